@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -13,30 +14,16 @@ from tests.calib.light_fields import CARDS, Views, light_field
 
 ROWS, COLUMNS, WIDTH, HEIGHT = 5, 7, 160, 120
 
-# Views are rendered with this margin in px, so that they can be aligned on any plane: a view is a part of its picture.
-_MARGIN_PX = 13
-
 WHITE = 40_000
 
 type Numbers = Callable[[int, int], str]
-type Pictures = dict[tuple[int, int], NDArray[np.float32]]
 type Writer = Callable[[Path, dict[str, NDArray[np.float32]]], None]
 
 
-def rendered() -> Views:
-    """Return the one scene of the corpus: 7 x 7 views with a margin."""
-    return light_field(CARDS, grid=(7, 7), size_px=(WIDTH + 2 * _MARGIN_PX, HEIGHT + 2 * _MARGIN_PX))
-
-
-def views_of(scene: Views, aligned_px: int, square: bool = False) -> Pictures:
+@cache
+def views_of(aligned_px: int, square: bool = False) -> Views:
     """Return the views, 5 x 7 or 7 x 7, in which each point moves by so many px more from node to node."""
-    rows = range(0, 7) if square else range(1, 6)
-    views = {}
-    for row in rows:
-        for column in range(COLUMNS):
-            top, left = (_MARGIN_PX - aligned_px * (index - 3) for index in (row, column))
-            views[row - rows[0], column] = scene[row, column][top : top + HEIGHT, left : left + WIDTH]
-    return views
+    return light_field(CARDS, (7 if square else ROWS, COLUMNS), (WIDTH, HEIGHT), aligned_px=aligned_px)
 
 
 def other_scene(seed: int) -> NDArray[np.float32]:
@@ -160,7 +147,7 @@ class Variant:
     names: Names = field(default_factory=Names)
     aligned_px: int = 0
     square: bool = False
-    change: Callable[[Pictures], Pictures] | None = None
+    change: Callable[[Views], Views] | None = None
     write: Writer = png16
     options: tuple[str, ...] = ()
     beside: dict[str, str] = field(default_factory=dict)
@@ -168,10 +155,10 @@ class Variant:
     ratio: float = 1.0
     words: str = ""
 
-    def source(self, scene: Views, folder: Path) -> Path:
+    def source(self, folder: Path) -> Path:
         """Write the files; return what is to be imported."""
         folder.mkdir()
-        views = views_of(scene, self.aligned_px, self.square)
+        views = views_of(self.aligned_px, self.square)
         if self.change is not None:
             views = self.change(views)
         size = (7 if self.square else ROWS), COLUMNS

@@ -10,7 +10,6 @@ from unittest import mock
 import pytest
 
 from faintfield.pipelines import cli
-from faintfield.rig.session.disk import lock_session
 from faintfield.rig.session.journal import Journal
 from faintfield.rig.session.session import taken_frames
 from faintfield.rig.simulation.lab import SimulatedLab
@@ -19,9 +18,6 @@ from tests.end_to_end.rigs import write_small_rig
 # Kind and frames of each step of the rig.toml that `init` writes, on a grid of 2 x 2, with a frame for each exposure.
 STEPS = [*[("charuco", 4)] * 6, ("bright", 4), ("dark_scene", 4), ("noise_reference", 4), ("dark", 4), ("flat", 2)]
 FRAMES = sum(count for _, count in STEPS)
-
-
-KEEP_OUT = "[[stage.keep_out]]\nx_mm = [-260, -240]\ny_mm = [-260, -240]"
 
 
 class Shell:
@@ -136,7 +132,12 @@ def test_check_remembers_settings_of_stage(shell: Shell) -> None:
     ("old", "new", "failure", "words"),
     [
         ("origin_mm = [-350.0", "origin_mm = [-250.0", "OutsideTravel", "outside the travel"),
-        ("# [[stage.keep_out]]", f"{KEEP_OUT}\n#", "KeepOutCrossed", "meets"),
+        (
+            "# [[stage.keep_out]]",
+            "[[stage.keep_out]]\nx_mm = [-260, 0]\ny_mm = [-260, 0]\n#",
+            "KeepOutCrossed",
+            "meets",
+        ),
         ("pitch_mm", "pich_mm", "UnknownKey", "did you mean 'pitch_mm'?"),
         ('protocol = "simulated"', 'protocol = "klipper"', "UnknownPlugin", "choose from 'grbl', 'marlin', "),
         ('backend = "simulated"', 'backend = "gphoto2"', "UnknownKey", "'camera.size_px' is not a key"),
@@ -176,7 +177,6 @@ def test_init_overwrites_nothing(shell: Shell) -> None:
 
 
 def test_capture_resumes_after_ctrl_c(small: Shell) -> None:
-    shell = small
     expose = SimulatedLab.expose
     calls = []
 
@@ -188,53 +188,40 @@ def test_capture_resumes_after_ctrl_c(small: Shell) -> None:
 
     before = signal.getsignal(signal.SIGINT)
     with mock.patch.object(SimulatedLab, "expose", interrupted):
-        assert shell.run("capture", shell.rig, shell.session, "--yes") == 1
+        assert small.run("capture", small.rig, small.session, "--yes") == 1
     assert signal.getsignal(signal.SIGINT) is before
-    assert "CaptureStopped: stopped with 7 of 42 frames taken; run the same command to go on" in shell.words
-    verdict = shell.result("verify", shell.session)["session"]
+    assert "CaptureStopped: stopped with 7 of 42 frames taken; run the same command to go on" in small.words
+    verdict = small.result("verify", small.session)["session"]
     assert (verdict["present"], len(verdict["missing"]), verdict["sealed"]) == (7, 35, False)
-    assert "35 still to be taken" in shell.words
-    assert shell.result("capture", shell.rig, shell.session, "--yes")["taken"] == 35
-    assert "7 of 42 frames are there; going on" in shell.words
-    assert shell.result("capture", shell.rig, shell.session, "--yes")["taken"] == 0
-    assert shell.result("verify", shell.session)["session"]["sealed"] is True
-
-
-def test_session_stays_with_rig_and_one_capture(small: Shell) -> None:
-    shell = small
-    with mock.patch.object(SimulatedLab, "expose", side_effect=KeyboardInterrupt):
-        assert shell.run("capture", shell.rig, shell.session, "--yes") == 1
-    assert "Interrupted" in shell.words
-    with lock_session(shell.session):
-        assert shell.run("capture", shell.rig, shell.session, "--yes") == 1
-        assert "SessionBusy" in shell.words
-        assert shell.run("verify", shell.session) == 1
-    shell.edit("pitch_mm = 50.0", "pitch_mm = 40.0")
-    assert shell.run("capture", shell.rig, shell.session, "--yes") == 1
-    assert "PlanRefused: the rig.toml differs from the plan.json of the session: grid.pitch_mm was 50.0" in shell.words
+    assert "35 still to be taken" in small.words
+    assert small.result("capture", small.rig, small.session, "--yes")["taken"] == 35
+    assert "7 of 42 frames are there; going on" in small.words
+    assert small.result("capture", small.rig, small.session, "--yes")["taken"] == 0
+    assert small.result("verify", small.session)["session"]["sealed"] is True
 
 
 def test_check_compares_rig_with_session(small: Shell) -> None:
-    shell = small
-    assert shell.run("check", shell.rig, "--session", shell.session) == 1
-    assert "MissingFile" in shell.words
+    assert small.run("check", small.rig, "--session", small.session) == 1
+    assert "MissingFile" in small.words
     with mock.patch.object(SimulatedLab, "expose", side_effect=KeyboardInterrupt):
-        assert shell.run("capture", shell.rig, shell.session, "--yes") == 1
-    assert shell.result("check", shell.rig, "--session", shell.session)["changed_since_session"] == []
-    assert "a resume would be accepted; no settings differ" in shell.words
-    shell.edit("leak_dn = 8.0", "leak_dn = 9.0")
+        assert small.run("capture", small.rig, small.session, "--yes") == 1
+    assert small.result("check", small.rig, "--session", small.session)["changed_since_session"] == []
+    assert "a resume would be accepted; no settings differ" in small.words
+    small.edit("leak_dn = 8.0", "leak_dn = 9.0")
     changed = ["checks.leak_dn was 8.0 and is 9.0"]
-    assert shell.result("check", shell.rig, "--session", shell.session)["changed_since_session"] == changed
-    assert f"session: {changed[0]}; would apply from the resume on" in shell.words
-    shell.edit("pitch_mm = 50.0", "pitch_mm = 40.0")
-    assert shell.run("check", shell.rig, "--session", shell.session) == 1
-    assert f"session: {changed[0]}; would apply from the resume on" in shell.words
-    assert "session: grid.pitch_mm was 50.0 and is 40.0; the session keeps the old value" in shell.words
-    assert "PlanRefused: the rig.toml differs" in shell.words
-    with Journal(shell.session / "journal.sqlite", read_only=True) as journal:
+    assert small.result("check", small.rig, "--session", small.session)["changed_since_session"] == changed
+    assert f"session: {changed[0]}; would apply from the resume on" in small.words
+    small.edit("pitch_mm = 50.0", "pitch_mm = 40.0")
+    assert small.run("check", small.rig, "--session", small.session) == 1
+    assert f"session: {changed[0]}; would apply from the resume on" in small.words
+    assert "session: grid.pitch_mm was 50.0 and is 40.0; the session keeps the old value" in small.words
+    assert "PlanRefused: the rig.toml differs" in small.words
+    assert small.run("capture", small.rig, small.session, "--yes") == 1
+    assert "PlanRefused: the rig.toml differs from the plan.json of the session: grid.pitch_mm was 50.0" in small.words
+    with Journal(small.session / "journal.sqlite", read_only=True) as journal:
         assert journal.events("setting_changed") == []
-    shell.edit("pitch_mm = 40.0", "pitch_mm = 50.0")
-    assert shell.run("capture", shell.rig, shell.session, "--yes") == 0
-    assert f"{changed[0]}, from now on" in shell.words
-    assert shell.result("check", shell.rig, "--session", shell.session)["changed_since_session"] == []
-    assert "it is complete, nothing is left to capture" in shell.words
+    small.edit("pitch_mm = 40.0", "pitch_mm = 50.0")
+    assert small.run("capture", small.rig, small.session, "--yes") == 0
+    assert f"{changed[0]}, from now on" in small.words
+    assert small.result("check", small.rig, "--session", small.session)["changed_since_session"] == []
+    assert "it is complete, nothing is left to capture" in small.words

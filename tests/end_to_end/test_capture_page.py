@@ -5,13 +5,12 @@ import http.client
 import re
 import socket
 import threading
-import urllib.error
+import time
 import urllib.parse
-import urllib.request
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
-from typing import NoReturn
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -36,6 +35,8 @@ from tests.end_to_end.browser import Tab
 from tests.end_to_end.rigs import write_small_rig
 from tests.faults.capturing import FRAMES, SMALL_RIG
 from tests.patience import HANG_S
+
+STOP = b'{"word": "stop"}'
 
 
 class Running:
@@ -144,21 +145,11 @@ def test_no_name_becomes_part_of_page(browser: Tab) -> None:
         assert browser.evaluate("document.querySelectorAll('script').length") == 1
 
 
-def status_of(address: str, data: bytes | None = None, **headers: str) -> int:
-    """Return the HTTP status of a request."""
-    try:
-        with urllib.request.urlopen(urllib.request.Request(address, data, headers)) as answer:
-            return int(answer.status)
-    except urllib.error.HTTPError as failure:
-        failure.close()
-        return failure.code
-
-
-def answer_to(address: str, method: str, **headers: str) -> http.client.HTTPResponse:
+def answer_to(address: str, method: str = "GET", body: bytes | None = None, **headers: str) -> http.client.HTTPResponse:
     """Return the answer to a request with these headers."""
     parts = urllib.parse.urlsplit(address)
     with closing(http.client.HTTPConnection(parts.netloc)) as connection:
-        connection.request(method, parts.path, b'{"word": "stop"}' if method == "POST" else None, headers)
+        connection.request(method, parts.path, body, headers)
         return connection.getresponse()
 
 
@@ -175,12 +166,12 @@ def test_strangers_learn_nothing_and_press_nothing() -> None:
         hosts = ["evil.example", "localhost.evil.example:80", ""]
         origins = ["http://evil.example", "null", "http://127.0.0.1:1", f"https://{parts.netloc}"]
         answers = [
-            *(answer_to(place, "GET") for place in places),
-            *(answer_to(place, "POST") for place in (root + "press", wrong_token + "press")),
-            *(answer_to(address + "state", "GET", Host=host) for host in hosts),
-            *(answer_to(address + "press", "POST", Origin=origin) for origin in origins),
+            *(answer_to(place) for place in places),
+            *(answer_to(place, "POST", STOP) for place in (root + "press", wrong_token + "press")),
+            *(answer_to(address + "state", Host=host) for host in hosts),
+            *(answer_to(address + "press", "POST", STOP, Origin=origin) for origin in origins),
         ]
-        assert status_of(address) == status_of(address + "state") == 200
+        assert answer_to(address).status == answer_to(address + "state").status == 200
     assert [answer.status for answer in answers] == [404] * len(answers)
     (headers,) = {tuple((name, value) for name, value in it.getheaders() if name != "date") for it in answers}
     names = {name for name, _ in headers}
@@ -194,13 +185,13 @@ def test_page_itself_may_press(host: str) -> None:
     panel = CapturePanel(unattended=True)
     with serve_page(panel) as address:
         host = host or urllib.parse.urlsplit(address).netloc
-        assert answer_to(address + "press", "POST", Host=host, Origin=f"http://{host}").status == 200
+        assert answer_to(address + "press", "POST", STOP, Host=host, Origin=f"http://{host}").status == 200
         assert panel.take_request() == "stop"
         for body in (
             *(b"", b"[]", b"[" * 999, b'{"word": "explode"}', b'{"word": "go", "more": 1}', b'{"word": 5}'),
             *(b'{"word": "\xff"}', b'{"word": "go"}' + b" " * 1000, b"x" * 100_000),
         ):
-            assert status_of(address + "press", body) == 400, body
+            assert answer_to(address + "press", "POST", body).status == 400, body
     assert panel.take_request() is None
 
 
@@ -215,6 +206,11 @@ def test_connection_that_stalls_is_closed(monkeypatch: pytest.MonkeyPatch) -> No
                 connection.sendall(beginning)
                 with suppress(ConnectionResetError):
                     assert connection.recv(1) == b""
+        with socket.create_connection(place, HANG_S) as connection, suppress(ConnectionError):
+            for _ in range(1000):  # a request that comes byte by byte is never idle
+                connection.sendall(b"G")
+                time.sleep(0.01)
+            pytest.fail("a slow request is never closed")
         with socket.create_connection(place, HANG_S) as connection:
             connection.sendall(f"GET {parts.path}state HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode())
             count = 0
@@ -222,19 +218,16 @@ def test_connection_that_stalls_is_closed(monkeypatch: pytest.MonkeyPatch) -> No
                 while data := connection.recv(256):  # takes far longer than the page allows
                     count += len(data)
             assert count < 50_000_000
-        assert status_of(address) == 200
+        assert answer_to(address).status == 200
 
 
 def test_failure_in_page_stays_there(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
-    def fail(panel: CapturePanel) -> NoReturn:
-        raise ZeroDivisionError
-
-    monkeypatch.setattr(capture_page, "_state", fail)
+    monkeypatch.setattr(capture_page, "_state", mock.Mock(side_effect=ZeroDivisionError))
     with serve_page(CapturePanel(unattended=True)) as address:
-        assert status_of(address + "state") == 500
-        assert status_of(address) == 200
+        assert answer_to(address + "state").status == 500
+        assert answer_to(address).status == 200
     assert capfd.readouterr() == ("", "")
     assert caplog.messages == []
 
@@ -259,30 +252,20 @@ def test_terminal_shows_address_and_no_log_does(tmp_path: Path, capsys: pytest.C
     assert verify(tmp_path / "session").sealed
 
 
-def test_capture_without_page_goes_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("broken", "words"),
+    [("socket.create_server", "there is no page ("), ("uvicorn.Server.serve", "the page has ended (OSError: ")],
+)
+def test_capture_goes_on_without_page(
+    broken: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def refuse(*_: object) -> NoReturn:
-        raise OSError(errno.EMFILE, "Too many open files")
-
-    monkeypatch.setattr("socket.create_server", refuse)
-    assert _capture(tmp_path) == 1
-    complaint = capsys.readouterr().err.splitlines()[-1]
-    assert complaint.startswith("faintfield: CaptureStopped: there is no page ([Errno 24] Too many open files) and no")
+    monkeypatch.setattr(broken, mock.Mock(side_effect=OSError(errno.EMFILE, "Too many open files")))
+    if broken == "socket.create_server":
+        assert _capture(tmp_path) == 1
+        complaint = capsys.readouterr().err.splitlines()[-1]
+        assert complaint.startswith(f"faintfield: CaptureStopped: {words}[Errno 24] Too many open files) and no")
     assert _capture(tmp_path, "--yes") == 0
-    assert "warning: there is no page ([Errno 24] Too many open files); " in capsys.readouterr().err
-    assert verify(tmp_path / "session").sealed
-
-
-def test_capture_whose_page_fails_goes_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    async def fail(*_: object, **__: object) -> NoReturn:
-        raise OSError(errno.EMFILE, "Too many open files")
-
-    monkeypatch.setattr("uvicorn.Server.serve", fail)
-    assert _capture(tmp_path, "--yes") == 0
-    assert "warning: the page has ended (OSError: [Errno 24] Too many open files); " in capsys.readouterr().err
+    assert f"warning: {words}[Errno 24] Too many open files); " in capsys.readouterr().err
     assert verify(tmp_path / "session").sealed
 
 

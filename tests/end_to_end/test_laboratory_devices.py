@@ -16,6 +16,7 @@ import pytest
 import tifffile
 
 from faintfield.pipelines import cli
+from faintfield.pipelines.formats.results.geometry import LensRecord
 from faintfield.pipelines.formats.sets.noise_set import load_noise_set
 from faintfield.pipelines.live import guided
 from faintfield.rig.cameras.aravis import AravisCamera
@@ -28,6 +29,7 @@ from faintfield.rig.plan import StepKind
 from faintfield.rig.session.journal import CommittedFrame
 from faintfield.rig.session.session import read_plan, taken_frames
 from faintfield.rig.settings import RigSettings
+from tests.end_to_end.rigs import write_geometry
 from tests.pipelines.by_hand import write_by_hand
 
 RIG = """
@@ -106,26 +108,6 @@ def captured(folder: Path, changes: dict[str, Any]) -> Path:
     return folder / "session"
 
 
-def write_geometry(session: Path, fx_px: float, size_px: tuple[int, int]) -> None:
-    """Write a geometry.json by hand in a folder beside the session, with the poses that the stage was told."""
-    plan = read_plan(session).plan
-    centre = plan.centre.target
-    nodes = {frame.stop.node: frame.stop.target for frame, _, _ in taken_frames(session) if frame.kind == "dark_scene"}
-    lens = {"model": "pinhole", "fx_px": fx_px, "fy_px": fx_px, "cx_px": size_px[0] / 2, "cy_px": size_px[1] / 2}
-    poses = [
-        {
-            "node": node,
-            "rt_cam_ref": [0.0, 0.0, 0.0, centre.x_mm - at.x_mm, centre.y_mm - at.y_mm, 0.0],
-            "sigma_mm": 0.01,
-            "sigma_rad": 1e-5,
-        }
-        for node, at in sorted(nodes.items())
-    ]
-    record = {"lens": lens | {"distortion": []}, "size_px": size_px, "reference_node": plan.centre.node, "nodes": poses}
-    session.with_name("geometry").mkdir()
-    write_by_hand(session.with_name("geometry") / "geometry.json", {"format": 1} | record)
-
-
 def check_session(session: Path, sent: dict[int, Exposure], fx_px: float, depth_mm: float) -> None:
     """Check that the session is whole, holds what the camera sent, and can be reconstructed with its noise.json."""
     assert (session / "SHA256SUMS").is_file()
@@ -137,8 +119,10 @@ def check_session(session: Path, sent: dict[int, Exposure], fx_px: float, depth_
     assert len(taken) == FRAMES
     pixels = sent[taken[0].intent].pixels
     assert pixels is not None
-    write_geometry(session, fx_px, pixels.shape[::-1])
-    out, geometry = session.with_name("planes"), session.with_name("geometry") / "geometry.json"
+    height, width = pixels.shape
+    lens = LensRecord("pinhole", fx_px, fx_px, width / 2, height / 2, ())
+    geometry = write_geometry(session.with_name("geometry"), read_plan(session).rig.grid, lens, (width, height))
+    out = session.with_name("planes")
     faintfield("reconstruct", session, "--geometry", geometry, "--out", out, "--depth-mm", depth_mm, "--passes", 3)
     result = json.loads((out / "reconstruction.json").read_text())
     assert [plane["depth_mm"] for plane in result["planes"]] == [depth_mm]

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from faintfield.pipelines.cli import run
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
-from tests.calib.light_fields import CARDS, Views
-from tests.end_to_end.light_field_files import HCI_FX_PX, HCI_PITCH_MM, Variant, rendered, views_of
+from tests.calib.light_fields import CARDS
+from tests.end_to_end.light_field_files import HCI_FX_PX, HCI_PITCH_MM, Variant, views_of
 from tests.end_to_end.light_field_variants import CORPUS, REFUSED
 
 pytestmark = pytest.mark.deep  # tests/calib and tests/pipelines try a few quickly
@@ -21,13 +21,8 @@ pytestmark = pytest.mark.deep  # tests/calib and tests/pipelines try a few quick
 LEAST_PX, LARGEST_PX, WIDER_PX, NARROWER_PX = -3.8, -1.0, 0.7, 0.1
 
 
-@pytest.fixture(scope="session")
-def scene() -> Views:
-    return rendered()
-
-
-def _import(variant: Variant, scene: Views, folder: Path) -> int:
-    return run(["import", "grid", str(variant.source(scene, folder / "src")), str(folder / "set"), *variant.options])
+def _import(variant: Variant, folder: Path) -> int:
+    return run(["import", "grid", str(variant.source(folder / "src")), str(folder / "set"), *variant.options])
 
 
 def _shown(elemental_set: ElementalSet) -> dict[tuple[int, int], NDArray[np.float64]]:
@@ -40,9 +35,9 @@ def _shown(elemental_set: ElementalSet) -> dict[tuple[int, int], NDArray[np.floa
     return pictures
 
 
-def _assert_as_rendered(elemental_set: ElementalSet, variant: Variant, scene: Views) -> None:
+def _assert_as_rendered(elemental_set: ElementalSet, variant: Variant) -> None:
     """Each node has the picture that was rendered for it, at its place among the cameras."""
-    views = views_of(scene, variant.aligned_px, variant.square)
+    views = views_of(variant.aligned_px, variant.square)
     kept = sorted(node for node in views if variant.kept(*node))
     # Rows and columns count what is there: every second one is a grid of its own
     by_row, by_column = max(round(1 / variant.ratio), 1), max(round(variant.ratio), 1)
@@ -82,27 +77,23 @@ def _assert_range(elemental_set: ElementalSet, variant: Variant) -> None:
 
 
 @pytest.mark.parametrize("name", CORPUS)
-def test_scene_is_imported_from_any_convention(
-    name: str, scene: Views, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_scene_is_imported_from_any_convention(name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     variant = CORPUS[name]
-    code = _import(variant, scene, tmp_path)
+    code = _import(variant, tmp_path)
     complaint = capfd.readouterr().err
     assert code == 0, complaint
     elemental_set = load_set(tmp_path / "set")
     assert elemental_set.settings.arrangement is not None
     assert elemental_set.settings.arrangement.told_by in ("pictures", "signs")
     assert variant.words in complaint
-    _assert_as_rendered(elemental_set, variant, scene)
+    _assert_as_rendered(elemental_set, variant)
     _assert_range(elemental_set, variant)
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_pictures_without_order_are_refused(
-    name: str, scene: Views, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_pictures_without_order_are_refused(name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     failure, variant = REFUSED[name]
-    code = _import(variant, scene, tmp_path)
+    code = _import(variant, tmp_path)
     complaint = capfd.readouterr().err
     assert code == 1, complaint
     assert f"faintfield: {failure}: " in complaint
@@ -128,10 +119,10 @@ def _in_focus_px(elemental_set: ElementalSet, best: dict[str, Any]) -> NDArray[n
 
 
 @pytest.mark.parametrize("name", WITH_PLANES)
-def test_planes_of_best_focus_lie_at_cards(name: str, scene: Views, tmp_path: Path) -> None:
+def test_planes_of_best_focus_lie_at_cards(name: str, tmp_path: Path) -> None:
     """Each plane is at a card's disparity."""
     variant = CORPUS[name]
-    assert _import(variant, scene, tmp_path) == 0
+    assert _import(variant, tmp_path) == 0
     asked = ("--depth-mm", "auto", "--method", "backprojection")
     assert run(["reconstruct", str(tmp_path / "set"), "--out", str(tmp_path / "planes"), *asked]) == 0
     elemental_set = load_set(tmp_path / "set")

@@ -20,7 +20,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from faintfield.pipelines import cli
-from faintfield.pipelines.formats.results.geometry import CameraPoses, LensRecord, NodeRecord
+from faintfield.pipelines.formats.results.geometry import LensRecord
 from faintfield.pipelines.live.capture_page import serve_page
 from faintfield.pipelines.live.guided import read_pixels
 from faintfield.pipelines.live.panel import CapturePanel
@@ -31,7 +31,7 @@ from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.capture.loop import Capture
 from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import open_rig
-from faintfield.rig.plan import Grid, nominal_poses_rt_cam_ref
+from faintfield.rig.plan import Grid
 from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.session import FrozenPlan
 from faintfield.rig.session.verify import verify
@@ -39,7 +39,7 @@ from faintfield.rig.settings import DriftSettings, RigSettings, SettleSettings, 
 from faintfield.rig.simulation.lab import lab_experiment
 from faintfield.rig.stages.protocol import Point, StageSettings
 from tests.end_to_end.browser import Tab
-from tests.end_to_end.rigs import write_small_rig
+from tests.end_to_end.rigs import write_geometry, write_small_rig
 from tests.patience import HANG_S
 
 _CAMERA = SimulatedSettings(size_px=(96, 72), unlit_photons_per_s=30.0)
@@ -71,10 +71,7 @@ def write_calibrations(folder: Path, settings: RigSettings) -> None:
     (folder / "noise.json").write_text(json.dumps(numbers))
     optics = lab.optics
     lens = LensRecord("opencv", optics.fx_px, optics.fy_px, optics.cx_px, optics.cy_px, tuple(optics.distortion))
-    poses = nominal_poses_rt_cam_ref(grid.rows, grid.columns, grid.pitch_mm).tolist()
-    nodes = [NodeRecord(divmod(view, grid.columns), tuple(pose), 0.0, 0.0) for view, pose in enumerate(poses)]
-    geometry = CameraPoses(lens=lens, size_px=_CAMERA.size_px, reference_node=grid.centre().node, nodes=nodes)
-    (folder / "geometry.json").write_bytes(msgspec.json.encode(geometry))
+    write_geometry(folder, grid, lens, _CAMERA.size_px)
 
 
 class Running:
@@ -118,9 +115,8 @@ class Running:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.take(10**6)
-        self._thread.join(HANG_S)
-        self._stack.close()
+        with self._stack:
+            self.end()
 
     def take(self, frames: int) -> None:
         """Let the capture go on until there are so many frames."""
@@ -262,10 +258,8 @@ def check_access(address: str) -> None:
     for name in ("planes/plane_000_mean.png?1", "planes/node_r0_c0.png", "node/0/0"):
         assert status(name) == 200, name
     for name in (
-        *("planes/status.json", "planes/.status.json", "planes/", "planes/../state", "node/-1/0", "node/0/x"),
-        *("planes/plane_999_mean.png", "planes/plane_000_mean.png%00", "planes/plane_000_mean.png%0a"),
-        *("planes/plane_%D9%A0%D9%A0%D9%A0_mean.png", "planes/plane_000_mean.png/.."),
-        *("planes/..%2f..%2fetc%2fpasswd", "planes/%2e%2e/plane_000_mean.png"),
+        *("planes/status.json", "planes/", "planes/../state", "node/-1/0", "node/0/x", "planes/plane_999_mean.png"),
+        *("planes/plane_000_mean.png%0a", "planes/..%2f..%2fetc%2fpasswd", "planes/%2e%2e/plane_000_mean.png"),
     ):
         assert status(name) == 404, name
     token = urllib.parse.urlsplit(address).path

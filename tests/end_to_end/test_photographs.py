@@ -89,9 +89,3 @@ def test_colours_come_back(results: Path) -> None:
     expected_e = bright * _electrons_of_white(results)
     standard_error_e = (3.464**2 + expected_e.max()) ** 0.5 / (25 * 200 * 340) ** 0.5
     np.testing.assert_allclose(penalised, expected_e, atol=3 * standard_error_e)
-
-
-def test_plane_lies_at_disparity(results: Path) -> None:
-    record = json.loads((results / "of-dark" / "pmlem-osl" / "reconstruction.json").read_text())
-    assert [plane["disparity_px"] for plane in record["planes"]] == pytest.approx([_DISPARITY_PX] * 3, rel=1e-9)
-    assert [plane["channel"] for plane in record["planes"]] == ["red", "green", "blue"]

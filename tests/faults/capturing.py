@@ -2,15 +2,11 @@
 
 import ctypes
 import multiprocessing
-import os
-import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.cameras.settings import SimulatedSettings
@@ -19,12 +15,9 @@ from faintfield.rig.capture.loop import Capture
 from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import open_rig
 from faintfield.rig.plan import Grid, PlannedFrame
-from faintfield.rig.session import disk, session
-from faintfield.rig.session.journal import Journal
 from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.session import FrozenPlan
 from faintfield.rig.settings import BoardSettings, DriftSettings, RigSettings, SettleSettings, StepSettings
-from faintfield.rig.simulation.lab import SimulatedLab
 from faintfield.rig.stages.protocol import Point, StageSettings
 
 SMALL_RIG = RigSettings(
@@ -37,18 +30,6 @@ SMALL_RIG = RigSettings(
 )
 FRAMES = 2 * 3 + 2 * 3 + 4
 BOARD = BoardSettings("large", 9, 6, 40.0, 30.0)
-
-# The steps by which a frame reaches the disk, each with the function before or after which the power may fail
-STEPS: Mapping[str, tuple[Any, str]] = {
-    "intent": (Journal, "intend"),
-    "exposure": (SimulatedLab, "expose"),
-    "writing": (disk, "write_new"),
-    "flushing": (os, "fsync"),
-    "naming": (Path, "rename"),
-    "flushing the folder": (disk, "sync_folder"),
-    "file written": (session.Session, "write"),
-    "commit": (Journal, "commit"),
-}
 
 
 class Unattended:
@@ -72,45 +53,6 @@ def capture_small(folder: Path, settings: RigSettings = SMALL_RIG) -> None:
     frozen = FrozenPlan(survey(open_rig(settings), settings).plan, settings)
     with open_session(folder, frozen) as begun:
         Capture(begun, open_rig(settings, begun.journal), Unattended(), lambda path: None).run()
-
-
-def capture_and_die(folder: Path, step: str, *, after: bool, countdown: int) -> None:
-    """Capture, and be killed before or after a step, the `countdown`-th time it is reached since the first intent."""
-    owner, name = STEPS[step]
-    with kill_at(owner, name, after=after, countdown=countdown):
-        capture_small(folder)
-
-
-@contextmanager
-def kill_at(owner: Any, name: str, *, after: bool, countdown: int) -> Iterator[None]:
-    """Kill this process when `owner.name` is called for the `countdown`-th time since the first intent."""
-    original: Callable[..., Any] = getattr(owner, name)
-    intend = Journal.intend
-    left = [countdown]
-    begun = [name == "intend"]
-
-    def watched_intend(journal: Journal, frame: int) -> int:
-        begun[0] = True
-        return intend(journal, frame)
-
-    def watched(*arguments: Any, **named: Any) -> Any:
-        left[0] -= begun[0]
-        dies = begun[0] and left[0] == 0
-        if dies and not after:
-            os.kill(os.getpid(), signal.SIGKILL)
-        result = original(*arguments, **named)
-        if dies:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return result
-
-    places = [(owner, name)] + ([(session, name)] if owner is disk and hasattr(session, name) else [])
-    with mock.patch.object(Journal, "intend", watched_intend):
-        patches = [mock.patch.object(place, attribute, watched) for place, attribute in places]
-        for patch in patches:
-            patch.start()
-        yield
-        for patch in patches:
-            patch.stop()
 
 
 def drop_rights() -> None:

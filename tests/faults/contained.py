@@ -24,13 +24,16 @@ from hashlib import blake2b
 from pathlib import Path
 from stat import S_ISDIR, S_ISREG
 
+# Threads would not survive the fork, and their stacks count as memory; libraries read these as they are loaded.
+ONE_THREAD = dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+
 # What a child may use beyond the memory that this process has already when it is forked.
 MAX_EXTRA_BYTES = 2 << 30
 MAX_FILE_BYTES = 1 << 30
 MAX_SECONDS = 30.0
 
-# Share of a processor that a child has even on a busy machine, unless it waits.
-_LEAST_RUNNING = 0.02
+# A child may wait for so many times longer than it may compute: the machine may be busy.
+_PATIENCE = 10
 
 # Begins a line that only a name in a file can have brought about, and a script that must never reach a page as such.
 FORGED = "faintfield-forged:"
@@ -48,29 +51,25 @@ type State = Mapping[str, tuple[object, ...]]
 
 @dataclass(frozen=True)
 class Ended:
-    """How a child ended: its exit code or its signal, what it printed, and whether it left no process behind."""
+    """How a child ended: its exit code, of a signal negative, what it printed, and if it left no process behind."""
 
-    code: int | None
-    signal: int | None
+    code: int
     out: str
     err: str
     alone: bool
     seconds: float
 
 
-def contained(
-    call: Callable[[], int], place: Path, *, seconds: float = MAX_SECONDS, extra_bytes: int = MAX_EXTRA_BYTES
-) -> Ended:
+def contained(call: Callable[[], int], place: Path, *, seconds: float = MAX_SECONDS) -> Ended:
     """Run `call` in a child whose working folder is `place`; its result is the exit code.
 
-    The child may compute for `seconds`, and wait for as long.
+    The child may compute for `seconds`, and wait ten times as long.
     """
     files = os.memfd_create("out"), os.memfd_create("err")
-    limit = _data_bytes() + extra_bytes
     begun = time.monotonic()
     child = os.fork()
     if child == 0:
-        _be_child(call, place, files, seconds, limit)
+        _be_child(call, place, files, seconds)
     status = _wait(child, seconds)
     try:
         os.killpg(child, signal.SIGKILL)
@@ -78,28 +77,19 @@ def contained(
     except ProcessLookupError:
         alone = True
     out, err = (_content(file) for file in files)
-    killed = os.WTERMSIG(status) if os.WIFSIGNALED(status) else None
-    code = os.WEXITSTATUS(status) if os.WIFEXITED(status) else None
-    return Ended(code, killed, out, err, alone, time.monotonic() - begun)
+    return Ended(os.waitstatus_to_exitcode(status), out, err, alone, time.monotonic() - begun)
 
 
 def _wait(child: int, seconds: float) -> int:
-    """Return the status of a child at its end; end it if it waits for something that never comes.
-
-    On a busy machine it may take long, but it then still runs now and then.
-    """
+    """Return the status of a child at its end; end it if it waits for something that never comes."""
     watched = os.pidfd_open(child)
-    used = 0.0
-    while not select.select([watched], [], [], seconds)[0]:
-        fields = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()
-        before, used = used, (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-        if used - before < _LEAST_RUNNING * seconds:
-            os.kill(child, signal.SIGALRM)
+    if not select.select([watched], [], [], _PATIENCE * seconds)[0]:
+        os.kill(child, signal.SIGALRM)
     os.close(watched)
     return os.waitpid(child, 0)[1]
 
 
-def _be_child(call: Callable[[], int], place: Path, files: tuple[int, int], seconds: float, limit: int) -> None:
+def _be_child(call: Callable[[], int], place: Path, files: tuple[int, int], seconds: float) -> None:
     code = 1
     try:
         os.setsid()
@@ -111,6 +101,7 @@ def _be_child(call: Callable[[], int], place: Path, files: tuple[int, int], seco
         sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)
         os.chdir(place)
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        limit = _data_bytes() + MAX_EXTRA_BYTES
         resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
         resource.setrlimit(resource.RLIMIT_FSIZE, (MAX_FILE_BYTES, MAX_FILE_BYTES))
         whole_seconds = math.ceil(seconds)
@@ -171,7 +162,7 @@ def faults_of(
     """
     after = state_of(folder)
     changed = {name for name in before.keys() | after.keys() if before.get(name) != after.get(name)}
-    faults = _faults_of_end(ended)
+    faults = faults_of_end(ended)
     for name in sorted(changed):
         if not any(fnmatchcase(name, pattern) for pattern in may_change):
             what = "made" if name not in before else "removed" if name not in after else "changed"
@@ -185,14 +176,15 @@ def faults_of(
     return faults
 
 
-def _faults_of_end(ended: Ended) -> list[str]:
+def faults_of_end(ended: Ended) -> list[str]:
+    """Return what is wrong with how a command in a child ended."""
     faults = []
     lines = ended.err.splitlines()
     said = [line for line in lines if _FAILURE.match(line)]
-    if ended.signal in (signal.SIGALRM, signal.SIGXCPU):
-        faults.append(f"hang: {'waited' if ended.signal == signal.SIGALRM else 'ran'} too long")
-    elif ended.signal is not None:
-        faults.append(f"died by signal {signal.Signals(ended.signal).name}")
+    if ended.code in (-signal.SIGALRM, -signal.SIGXCPU):
+        faults.append(f"hang: {'waited' if ended.code == -signal.SIGALRM else 'ran'} too long")
+    elif ended.code < 0:
+        faults.append(f"died by signal {signal.Signals(-ended.code).name}")
     elif "Traceback (most recent call last)" in ended.err:
         faults.append(f"traceback: {lines[-1][:300]}")
     elif ended.code not in (0, 1, 2):

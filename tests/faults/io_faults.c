@@ -1,6 +1,7 @@
 /* Stands between a program and the system's calls on files (LD_PRELOAD), and lets one of them fail.
 
-   Calls on files in one folder are counted by their kind. The n-th of a kind fails, is cut short, or kills the process.
+   Calls on files in one folder are counted by their kind, as far as commands make them. The n-th of a kind fails, is cut short, or kills or interrupts the
+   process.
    Calls that change a file outside that folder are recorded: there must be none. */
 
 #define _GNU_SOURCE
@@ -15,15 +16,13 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/file.h>
-#include <sys/sendfile.h>
 #include <sys/stat.h>
-#include <sys/uio.h>
 #include <dirent.h>
 #include <unistd.h>
 
 /* In the order of `KINDS` in io_faults.py */
 enum kind { OPEN, CREATE, LIST, STATUS, READ, WRITE, SYNC, RENAME, REMOVE, MAKE, LOCK, ALLOCATE, KINDS };
-enum action { COUNT, FAIL_ONCE, FAIL_ON, CUT_SHORT, KILL };
+enum action { COUNT, FAIL_ONCE, FAIL_ON, CUT_SHORT, KILL, INTERRUPT };
 enum verdict { GO_ON, FAILED, HALF };
 
 static char folder[PATH_MAX];
@@ -84,7 +83,7 @@ static int may_change(const char *path)
 static enum verdict judge(enum kind kind, int changes, const char *path, const char *name)
 {
     enum verdict verdict = GO_ON;
-    int die = 0;
+    int fate = 0;
     if (!folder[0])
         return GO_ON;
     pthread_mutex_lock(&guard);
@@ -97,13 +96,13 @@ static enum verdict judge(enum kind kind, int changes, const char *path, const c
             fprintf(diary, "%d %s %s\n", kind, name, path + strlen(folder)), fflush(diary);
         if (kind == struck && action != COUNT && (count == nth || (action == FAIL_ON && count > nth))) {
             injected++;
-            die = action == KILL;
-            verdict = action == CUT_SHORT || die ? HALF : FAILED;
+            fate = action == KILL ? SIGKILL : action == INTERRUPT ? SIGINT : 0;
+            verdict = fate == SIGINT ? GO_ON : fate || action == CUT_SHORT ? HALF : FAILED;
         }
     }
     pthread_mutex_unlock(&guard);
-    if (die && kind != WRITE)
-        kill(getpid(), SIGKILL);
+    if (fate == SIGINT || (fate && kind != WRITE))
+        kill(getpid(), fate);
     if (verdict == FAILED)
         errno = error_number;
     return verdict;
@@ -204,11 +203,6 @@ ALSO(fopen, fopen64)
 READING(read, (int fd, void *to, size_t count), fd, (fd, to, count), (fd, to, half(count)))
 READING(pread, (int fd, void *to, size_t count, off_t at), fd, (fd, to, count, at), (fd, to, half(count), at))
 ALSO(pread, pread64)
-READING(sendfile, (int to, int from, off_t *at, size_t count), from, (to, from, at, count),
-        (to, from, at, half(count)))
-ALSO(sendfile, sendfile64)
-READING(copy_file_range, (int from, off64_t *at, int to, off64_t *to_at, size_t count, unsigned flags), from,
-    (from, at, to, to_at, count, flags), (from, at, to, to_at, half(count), flags))
 
 #define WRITING(name, parameters, arguments, halved_arguments) \
     ssize_t name parameters \
@@ -224,7 +218,6 @@ WRITING(write, (int fd, const void *from, size_t count), (fd, from, count), (fd,
 WRITING(pwrite, (int fd, const void *from, size_t count, off_t at), (fd, from, count, at),
         (fd, from, half(count), at))
 ALSO(pwrite, pwrite64)
-WRITING(writev, (int fd, const struct iovec *parts, int count), (fd, parts, count), (fd, parts, (int)half(count)))
 
 /* numpy writes arrays through streams of the C library, whose own calls nothing can stand before */
 size_t fwrite(const void *from, size_t size, size_t count, FILE *stream)
@@ -245,12 +238,6 @@ size_t fwrite(const void *from, size_t size, size_t count, FILE *stream)
     }
 }
 
-size_t fread(void *to, size_t size, size_t count, FILE *stream)
-{
-    NEXT(fread);
-    return judge_fd(READ, 0, fileno(stream), "fread") == GO_ON ? original(to, size, count, stream) : 0;
-}
-
 /* Calls that succeed with 0 */
 #define CALL(name, parameters, verdict, arguments) \
     int name parameters \
@@ -261,21 +248,13 @@ size_t fread(void *to, size_t size, size_t count, FILE *stream)
         return original arguments; \
     }
 CALL(rename, (const char *from, const char *to), judge_at(RENAME, 1, AT_FDCWD, to, "rename"), (from, to))
-CALL(renameat, (int from_in, const char *from, int to_in, const char *to), judge_at(RENAME, 1, to_in, to,
-    "renameat"), (from_in, from, to_in, to))
-CALL(renameat2, (int from_in, const char *from, int to_in, const char *to, unsigned flags), judge_at(RENAME,
-    1, to_in, to, "renameat2"), (from_in, from, to_in, to, flags))
 CALL(unlink, (const char *path), judge_at(REMOVE, 1, AT_FDCWD, path, "unlink"), (path))
 CALL(unlinkat, (int in, const char *path, int flags), judge_at(REMOVE, 1, in, path, "unlinkat"), (in, path, flags))
 CALL(rmdir, (const char *path), judge_at(REMOVE, 1, AT_FDCWD, path, "rmdir"), (path))
 CALL(mkdir, (const char *path, mode_t mode), judge_at(MAKE, 1, AT_FDCWD, path, "mkdir"), (path, mode))
-CALL(mkdirat, (int in, const char *path, mode_t mode), judge_at(MAKE, 1, in, path, "mkdirat"), (in, path, mode))
 CALL(flock, (int fd, int operation), operation &LOCK_UN ? GO_ON : judge_fd(LOCK, 0, fd, "flock"), (fd, operation))
 CALL(ftruncate, (int fd, off_t length), judge_fd(ALLOCATE, 1, fd, "ftruncate"), (fd, length))
 ALSO(ftruncate, ftruncate64)
-CALL(fallocate, (int fd, int mode, off_t at, off_t length), judge_fd(ALLOCATE, 1, fd, "fallocate"), (fd,
-    mode, at, length))
-ALSO(fallocate, fallocate64)
 CALL(stat, (const char *restrict path, struct stat *restrict to), judge_at(STATUS, 0, AT_FDCWD, path,
     "stat"), (path, to))
 ALSO(stat, stat64)
@@ -298,14 +277,6 @@ ALSO(fstatat, fstatat64)
 FLUSHING(fsync)
 FLUSHING(fdatasync)
 
-/* This returns the error itself */
-int posix_fallocate(int fd, off_t at, off_t length)
-{
-    NEXT(posix_fallocate);
-    return judge_fd(ALLOCATE, 1, fd, "posix_fallocate") == FAILED ? error_number : original(fd, at, length);
-}
-ALSO(posix_fallocate, posix_fallocate64)
-
 int fcntl(int fd, int command, ...)
 {
     NEXT(fcntl);
@@ -324,10 +295,4 @@ DIR *opendir(const char *path)
 {
     NEXT(opendir);
     return judge_at(LIST, 0, AT_FDCWD, path, "opendir") == FAILED ? NULL : original(path);
-}
-
-DIR *fdopendir(int fd)
-{
-    NEXT(fdopendir);
-    return judge_fd(LIST, 0, fd, "fdopendir") == FAILED ? NULL : original(fd);
 }

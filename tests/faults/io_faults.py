@@ -1,7 +1,8 @@
-"""Run commands in processes in which one call to the system fails, is cut short, or kills.
+"""Run commands in processes in which one call to the system fails, is cut short, kills, or interrupts.
 
-`io_faults.c` stands between the program and the C library (LD_PRELOAD). `faults` starts a process with it, which loads
-the program and runs every command once; each trial is a fork of that process, so that it costs the command alone.
+`io_faults.c` stands between the program and the C library (LD_PRELOAD). `faulty_process` starts a process with it,
+which loads the program and runs every command once; each trial is a fork of that process, so that it costs the command
+alone.
 """
 
 import ctypes
@@ -12,34 +13,32 @@ import os
 import pickle
 import shutil
 import subprocess
-import sys
-import traceback
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
+from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from types import CodeType
-from typing import IO, Any, Literal
+from typing import Literal, NamedTuple
+from unittest import mock
 
-import jinja2
-import msgspec
+import cv2
 
+from faintfield.pipelines.cli import run
+from tests.faults.contained import ONE_THREAD, Ended, contained
 from tests.patience import HANG_S
 
-ROOT = Path(__file__).parents[2]
 SOURCE = Path(__file__).with_suffix(".c")
 
 # In the order of the enumeration in io_faults.c
 KINDS = ("open", "create", "list", "status", "read", "write", "sync", "rename", "remove", "make", "lock", "allocate")
-ACTIONS = ("count", "fail once", "fail from then on", "cut short", "kill")
+ACTIONS = ("count", "fail once", "fail from then on", "cut short", "kill", "interrupt")
 
-# Exit codes of a command that ended by an exception, and of one that was killed after its time
-CRASHED, TIME_OVER = 70, 71
-
-type Action = Literal["count", "fail once", "fail from then on", "cut short", "kill"]
+type Action = Literal["count", "fail once", "fail from then on", "cut short", "kill", "interrupt"]
 
 
-class Fault(msgspec.Struct, frozen=True):
+@dataclass(frozen=True)
+class Fault:
     """The fate of the `nth` call of a kind, counted from 1, on files of the trial's folder.
 
     A write that kills has written half of its bytes; any other call that kills has done nothing.
@@ -55,24 +54,12 @@ class Fault(msgspec.Struct, frozen=True):
         return f"{what} at {self.kind} {self.nth}" + (" and after" if self.action == "fail from then on" else "")
 
 
-class Trial(msgspec.Struct, frozen=True):
-    """A command that is tried on the files of a folder, all whose calls are listed in the file `diary`."""
+class Outcome(NamedTuple):
+    """How a command ended, how often the fault struck, and a file changed outside the folder."""
 
-    words: list[str]
-    folder: str
-    fault: Fault = Fault()
-    diary: str | None = None
-    limit_s: float = HANG_S
-
-
-class Ended(msgspec.Struct, frozen=True):
-    """How a command ended: its exit code, what it printed, how often the fault struck, and a file changed elsewhere."""
-
-    code: int
-    said: str
-    complaint: str
-    injected: int = 0
-    stray: str = ""
+    ended: Ended
+    injected: int
+    stray: str
 
 
 # What takes long and touches no file. A trial takes its result from the commands that were run first, as long as the
@@ -98,58 +85,45 @@ def compiled(folder: Path) -> Path | None:
     return library
 
 
-class Faults:
-    """A process under the library, which forks one process per trial."""
-
-    def __init__(self, process: subprocess.Popen[bytes]) -> None:
-        self._process = process
-
-    def run(self, trial: Trial) -> Ended:
-        to, answers = self._process.stdin, self._process.stdout
-        assert to is not None
-        assert answers is not None
-        to.write(msgspec.json.encode(trial) + b"\n")
-        to.flush()
-        return msgspec.json.decode(answers.readline(), type=Ended)
-
-
 @contextmanager
-def faults(library: Path, warm_up: Sequence[Sequence[str]] = ()) -> Iterator[Faults]:
-    """Start the process that forks, having run some commands in it, which loads what they need."""
-    one_thread = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
-    with subprocess.Popen(
-        [sys.executable, "-m", "tests.faults.io_faults", msgspec.json.encode(warm_up).decode()],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        cwd=ROOT,
-        env={**os.environ, **one_thread, "LD_PRELOAD": str(library)},
-    ) as process:
-        try:
-            server = Faults(process)
-            assert server.run(Trial(["--help"], "/none")).code == 0
-            yield server
-        finally:
-            process.kill()
+def faulty_process(library: Path, commands: Sequence[Sequence[str]]) -> Iterator[ProcessPoolExecutor]:
+    """Start the process that forks, to which `try_command` can be submitted, and run some commands in it."""
+    spawn = get_context("spawn")  # the library is loaded by a new process only
+    with ProcessPoolExecutor(1, spawn, _warm_up, (commands,)) as process:
+        with mock.patch.dict(os.environ, ONE_THREAD | {"LD_PRELOAD": str(library)}):
+            process.submit(os.getpid).result()
+        yield process
 
 
-def elemental_set() -> ctypes.CDLL:
-    """Return the library that stands between this process and the C library."""
+def try_command(words: list[str], folder: Path, fault: Fault, diary: Path | None = None) -> Outcome:
+    """Run a command in a fork; one of its calls on files of a folder fails. `diary` lists them all."""
     library = ctypes.CDLL(None)
-    library.faults_arm.argtypes = (
-        *(ctypes.c_char_p, ctypes.c_int, ctypes.c_int, ctypes.c_long, ctypes.c_int, ctypes.c_char_p),
-    )
     library.faults_injected.restype = ctypes.c_long
     library.faults_stray.restype = ctypes.c_char_p
-    return library
+    report = os.memfd_create("report")
+
+    def call() -> int:
+        library.faults_arm(
+            *(str(folder).encode(), KINDS.index(fault.kind), ACTIONS.index(fault.action), ctypes.c_long(fault.nth)),
+            *(getattr(errno, fault.error), str(diary).encode() if diary else None),
+        )
+        code = run(words)
+        library.faults_disarm()
+        os.write(report, b"%d %s" % (library.faults_injected(), library.faults_stray()))
+        return code
+
+    ended = contained(call, Path.cwd(), seconds=HANG_S)
+    injected, _, stray = os.pread(report, 1 << 16, 0).decode(errors="replace").partition(" ")
+    os.close(report)
+    return Outcome(ended, int(injected or 0), stray)
 
 
-def arm(library: ctypes.CDLL, folder: str, fault: Fault, diary: str | None = None) -> None:
-    """Count the calls of this process on the files in a folder from now on, and let one of them fail."""
-    library.faults_arm(
-        *(folder.encode(), KINDS.index(fault.kind), ACTIONS.index(fault.action), fault.nth),
-        getattr(errno, fault.error),
-        None if diary is None else diary.encode(),
-    )
+def _warm_up(commands: Sequence[Sequence[str]]) -> None:
+    cv2.setNumThreads(1)
+    for place in _COMPUTATIONS:
+        _remember(*place.rsplit(".", 1))
+    for words in commands:
+        assert run(words) == 0, words
 
 
 def _remember(module: str, name: str) -> None:
@@ -165,82 +139,3 @@ def _remember(module: str, name: str) -> None:
         return pickle.loads(known[key])
 
     setattr(owner, name, remembered)
-
-
-def _keep_templates() -> None:
-    """Let templates be compiled once only."""
-    compile_once = jinja2.Environment.compile
-    known: dict[object, CodeType] = {}
-
-    def kept(environment: jinja2.Environment, source: Any, *rest: Any, **named: Any) -> CodeType:
-        key = (source, rest, tuple(named.items()))
-        if key not in known:
-            known[key] = compile_once(environment, source, *rest, **named)
-        return known[key]
-
-    jinja2.Environment.compile = kept  # type: ignore[method-assign, assignment]
-
-
-def _serve(warm_up: list[list[str]]) -> None:
-    """Run the commands, then one trial per line of standard input, each in a fork."""
-    import cv2
-
-    from faintfield.pipelines.cli import run
-
-    cv2.setNumThreads(1)
-    for place in _COMPUTATIONS:
-        _remember(*place.rsplit(".", 1))
-    _keep_templates()
-    answers = os.fdopen(os.dup(1), "wb", buffering=0)
-    os.dup2(2, 1)
-    for words in warm_up:
-        assert run(words) == 0, words
-    library = elemental_set()
-    for line in sys.stdin.buffer:
-        answers.write(msgspec.json.encode(_tried(msgspec.json.decode(line, type=Trial), library)) + b"\n")
-
-
-def _tried(trial: Trial, library: ctypes.CDLL) -> Ended:
-    """Fork a process that runs a trial, and return how it ended."""
-    said, complaint, report = (os.fdopen(os.memfd_create(name), "w+b") for name in ("said", "complaint", "report"))
-    with said, complaint, report:
-        process = get_context("fork").Process(target=_child, args=(trial, library, said, complaint, report))
-        process.start()
-        process.join(trial.limit_s)
-        if process.exitcode is None:
-            process.kill()
-            process.join()
-            code = TIME_OVER
-        else:
-            code = process.exitcode
-        injected, _, stray = _content(report).partition(" ")
-        return Ended(code, _content(said), _content(complaint), int(injected or 0), stray)
-
-
-def _child(trial: Trial, library: ctypes.CDLL, said: IO[bytes], complaint: IO[bytes], report: IO[bytes]) -> None:
-    """Run a trial in this process, and end it."""
-    from faintfield.pipelines.cli import run
-
-    os.dup2(said.fileno(), 1)
-    os.dup2(complaint.fileno(), 2)
-    arm(library, trial.folder, trial.fault, trial.diary)
-    try:
-        code = run(trial.words)
-    except BaseException:
-        traceback.print_exc()
-        code = CRASHED
-    sys.stdout.flush()
-    sys.stderr.flush()
-    library.faults_disarm()
-    report.write(b"%d " % library.faults_injected() + library.faults_stray())
-    report.flush()
-    os._exit(code)
-
-
-def _content(file: IO[bytes]) -> str:
-    file.seek(0)
-    return file.read().decode(errors="replace")
-
-
-if __name__ == "__main__":
-    _serve(msgspec.json.decode(sys.argv[1], type=list[list[str]]))

@@ -1,7 +1,7 @@
 """A simulated bench, a camera that records where the stage truly is, and the session captured with both."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import msgspec
@@ -60,6 +60,21 @@ class TruthfulCamera:
         pass
 
 
+type Prepare = Callable[[Bench, TruthfulCamera], object]
+
+
+def at_exposures(numbers: Iterable[int], strike: Callable[[Bench], None], delay_s: float = 0.0) -> Prepare:
+    """Return what lets a fault strike when some exposures begin, or some time after."""
+
+    def prepare(bench: Bench, camera: TruthfulCamera) -> None:
+        def act() -> None:
+            bench.clock.after(delay_s, lambda: strike(bench)) if delay_s else strike(bench)
+
+        camera.on_exposure = dict.fromkeys(numbers, act)
+
+    return prepare
+
+
 def error_mm(path: Path, node: Point) -> float:
     """Return how far from a node the stage was during the exposure of a frame, at most; infinite if it moved."""
     places_mm = np.frombuffer(path.read_bytes()).reshape(-1, 2)
@@ -72,11 +87,7 @@ class Lab:
     """A bench and the session captured on it; a new bench for each run, as after switching everything off and on."""
 
     def __init__(
-        self,
-        folder: Path,
-        controller: Controller,
-        settings: RigSettings = SMALL_RIG,
-        link: MakeLink | None = None,
+        self, folder: Path, controller: Controller, settings: RigSettings = SMALL_RIG, link: MakeLink | None = None
     ) -> None:
         self.folder = folder
         self.controller = controller
@@ -87,9 +98,7 @@ class Lab:
         self._link = link
 
     def run(
-        self,
-        prepare: Callable[[Bench, TruthfulCamera], None] = lambda bench, camera: None,
-        operator: OperatorInterface | None = None,
+        self, prepare: Prepare = lambda bench, camera: None, operator: OperatorInterface | None = None
     ) -> RigError | None:
         """Capture; return how it failed, None when it did not."""
         frozen = read_plan(self.folder) if (self.folder / "plan.json").exists() else self.plan()

@@ -64,25 +64,14 @@ def _splice(path: Path, at: int, removed: int, added: str) -> None:
     path.write_bytes(content[:at] + bytes.fromhex(added) + content[at + removed :])
 
 
-_LINKS = ("/dev/zero", "/dev/full", "/dev/null", "/proc/self/mem", "/")
-_BECOMES = (
-    "missing",
-    "empty",
-    "folder",
-    "pipe",
-    "huge",
-    "itself",
-    "beside",
-    "victim",
-    "nowhere",
-    "unreadable",
-    *_LINKS,
-)
+_LINKS = ("/dev/zero", "/dev/full", "/dev/null", "/proc/self/mem", "/", f"@guard@/{VICTIM}", "@guard@/beside/new.txt")
+_BECOMES = ("missing", "folder", "pipe", "huge", "itself", "another", "unreadable", *_LINKS)
 
 
 def _become(path: Path, what: str) -> None:
-    content = path.read_bytes()
-    path.unlink()
+    other = path.rename(path.with_name(f"{path.name}.other")) if what == "another" else path
+    content = other.read_bytes()
+    path.unlink(missing_ok=True)
     match what:
         case "missing":
             pass
@@ -94,18 +83,11 @@ def _become(path: Path, what: str) -> None:
         case "huge":
             path.write_bytes(content)
             os.truncate(path, 3 << 30)
-        case "itself":
-            path.symlink_to(path.name)
-        case "beside":
-            path.with_name(f"{path.name}.other").write_bytes(content)
-            path.symlink_to(f"{path.name}.other")
-        case "victim":
-            path.symlink_to(guard_of(path) / VICTIM)
-        case "nowhere":
-            path.symlink_to(guard_of(path) / "beside" / "new.txt")
         case "unreadable":
             path.write_bytes(content)
             path.chmod(0)
+        case "itself" | "another":
+            path.symlink_to(other.name)
         case _:
             path.symlink_to(what)
 
@@ -163,12 +145,6 @@ def _read_tree(path: Path) -> Any:
     return tomllib.loads(content) if path.suffix == ".toml" else json.loads(content)
 
 
-def _write_tree(path: Path, tree: Any, raw: str = "") -> None:
-    """Write a tree in which the string `@@` stands for a raw text."""
-    text = tomli_w.dumps(tree) if path.suffix == ".toml" else json.dumps(tree)
-    path.write_text(text.replace('"@@"', raw), encoding="utf-8", errors="surrogatepass")
-
-
 def _value_at(tree: Any, place: Sequence[Any]) -> Any:
     for key in place:
         tree = tree[key]
@@ -187,34 +163,26 @@ def _draw_place(rng: Random, tree: Any) -> list[Any]:
 def _draw_set(rng: Random, path: Path) -> Arguments:
     tree = _read_tree(path)
     place = _draw_place(rng, tree)
+    kind = rng.random()
+    if kind < 0.2:
+        return [place, ""]
+    if kind < 0.4:
+        return [[*place[:-1], rng.choice([*_names("x")[:12], "@5000*x@", "inputs"])], _draw_raw(rng, None)]
     return [place, _draw_raw(rng, _value_at(tree, place))]
 
 
 def _set(path: Path, place: Sequence[Any], raw: str) -> None:
+    """Give a place a value as it will stand in the file, add one to a list, or remove that of the place if empty."""
     tree = _read_tree(path)
-    _value_at(tree, place[:-1])[place[-1]] = "@@"
-    _write_tree(path, tree, raw)
-
-
-def _remove(path: Path, place: Sequence[Any]) -> None:
-    tree = _read_tree(path)
-    del _value_at(tree, place[:-1])[place[-1]]
-    _write_tree(path, tree)
-
-
-def _draw_add(rng: Random, path: Path) -> Arguments:
-    place = _draw_place(rng, _read_tree(path))[:-1]
-    return [place, rng.choice([*_names("x")[:12], "@5000*x@", "inputs"]), _draw_raw(rng, None)]
-
-
-def _add(path: Path, place: Sequence[Any], key: str, raw: str) -> None:
-    tree = _read_tree(path)
-    holder = _value_at(tree, place)
-    if isinstance(holder, list):
+    holder = _value_at(tree, place[:-1])
+    if raw == "":
+        del holder[place[-1]]
+    elif isinstance(holder, list) and not isinstance(place[-1], int):
         holder.append("@@")
     else:
-        holder[key] = "@@"
-    _write_tree(path, tree, raw)
+        holder[place[-1]] = "@@"
+    text = tomli_w.dumps(tree) if path.suffix == ".toml" else json.dumps(tree)
+    path.write_text(text.replace('"@@"', raw), encoding="utf-8", errors="surrogatepass")
 
 
 _DIGEST = re.compile(rf',\s*"{DIGEST_KEY}":\s*"[^"]*"')
@@ -286,11 +254,7 @@ def _pixels(path: Path, shape: Sequence[int], kind: str, fill: str, pages: int, 
 
 _BYTES = {"flip": Operation(_draw_flips, _flip), "splice": Operation(_draw_splice, _splice, weight=2)}
 _FILE = {"become": Operation(lambda rng, _: [rng.choice(_BECOMES)], _become)}
-_TREE = {
-    "set": Operation(_draw_set, _set, weight=3),
-    "remove": Operation(lambda rng, path: [_draw_place(rng, _read_tree(path))], _remove),
-    "add": Operation(_draw_add, _add),
-}
+_TREE = {"set": Operation(_draw_set, _set)}
 _TEXT = {"word": Operation(_draw_word, _word), "line": Operation(_draw_line, _line)}
 _TIFF = {"pixels": Operation(_draw_pixels, _pixels)}
 _ALL = {**_BYTES, **_FILE, **_TREE, **_TEXT, **_TIFF, "sign": Operation(lambda *_: [], _sign)}

@@ -16,24 +16,22 @@ import shutil
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import dataclass
 from importlib import import_module
+from itertools import chain
 from pathlib import Path
 from random import Random
 from tempfile import TemporaryDirectory, mkdtemp
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 
 from faintfield.pipelines import registry
 from faintfield.pipelines.cli import run
 from faintfield.recon import compile_kernels
-from tests.faults import contained, mutation_operations
+from tests.faults import mutation_operations
+from tests.faults.contained import MAX_EXTRA_BYTES, ONE_THREAD, Ended, contained, faults_of, state_of
 from tests.faults.mutation_kinds import KINDS
 from tests.faults.mutation_operations import VICTIM
-
-# Threads would not survive the fork, and their stacks count as memory; libraries read these as they are loaded.
-ONE_THREAD = dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
 
 # A call of most commands, so that what they keep in memory is there before the fork.
 _EACH_COMMAND = (
@@ -51,26 +49,19 @@ _EACH_COMMAND = (
 CASES = Path(__file__).parent / "mutation_cases" / "cases.jsonl"
 
 
-@dataclass(frozen=True)
-class Case:
-    """One mutation: the kind of files, the words of the command, and what is done to which file."""
+class Case(NamedTuple):
+    """One mutation: its name or seed, the words of the command, and what is done to which file."""
 
-    kind: str
+    name: str
     call: str
-    edits: tuple[tuple[str, str, list[Any]], ...]
-
-    def __str__(self) -> str:
-        edits = "; ".join(f"{file}: {name} {json.dumps(arguments):.300}" for file, name, arguments in self.edits)
-        return f"{self.call}\n    {edits}"
+    edits: Sequence[tuple[str, str, list[Any]]]
 
 
 class Bench:
     """The valid files of a kind, kept in a folder, where they are copied and mutated and the commands run."""
 
-    def __init__(self, folder: Path, kind: str) -> None:
-        self.ended: contained.Ended
-        self.mutated = False
-        self._name, self._kind = kind, KINDS[kind]
+    def __init__(self, folder: Path, name: str) -> None:
+        self._name, self._kind = name, KINDS[name]
         self._valid, self._guard = folder / "valid", folder / "case"
         (self._valid / "beside").mkdir(parents=True)
         (self._valid / "beside" / "notes.txt").write_text("of someone else\n")
@@ -80,9 +71,9 @@ class Bench:
             self._kind.seed(self._valid / "IN")
             return 0
 
-        made = contained.contained(seed, folder, seconds=600.0)
+        made = contained(seed, folder, seconds=600.0)
         if made.code != 0:
-            raise RuntimeError(f"{kind}: cannot be made: {made.err}")
+            raise RuntimeError(f"{name}: cannot be made: {made.err}")
 
     def draw(self, seed: int) -> Case:
         """Return the case of a seed."""
@@ -101,24 +92,34 @@ class Bench:
             mutation_operations.apply(path, name, arguments)
         if rng.random() < 0.4:
             edits += [(file, "sign", []) for file, *_ in edits if file.endswith(".json")]
-        return Case(self._name, call, tuple(edits))
+        return Case(str(seed), call, edits)
 
-    def faults(self, case: Case) -> list[str]:
-        """Return what is wrong with how a command ended on the files of a case; nothing if all is well."""
+    def known(self) -> Iterator[Case]:
+        """Yield a case of valid files for each command, and the kept cases."""
+        yield from (Case("valid", call.words, ()) for call in self._kind.calls)
+        for kept in map(json.loads, CASES.read_text().splitlines()):
+            if kept["kind"] == self._name:
+                yield Case(kept["name"], kept["call"], kept["edits"])
+
+    def run(self, case: Case) -> tuple[Ended, list[str]]:
+        """Return how the command of a case ended, and what is wrong with that."""
         self._lay_out()
-        clean = contained.state_of(self._guard)
-        call = next(call for call in self._kind.calls if call.words == case.call)
+        clean = state_of(self._guard)
         for file, name, arguments in case.edits:
             mutation_operations.apply(self._guard / "IN" / file, name, arguments)
-        before = contained.state_of(self._guard)
-        self.mutated = before != clean
-        self.ended = contained.contained(lambda: run(call.words.split()), self._guard)
-        faults = contained.faults_of(self.ended, self._guard, before, call.may_change, call.copies)
-        if self.ended.code == 0 and call.then:
-            then = contained.contained(lambda: run(call.then.split()), self._guard)
+        before = state_of(self._guard)
+        call = next(call for call in self._kind.calls if call.words == case.call)
+        ended = contained(lambda: run(call.words.split()), self._guard)
+        faults = faults_of(ended, self._guard, before, call.may_change, call.copies)
+        if ended.code == 0 and call.then:
+            then = contained(lambda: run(call.then.split()), self._guard)
             if then.code != 0:
                 faults.append(f"ended well, and then `{call.then}` did not: {then.err[-300:]}")
-        return faults
+        if not case.edits and ended.code != 0:
+            faults.append(f"cannot read valid files: {ended.err}")
+        if case.edits and before == clean and not case.name.isdecimal():
+            faults.append("nothing was mutated: this case is of an earlier format")
+        return ended, faults
 
     def _lay_out(self) -> None:
         """Lay out the valid files in a folder that also holds files of another owner."""
@@ -130,7 +131,7 @@ def warm_up() -> None:
     """Load what commands load when they are first used, so that children inherit it."""
     cv2.setNumThreads(1)
     # A mutation of a huge file must fail here, not take the memory of all
-    resource.setrlimit(resource.RLIMIT_DATA, (2 * contained.MAX_EXTRA_BYTES, resource.RLIM_INFINITY))
+    resource.setrlimit(resource.RLIMIT_DATA, (2 * MAX_EXTRA_BYTES, resource.RLIM_INFINITY))
     folder = Path(registry.__file__).parent / "commands"
     for path in folder.rglob("*.py"):
         module = ".".join(path.relative_to(folder).with_suffix("").parts)
@@ -146,54 +147,30 @@ def warm_up() -> None:
         raise RuntimeError("this process has threads, which would not survive a fork")
 
 
-def _described(bench: Bench, name: str, case: Case) -> list[str]:
-    """Run a case; return its description and its faults as one text, if it has faults."""
-    faults = bench.faults(case)
-    if not case.edits and bench.ended.code != 0:
-        faults.append(f"cannot read valid files: {bench.ended.err}")
-    if case.edits and not (bench.mutated or name.isdecimal()):
-        faults.append("nothing was mutated: this case is of an earlier format")
-    kept = json.dumps({"kind": case.kind, "call": case.call, "edits": case.edits})
-    words = kept if len(kept) < 2000 else ""
-    return ["\n    ".join([f"{case.kind} {name}: {case}", words, *faults])] if faults else []
-
-
-def _known(kind: str) -> Iterator[tuple[str, Case]]:
-    """Yield a case of valid files for each command, and the kept cases of a kind, each with its name."""
-    for call in KINDS[kind].calls:
-        yield "valid", Case(kind, call.words, ())
-    for line in CASES.read_text().splitlines():
-        kept = json.loads(line)
-        if kept["kind"] == kind:
-            yield kept["name"], Case(kind, kept["call"], tuple(kept["edits"]))
-
-
-def main(arguments: Sequence[str]) -> int:
+def main(kind: str, seeds: str) -> int:
     """Run the cases of a kind that are asked for, and return the exit code."""
-    kind, seeds = arguments
     first, _, last = seeds.partition(":")
-    failed = []
+    failures = 0
     warm_up()
     # Not TemporaryDirectory: a child, which runs what Python does at its end, would remove it
     folder = Path(mkdtemp(prefix="mutations-"))
     try:
         bench = Bench(folder, kind)
-        for name, case in _known(kind) if last else ():
-            failed += _described(bench, name, case)
-        for seed in range(int(first), int(last or int(first) + 1)):
-            case = bench.draw(seed)
-            failed += _described(bench, str(seed), case)
-        if not last:
-            ended = bench.ended
-            sys.stdout.write(f"{case}\n    exit code {ended.code}, {ended.seconds:.2f} s\n{ended.out}{ended.err}")
+        drawn = (bench.draw(seed) for seed in range(int(first), int(last or int(first) + 1)))
+        for case in chain(bench.known() if last else (), drawn):
+            ended, faults = bench.run(case)
+            failures += bool(faults)
+            if faults or not last:
+                words = json.dumps({"kind": kind} | case._asdict())
+                result = f"exit code {ended.code}, {ended.seconds:.2f} s\n{ended.out}{ended.err}"
+                sys.stdout.write("\n    ".join([f"{words:.3000}", *faults, result]))
     finally:
         shutil.rmtree(folder)
-    sys.stdout.write("".join(f"{text}\n" for text in failed))
-    return 1 if failed else 0
+    return 1 if failures else 0
 
 
 if __name__ == "__main__":
     if not os.environ.items() >= ONE_THREAD.items():
         words = [sys.executable, "-m", "tests.faults.mutations", *sys.argv[1:]]
         os.execve(sys.executable, words, os.environ | ONE_THREAD)
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main(*sys.argv[1:]))

@@ -91,7 +91,9 @@ def _restart_unseen(bench: Bench) -> None:
     _silence(bench, bench.wire.filters_to_host, bench.firmware.boot_s + 0.1)
 
 
-def _unplug_for(duration_s: float) -> Callable[[Bench], None]:
+def unplug_for(duration_s: float) -> Callable[[Bench], None]:
+    """Return what unplugs a bench, and plugs it in again later."""
+
     def strike(bench: Bench) -> None:
         bench.unplug()
         bench.clock.after(duration_s, bench.plug)
@@ -187,8 +189,8 @@ _COMMON = (
     Fault("babble", "wire", _babble),
     Fault("every line damaged", "wire", _damage_every_line),
     Fault("unplugged", "wire", Bench.unplug),
-    Fault("unplugged and back", "wire", _unplug_for(0.3)),
-    Fault("port gone for three seconds", "wire", _unplug_for(3.0)),
+    Fault("unplugged and back", "wire", unplug_for(0.3)),
+    Fault("port gone for three seconds", "wire", unplug_for(3.0)),
     Fault("computer busy", "wire", _keep_host_busy),
     Fault("restart", "controller", lambda bench: bench.firmware.restart()),
     Fault("restart unseen", "controller", _restart_unseen),

@@ -1,25 +1,24 @@
-"""A page under siege: silent and slow connections and bad requests leave the capture alone."""
+"""A page under siege: silent connections and bad requests leave the capture alone."""
 
 import http.client
-import itertools
 import json
-import multiprocessing
 import re
 import resource
 import socket
 import subprocess
 import sys
+import threading
 import urllib.request
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from multiprocessing.connection import Connection
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
 
 from faintfield.rig.session.verify import verify
-from tests.faults.capturing import FRAMES, in_process
+from tests.faults.capturing import FRAMES
 from tests.patience import HANG_S
 
 _PATIENCE_S = 60.0
@@ -34,46 +33,21 @@ capture_session(SMALL_RIG, Path(sys.argv[1]), unattended=False, page=True)
 """
 
 
-def besiege(address: str, idle: int, slow: int, body_bytes: int, signal: Connection) -> None:
-    """Open `idle` silent and `slow` slow connections, and go round all bad requests until told to stop.
-
-    One message is sent when all connections were opened and each bad request was made once; another message ends it.
-    """
-    resource.setrlimit(resource.RLIMIT_NOFILE, (idle + slow + 100, resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
-    silent = [_connect(address) for _ in range(idle)]
-    dripping = [_Dripping(address) for _ in range(slow)]
-    bad = list(_bad_requests(address, body_bytes))
-    for round_number, request in enumerate(itertools.cycle(bad), 1):
-        for one in dripping:
-            one.drip()
-        _make(address, request)
-        if round_number == len(bad):
-            signal.send("all")
-        if signal.poll():
-            break
-    for connection in (*silent, *(one.connection for one in dripping)):
-        connection.close()
-
-
-class _Dripping:
-    """A connection that sends a request byte by byte, and comes again when it is closed."""
-
-    def __init__(self, address: str) -> None:
-        self._address = address
-        self._open()
-
-    def drip(self) -> None:
-        try:
-            self.connection.send(next(self._bytes))
-        except BlockingIOError:  # not connected yet
-            pass
-        except (OSError, StopIteration):
-            self.connection.close()
-            self._open()
-
-    def _open(self) -> None:
-        self.connection = _connect(self._address)
-        self._bytes = (bytes([letter]) for letter in b"GET /" + b"x" * 10_000)
+def besiege(address: str, idle: int, body_bytes: int, made: threading.Event, stop: threading.Event) -> None:
+    """Open silent connections, and go round all bad requests until told to stop; `made` is set after one round."""
+    place = (urlsplit(address).hostname or "", urlsplit(address).port or 0)
+    with ExitStack() as stack:
+        for _ in range(idle):
+            silent = stack.enter_context(socket.socket())
+            silent.setblocking(False)
+            silent.connect_ex(place)
+        while not stop.is_set():
+            for beginning, more in _bad_requests(address, body_bytes):
+                with suppress(OSError), socket.create_connection(place, _PATIENCE_S) as connection:
+                    connection.sendall(beginning)
+                    for _ in range(more // len(_CHUNK)):
+                        connection.sendall(_CHUNK)
+            made.set()
 
 
 def _bad_requests(address: str, body_bytes: int) -> Iterator[tuple[bytes, int]]:
@@ -96,28 +70,6 @@ def _bad_requests(address: str, body_bytes: int) -> Iterator[tuple[bytes, int]]:
     yield b"\r\n\r\n\r\n\x00\x00", 0
     yield (b"GET " + token + b"frame.png HTTP/1.1\r\n" + host + b"\r\n") * 1000, 0
     yield b"", 0
-
-
-def _connect(address: str) -> socket.socket:
-    """Begin to connect, without waiting for the other side."""
-    parts = urlsplit(address)
-    connection = socket.socket()
-    connection.setblocking(False)
-    connection.connect_ex((parts.hostname, parts.port))
-    return connection
-
-
-def _make(address: str, request: tuple[bytes, int]) -> None:
-    """Send a request until all is sent or the other side has closed, and go without an answer."""
-    beginning, more = request
-    parts = urlsplit(address)
-    try:
-        with socket.create_connection((parts.hostname, parts.port or 0), _PATIENCE_S) as connection:
-            connection.sendall(beginning)
-            for _ in range(more // len(_CHUNK)):
-                connection.sendall(_CHUNK)
-    except OSError:
-        pass
 
 
 class Capture:
@@ -152,15 +104,19 @@ class Capture:
 
 
 @contextmanager
-def besieged(address: str, idle: int, slow: int, body_bytes: int) -> Iterator[None]:
+def besieged(address: str, idle: int, body_bytes: int) -> Iterator[None]:
     """Besiege a page while the block runs, which begins when every connection is open and every request was made."""
-    signal, other_end = multiprocessing.Pipe()
-    besieger = in_process(besiege, address, idle, slow, body_bytes, other_end)
-    assert signal.poll(HANG_S), "the page takes no more requests"
-    yield
-    signal.send("stop")
-    besieger.join(HANG_S)
-    assert besieger.exitcode == 0
+    _, most_files = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(idle + 1000, most_files), most_files))
+    made, stop = threading.Event(), threading.Event()
+    with ThreadPoolExecutor() as threads:
+        siege = threads.submit(besiege, address, idle, body_bytes, made, stop)
+        try:
+            assert made.wait(HANG_S), "the page takes no more requests"
+            yield
+        finally:
+            stop.set()
+        siege.result()
 
 
 @pytest.mark.deep
@@ -179,7 +135,7 @@ def test_besieged_page_leaves_capture_alone(tmp_path: Path) -> None:
             # Whatever a capture and its page need has been in memory once: forget its highest value
             Path(f"/proc/{process.pid}/clear_refs").write_text("5")
             before_mb = capture.memory_mb("VmRSS")
-            with besieged(address, idle=2000, slow=200, body_bytes=600_000_000):
+            with besieged(address, idle=2000, body_bytes=600_000_000):
                 capture.go_on("Step 2 of 3: Dark-scene set")
                 capture.wait_for("Step 3 of 3: Dark frames")
                 assert capture.memory_mb("VmHWM") - before_mb < 50.0

@@ -1,8 +1,6 @@
-"""A lost cable or camera, a full disk, a read-only folder: a named failure or a recovery; the session stays whole."""
+"""A lost cable or camera, lost steps: a named failure or a recovery; the session stays whole."""
 
-import resource
-import signal
-from collections.abc import Callable, Container, Iterable
+from collections.abc import Container
 from pathlib import Path
 from unittest import mock
 
@@ -12,29 +10,23 @@ import pytest
 
 from faintfield.rig.cameras.protocol import Exposure
 from faintfield.rig.capture.guide import Answer, Prompt, Status
-from faintfield.rig.capture.loop import Capture
-from faintfield.rig.capture.survey import survey
 from faintfield.rig.capture.take import DriftChecks
-from faintfield.rig.devices import open_rig
-from faintfield.rig.errors import CameraError, CaptureStopped, SessionUnwritable
+from faintfield.rig.errors import CameraError, CaptureStopped
 from faintfield.rig.session.disk import encode_exposure
 from faintfield.rig.session.homings import DriftCheck, homing_groups, read_homing_groups
 from faintfield.rig.session.journal import Journal
-from faintfield.rig.session.resume import open_session
-from faintfield.rig.session.session import FrozenPlan, is_sealed, taken_frames
+from faintfield.rig.session.session import is_sealed, taken_frames
 from faintfield.rig.session.verify import verify
 from faintfield.rig.settings import DriftSettings, StepSettings
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
-from tests.faults.capturing import FRAMES, SMALL_RIG, Unattended, capture_small, drop_rights, in_process
-from tests.faults.laboratory import ON_TARGET_MM, Lab, TruthfulCamera, error_mm
-from tests.patience import HANG_S
+from tests.faults.capturing import FRAMES, SMALL_RIG, Unattended
+from tests.faults.laboratory import ON_TARGET_MM, Lab, at_exposures, error_mm
+from tests.faults.stage_faults import unplug_for
 from tests.rig.stages.benches import CONTROLLERS, Controller
 
 DRIFTING = msgspec.structs.replace(SMALL_RIG, drift=DriftSettings())
 GRBL, _, MARLIN = CONTROLLERS
-
-type Prepare = Callable[[Bench, TruthfulCamera], None]
 
 
 def test_cause_of_failed_recovery_is_recorded(tmp_path: Path) -> None:
@@ -45,11 +37,7 @@ def test_cause_of_failed_recovery_is_recorded(tmp_path: Path) -> None:
         def show_status(self, status: Status) -> None:
             told.extend(status.warnings)
 
-    def vanish(bench: Bench) -> None:
-        bench.unplug()
-        bench.clock.after(90.0, bench.plug)
-
-    assert lab.run(at_exposures([3], vanish), Watching()) is None
+    assert lab.run(at_exposures([3], unplug_for(90.0)), Watching()) is None
     lab.assert_true_positions()
     with Journal(lab.folder / "journal.sqlite", read_only=True) as journal:
         (failed,) = journal.events("recovery_failed")
@@ -58,15 +46,6 @@ def test_cause_of_failed_recovery_is_recorded(tmp_path: Path) -> None:
     assert failed.detail["error"] == "StageLost"
     assert "unplugged" in str(failed.detail["message"])
     assert any("the stage was not recovered: " in warning and "unplugged" in warning for warning in told)
-
-
-def at_exposures(numbers: Iterable[int], strike: Callable[[Bench], None]) -> Prepare:
-    """Return what lets a fault strike when some exposures begin."""
-
-    def prepare(bench: Bench, camera: TruthfulCamera) -> None:
-        camera.on_exposure = dict.fromkeys(numbers, lambda: strike(bench))
-
-    return prepare
 
 
 def slip(bench: Bench, by_mm: float = -3.0) -> None:
@@ -249,55 +228,6 @@ def test_failing_camera(tmp_path: Path, failures: int) -> None:
     with Journal(lab.folder / "journal.sqlite", read_only=True) as journal:
         assert len(journal.events("camera_failed")) == failures
         assert len(journal.uncommitted()) == failures
-
-
-def limited_capture(folder: Path, room_bytes: int) -> None:
-    """Capture while no file may grow beyond a size, as on a disk without room; SQLite's files are smaller."""
-    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (room_bytes, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
-    with pytest.raises(SessionUnwritable, match=r"; "):
-        capture_small(folder)
-
-
-@pytest.mark.parametrize(
-    "room_bytes", [80_000, *(pytest.param(room, marks=pytest.mark.deep) for room in (100, 600, 40_000))]
-)
-def test_full_disk_then_resume(tmp_path: Path, room_bytes: int) -> None:
-    folder = tmp_path / "session"
-    process = in_process(limited_capture, folder, room_bytes)
-    process.join(HANG_S)
-    assert process.exitcode == 0
-    assert not list(folder.glob("frames/*.part"))
-    capture_small(folder)
-    verdict = verify(folder)
-    assert verdict.problems == ()
-    assert (verdict.present, verdict.sealed) == (FRAMES, True)
-
-
-def capture_read_only(folder: Path, place: str) -> None:
-    """Capture; a folder becomes read-only after some frames."""
-    drop_rights()
-    taken = iter(range(FRAMES))
-
-    class Interfering(Unattended):
-        def show_status(self, status: object) -> None:
-            if next(taken) == 6:
-                (folder / place).chmod(0o500)
-
-    plan = FrozenPlan(survey(open_rig(SMALL_RIG), SMALL_RIG).plan, SMALL_RIG)
-    with open_session(folder, plan) as session, pytest.raises(SessionUnwritable, match=r"make the folder writable"):
-        Capture(session, open_rig(SMALL_RIG, session.journal), Interfering(), lambda path: None).run()
-
-
-def test_folder_made_read_only_then_resume(tmp_path: Path) -> None:
-    folder = tmp_path / "session"
-    process = in_process(capture_read_only, folder, "frames")
-    process.join(HANG_S)
-    assert process.exitcode == 0
-    (folder / "frames").chmod(0o700)
-    assert 0 < len(list((folder / "frames").iterdir())) < FRAMES
-    capture_small(folder)
-    assert verify(folder).problems == ()
 
 
 def test_bytes_of_the_camera_are_kept() -> None:

@@ -2,6 +2,7 @@
 
 import tempfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -14,10 +15,9 @@ from faintfield.rig.session.session import is_sealed, taken_frames
 from faintfield.rig.session.verify import verify
 from faintfield.rig.settings import DriftSettings
 from faintfield.rig.simulation.controller.bench import Bench, PtyLink
-from faintfield.rig.stages.protocol import Point
 from tests.faults.capturing import SMALL_RIG
-from tests.faults.laboratory import ON_TARGET_MM, Lab, MakeLink, TruthfulCamera, error_mm
-from tests.faults.stage_faults import FAULTS, Fault, faults_of
+from tests.faults.laboratory import ON_TARGET_MM, Lab, MakeLink, Prepare, TruthfulCamera, at_exposures, error_mm
+from tests.faults.stage_faults import FAULTS, Fault, faults_of, unplug_for
 from tests.rig.stages.benches import CONTROLLERS, Controller
 from tests.rig.stages.socket_link import SocketLink
 
@@ -26,33 +26,12 @@ FRAMES_ON_GRID = 12  # of SMALL_RIG; the last frames, at the centre, are dark
 FAULTS_PER_CAPTURE = 6
 LONGEST_S = 900.0  # of the simulated clock
 
-type Prepare = Callable[[Bench, TruthfulCamera], None]
-
-
-def at_exposure(number: int, fault: Fault, delay_s: float = 0.0) -> Prepare:
-    """Return what lets a fault strike some time after an exposure begins."""
-
-    def prepare(bench: Bench, camera: TruthfulCamera) -> None:
-        def strike() -> None:
-            bench.clock.after(delay_s, lambda: fault.strike(bench))
-
-        camera.on_exposure = {number: strike if delay_s else lambda: fault.strike(bench)}
-
-    return prepare
-
-
-def at_time(after_s: float, fault: Fault) -> Prepare:
-    def prepare(bench: Bench, camera: TruthfulCamera) -> None:
-        bench.clock.after(after_s, lambda: fault.strike(bench))
-
-    return prepare
-
 
 MOMENTS: dict[str, Callable[[Fault], Prepare]] = {
-    "connecting": lambda fault: at_time(1.02, fault),
-    "homing": lambda fault: at_time(5.0, fault),
-    "exposing": lambda fault: at_exposure(3, fault),
-    "moving": lambda fault: at_exposure(3, fault, 0.35),
+    "connecting": lambda fault: lambda bench, camera: bench.clock.after(1.02, lambda: fault.strike(bench)),
+    "homing": lambda fault: lambda bench, camera: bench.clock.after(5.0, lambda: fault.strike(bench)),
+    "exposing": lambda fault: at_exposures([3], fault.strike),
+    "moving": lambda fault: at_exposures([3], fault.strike, 0.35),
 }
 
 
@@ -81,38 +60,25 @@ def test_each_fault_spoils_no_frame(controller: Controller, moment: str, tmp_pat
     assert wrong == {}
 
 
-def _disconnected(controller: Controller, link: MakeLink, name: str, folder: Path) -> None:
-    fault = next(fault for fault in FAULTS if fault.name == name)
-    capture_with(Lab(folder, controller, link=link), at_exposure(3, fault, 0.35))
-
-
-def test_pulled_cable_ends_no_capture(tmp_path: Path) -> None:
-    _disconnected(CONTROLLERS[0], PtyLink, "unplugged and back", tmp_path / "session")
-
-
 @pytest.mark.deep
 @pytest.mark.parametrize("controller", CONTROLLERS)
 @pytest.mark.parametrize("link", [PtyLink, SocketLink])
 @pytest.mark.parametrize("name", ["unplugged", "restart", "noise", "controller mute"])
 def test_faults_of_a_real_port(controller: Controller, link: MakeLink, name: str, tmp_path: Path) -> None:
-    _disconnected(controller, link, name, tmp_path / "session")
+    fault = next(fault for fault in FAULTS if fault.name == name)
+    capture_with(Lab(tmp_path / "session", controller, link=link), at_exposures([3], fault.strike, 0.35))
 
 
 @pytest.mark.parametrize(("controller", "gone_s"), [*zip(CONTROLLERS, (3.0, 30.0, 3.0), strict=True)])
 def test_port_that_returns_ends_no_capture(tmp_path: Path, controller: Controller, gone_s: float) -> None:
     lab = Lab(tmp_path / "session", controller, msgspec.structs.replace(SMALL_RIG, drift=DriftSettings(every_nodes=2)))
-
-    def vanish(bench: Bench) -> None:
-        bench.unplug()
-        bench.clock.after(gone_s, bench.plug)
-
-    assert lab.run(at_exposure(3, Fault("gone", "wire", vanish), 0.4)) is None
+    assert lab.run(at_exposures([3], unplug_for(gone_s), 0.4)) is None
     lab.assert_true_positions()
 
 
 def test_port_that_stays_away_is_given_up(tmp_path: Path) -> None:
     lab = Lab(tmp_path / "session", CONTROLLERS[0])
-    assert isinstance(lab.run(at_exposure(3, Fault("gone", "wire", Bench.unplug))), StageLost)
+    assert isinstance(lab.run(at_exposures([3], Bench.unplug)), StageLost)
     assert 120.0 < lab.ended_s < 240.0
     assert lab.run() is None
     lab.assert_true_positions()
@@ -120,8 +86,8 @@ def test_port_that_stays_away_is_given_up(tmp_path: Path) -> None:
 
 def test_stage_jogged_during_exposure_repeats_frame(tmp_path: Path) -> None:
     lab = Lab(tmp_path / "session", CONTROLLERS[0])
-    jog = Fault("jog", "controller", lambda bench: bench.firmware.receive(b"$J=G91 G21 X-0.5 F6000\n"))
-    assert lab.run(at_exposure(3, jog)) is None
+    jog = b"$J=G91 G21 X-0.5 F6000\n"
+    assert lab.run(at_exposures([3], lambda bench: bench.firmware.receive(jog))) is None
     lab.assert_true_positions()
     with Journal(lab.folder / "journal.sqlite", read_only=True) as journal:
         assert [frame for _, frame in journal.uncommitted()] == [2]
@@ -143,7 +109,7 @@ def capture_with_random_faults(controller: Controller, generator: np.random.Gene
 
     def prepare(bench: Bench, camera: TruthfulCamera) -> None:
         for at_s, fault in zip(times_s, drawn, strict=True):
-            at_time(at_s, fault)(bench, camera)
+            bench.clock.after(at_s, partial(fault.strike, bench))
 
     # In memory if possible, since journals flush after each entry
     with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as folder:
@@ -172,24 +138,3 @@ def test_random_faults_spoil_no_frame(controller: Controller, captures: int, tmp
     generator = np.random.default_rng(20)
     for _ in range(captures):
         capture_with_random_faults(controller, generator, lab.ended_s)
-
-
-def test_camera_of_the_laboratory_sees_motion(tmp_path: Path) -> None:
-    bench = Bench(CONTROLLERS[0])
-    stage = bench.stage()
-    stage.connect()
-    stage.home()
-    stage.move_to(-100.0, -100.0)
-    camera, errors_mm = TruthfulCamera(bench), []
-    motions: list[Callable[[], None]] = [
-        lambda: None,
-        lambda: bench.firmware.mechanics.queue((-101.0, -100.0), 50.0, 500.0),
-        lambda: setattr(bench.firmware.mechanics.axes[0], "slip_mm", 0.02),
-        lambda: None,
-    ]
-    for number, motion in enumerate(motions):
-        bench.clock.after(0.05, motion)
-        (tmp_path / "frame").write_bytes(camera.expose(0.1, number).content or b"")
-        errors_mm.append(error_mm(tmp_path / "frame", Point(-101.0, -100.0)))
-        bench.clock.sleep_s(1.0)
-    assert errors_mm == pytest.approx([1.0, np.inf, np.inf, 0.02])

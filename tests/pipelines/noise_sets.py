@@ -54,3 +54,14 @@ def measure_sensor(folder: Path, out: Path | None = None) -> NoiseRecord:
         mock.patch(f"{pages}.emva_page.emva_page", return_value="page"),
     ):
         return noise(folder, out=out)
+
+
+def deviation_of_snr(snr: float, mean_e: NDArray[np.float64], read_e2: float, region: NDArray[np.bool_]) -> float:
+    """Return the deviation of a measured SNR, <g²> / <n²> - 1, whose g are the pixels of a region.
+
+    Means of squares of m ± s: the variance is 2 s⁴ + 4 m² s² and, for a Poisson count, m + 4 m² more, over the number
+    of pixels.
+    """
+    variance = mean_e + read_e2
+    of_object = np.mean(2 * variance**2 + 4 * mean_e**2 * variance + mean_e + 4 * mean_e**2) / region.sum()
+    return float(np.sqrt(of_object + (1 + snr) ** 2 * 2 * read_e2**2 / region.size) / read_e2)

@@ -12,9 +12,7 @@ import pytest
 
 from faintfield.calib.board import Board
 from faintfield.calib.geometry import BoardObservation, GeometrySettings, Node, Target, calibrate_geometry
-from faintfield.pipelines import cli
 from faintfield.pipelines.commands.board import board
-from faintfield.pipelines.commands.exports.mrcal import export_mrcal
 from faintfield.pipelines.commands.geometry import GeometrySummary, geometry
 from faintfield.pipelines.commands.imports.mrcal import import_mrcal
 from faintfield.pipelines.commands.simulate import simulate
@@ -31,7 +29,9 @@ from faintfield.pipelines.formats.sets.board_set import load_board_set
 from faintfield.pipelines.formats.sets.elemental_set import load_set, with_measured_geometry
 from faintfield.pipelines.formats.sets.ground_truth import read_truth
 from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
+from tests.pipelines.conftest import Command
 from tests.pipelines.forms import check_layout
+from tests.pipelines.refusals import assert_refused
 from tests.simulated_boards import simulate_board_set
 
 BOARDS = [Board(f"b{index}", 9, 7, 40.0, 29.0, "DICT_4X4_250", 31 * index) for index in range(4)]
@@ -85,23 +85,17 @@ def test_files_hold_true_poses(measured: tuple[Path, GeometrySummary], scene: Pa
         np.testing.assert_allclose(pixels, record.camera_lens().project(point), atol=1e-4)
 
 
-def read_corners(path: Path) -> list[BoardObservation]:
-    """Return the corners that a geometry was found from, as they are stored beside it."""
-    with np.load(path, allow_pickle=False) as stored:
-        arrays = {name: stored[name] for name in ("pixels", "sigma_px", "corner", "node", "sweep", "board")}
+def test_stored_corners_give_the_same_geometry(measured: tuple[Path, GeometrySummary]) -> None:
+    folder, _ = measured
+    content = read_geometry(folder, GeometryRecord)
+    with np.load(folder / CORNERS_FILE, allow_pickle=False) as stored:
+        arrays = dict(stored)
     groups: dict[tuple[Node, Target], list[int]] = {}
     for row, (node, sweep, name) in enumerate(zip(arrays["node"], arrays["sweep"], arrays["board"], strict=True)):
         groups.setdefault(((int(node[0]), int(node[1])), Target(str(name), int(sweep))), []).append(row)
     per_row = (arrays["corner"], arrays["pixels"], arrays["sigma_px"])
-    return [BoardObservation(*key, *(values[rows] for values in per_row)) for key, rows in groups.items()]
-
-
-def test_stored_corners_give_the_same_geometry(measured: tuple[Path, GeometrySummary]) -> None:
-    folder, _ = measured
-    content = read_geometry(folder, GeometryRecord)
-    corners = read_corners(folder / CORNERS_FILE)
-    names = Board.__dataclass_fields__
-    boards = {entry.name: Board(**{name: getattr(entry, name) for name in names}) for entry in content.boards}
+    corners = [BoardObservation(*key, *(values[rows] for values in per_row)) for key, rows in groups.items()]
+    boards = {board.name: board for board in BOARDS}
     again = calibrate_geometry(boards, corners, content.size_px, content.reference_node, GeometrySettings())
     pixels, here = np.array([[20.0, 30.0], [160.0, 100.0], [300.0, 200.0]]), content.camera_lens()
     points = np.column_stack([here.rays_at(pixels), np.ones(3)]) * 600.0
@@ -112,15 +106,12 @@ def test_stored_corners_give_the_same_geometry(measured: tuple[Path, GeometrySum
 
 def test_hand_written_geometry_needs_lens_and_poses_only(scene: Path, tmp_path: Path) -> None:
     poses = [[0.0, 0.0, 0.0, -100.0 * (column - 1), -100.0 * (row - 1), 0.0] for row, column in np.ndindex(3, 3)]
-    content = {
-        "lens": {"model": "pinhole", "fx_px": 390.0, "fy_px": 390.0, "cx_px": 159.0, "cy_px": 119.0, "distortion": []},
-        "size_px": [320, 240],
-        "reference_node": [1, 1],
-        "nodes": [
-            {"node": node, "rt_cam_ref": pose, "sigma_mm": 0.1, "sigma_rad": 1e-4}
-            for node, pose in zip(np.ndindex(3, 3), poses, strict=True)
-        ],
-    }
+    lens = {"model": "pinhole", "fx_px": 390.0, "fy_px": 390.0, "cx_px": 159.0, "cy_px": 119.0, "distortion": []}
+    nodes = [
+        {"node": node, "rt_cam_ref": pose, "sigma_mm": 0.1, "sigma_rad": 1e-4}
+        for node, pose in zip(np.ndindex(3, 3), poses, strict=True)
+    ]
+    content = {"lens": lens, "size_px": [320, 240], "reference_node": [1, 1], "nodes": nodes}
     (tmp_path / "geometry.json").write_text(json.dumps(content))
     elemental_set = with_measured_geometry(load_set(scene), tmp_path)
     assert elemental_set.lens.fx_px == 390.0
@@ -148,60 +139,20 @@ def test_poses_of_another_camera_are_refused(
         with_measured_geometry(elemental_set, tmp_path)
 
 
-def test_one_board_only_is_refused_in_one_line(
-    measured: tuple[Path, GeometrySummary], capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    folder, _ = measured
-    head, *images = (folder / "charuco.toml").read_text().split("[[image]]")
-    for path in folder.glob("b0_*.tiff"):
-        (tmp_path / path.name).write_bytes(path.read_bytes())
-    (tmp_path / "charuco.toml").write_text("[[image]]".join([head, *(part for part in images if "b0_" in part)]))
-    assert cli.run(["geometry", str(tmp_path)]) == 1
-    last = capsys.readouterr().err.strip().splitlines()[-1]
-    assert last.startswith("faintfield: NotIdentifiable: ")
-    assert "1 board pose(s) only" in last
-    assert not (tmp_path / "geometry.json").exists()
-
-
-def test_export_without_mrcal_is_a_named_failure(
-    scene: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.setitem(sys.modules, "mrcal", None)
-    capsys.readouterr()
-    assert cli.run(["export", "mrcal", str(scene), str(tmp_path / "out")]) == 1
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert line.startswith("faintfield: MissingMrcal: ")
-    assert "pip install" in line
-    assert not (tmp_path / "out").exists()
-
-
-BOARD_TOML = """format = 1
-[[board]]
-name = "a"
-columns = 9
-rows = 7
-square_mm = 40.0
-marker_mm = 29.0
-dictionary = "DICT_4X4_250"
-"""
+BOARD = 'name = "a", columns = 9, rows = 7, square_mm = 40.0, marker_mm = 29.0, dictionary = "DICT_4X4_250"'
+IMAGE = 'image = [{ file = "no.tiff", node = [0, 0], sweep = 0 }]'
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("boards", "words"),
     [
-        (BOARD_TOML + '[[image]]\nfile = "no.tiff"\nnode = [0, 0]\nsweep = 0\n', "no.tiff is named but missing"),
-        (BOARD_TOML.replace("columns", "colums"), "did you mean 'columns'"),
-        (
-            BOARD_TOML + BOARD_TOML[11:].replace('"a"', '"b"') + '[[image]]\nfile = "a"\nnode = [0, 0]\n',
-            "share markers 0 to 30",
-        ),
+        (f"{{ {BOARD} }}", "no.tiff is named but missing"),
+        ("{ colums = 9 }", "did you mean 'columns'"),
+        (f"{{ {BOARD} }}, {{ {BOARD.replace('"a"', '"b"')} }}", "share markers 0 to 30"),
     ],
 )
-def test_bad_board_sets_are_refused(text: str, words: str, tmp_path: Path) -> None:
-    (tmp_path / "charuco.toml").write_text(text)
+def test_bad_board_sets_are_refused(boards: str, words: str, tmp_path: Path) -> None:
+    (tmp_path / "charuco.toml").write_text(f"format = 1\nboard = [{boards}]\n{IMAGE}\n")
     with pytest.raises(InputError, match=words):
         load_board_set(tmp_path)
 
@@ -224,17 +175,17 @@ def test_board_pdf_is_true_to_size(tmp_path: Path) -> None:
         assert content[int(line.split()[0]) :].startswith(f"{number} 0 obj")
 
 
-def test_mrcal_there_and_back(scene: Path, tmp_path: Path) -> None:
-    export_mrcal(scene, tmp_path / "models")
-    import_mrcal(tmp_path / "models", tmp_path / "back", images=scene, reference="view_r1_c1.tiff", exposure_s=0.1)
-    first, back = load_set(scene), load_set(tmp_path / "back")
-    np.testing.assert_allclose(back.poses_rt_cam_ref, first.poses_rt_cam_ref, atol=1e-6)
-    assert back.lens.distortion == pytest.approx((*first.lens.distortion,), abs=1e-9)
-
-
 def test_missing_and_damaged_models_are_named(tmp_path: Path) -> None:
     with pytest.raises(MissingFile, match=r"cameras.bin or cameras.txt"):
         read_model(tmp_path)
     (tmp_path / "x.cameramodel").write_text("{ nonsense")
     with pytest.raises(BadValue, match="is not a camera model"):
         import_mrcal(tmp_path, tmp_path / "out")
+
+
+def test_export_without_mrcal_is_a_named_failure(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, faintfield: Command
+) -> None:
+    monkeypatch.setitem(sys.modules, "mrcal", None)
+    assert_refused(faintfield("export", "mrcal", scene, tmp_path / "out"), "MissingMrcal", "pip install")
+    assert not (tmp_path / "out").exists()

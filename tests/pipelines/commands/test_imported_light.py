@@ -14,7 +14,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from faintfield.pipelines.formats.frames import read_frame
-from faintfield.pipelines.formats.sets.elemental_file import ElementalSetFile, Noise
+from faintfield.pipelines.formats.sets.elemental_file import Noise
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
 from tests.pipelines.conftest import Command
@@ -28,26 +28,38 @@ def one_picture(folder: Path, pixels: NDArray[Any], name: str = "a.png") -> Path
     return folder
 
 
-def settings_of(folder: Path) -> ElementalSetFile:
-    return load_set(folder).settings
+def imported_light(folder: Path) -> tuple[str, NDArray[Any]]:
+    """Return the unit of light, and the first picture."""
+    elemental_set = load_set(folder)
+    return elemental_set.settings.units.light, read_frame(elemental_set.image_paths[0]).pixels_dn
 
 
-def imported_pixels(folder: Path) -> NDArray[Any]:
-    return read_frame(load_set(folder).image_paths[0]).pixels_dn
+def stated_noise(folder: Path) -> Noise:
+    noise = load_set(folder).settings.noise
+    assert isinstance(noise, Noise)
+    return noise
 
 
 def test_8_bit_pictures_lose_srgb_curve(tmp_path: Path, done: Command) -> None:
     ended = done("import", "grid", one_picture(tmp_path / "src", EVERY_VALUE), tmp_path / "out")
     assert "8-bit pictures are taken to have the tone curve of sRGB, which is undone; give --linear" in ended.stderr
-    light = imported_pixels(tmp_path / "out").ravel()
+    unit, picture = imported_light(tmp_path / "out")
+    light = picture.ravel()
     assert light.dtype == np.uint16
     assert (light[0], light[255]) == (0, 65535)
     # Points of the standard: the straight part ends at 0.04045, between the values 10 and 11
     for value, share in ((1, 1 / 255 / 12.92), (10, 10 / 255 / 12.92), (11, 0.003347), (64, 0.051269), (128, 0.215861)):
         assert light[value] == pytest.approx(65535 * share, abs=0.6), value
     assert (np.diff(light.astype(int)) > 0).all()
-    assert settings_of(tmp_path / "out").units.light == "relative"
+    assert unit == "relative"
     assert "estimated = true" in (tmp_path / "out" / "elemental.toml").read_text()
+    # The noise that is assumed is that of rounding
+    noise = stated_noise(tmp_path / "out")
+    white_step_dn = 65535 * 2.4 / 1.055 / 255  # slope of the curve at white
+    dark_step_dn = 65535 / 12.92 / 255
+    at_white_dn2 = noise.gain_dn_per_e * 65535 + (noise.gain_dn_per_e * noise.read_noise_e) ** 2
+    assert at_white_dn2 == pytest.approx(white_step_dn**2 / 12, rel=0.02)
+    assert noise.gain_dn_per_e * noise.read_noise_e == pytest.approx(dark_step_dn / 12**0.5, rel=0.01)
 
 
 def test_white_is_saturated_with_and_without_curve(tmp_path: Path, done: Command) -> None:
@@ -69,26 +81,29 @@ def with_gamma(content: bytes, gamma: int) -> bytes:
     return content[:33] + whole + content[33:]
 
 
-@pytest.mark.parametrize(("gamma", "unit"), [(100_000, "dn"), (45_455, "relative")])
-def test_png_may_state_linear_values(gamma: int, unit: str, tmp_path: Path, done: Command) -> None:
+def test_png_may_state_linear_values(tmp_path: Path, done: Command) -> None:
     path = one_picture(tmp_path / "src", EVERY_VALUE) / "a.png"
-    path.write_bytes(with_gamma(path.read_bytes(), gamma))
-    words = done("import", "grid", tmp_path / "src", tmp_path / "out").stderr
-    assert settings_of(tmp_path / "out").units.light == unit
-    assert ("curve of sRGB" in words) == (unit == "relative")
-    assert imported_pixels(tmp_path / "out").max() == (255 if unit == "dn" else 65535)
+    content = path.read_bytes()
+    for gamma, unit, white in ((100_000, "dn", 255), (45_455, "relative", 65535)):
+        path.write_bytes(with_gamma(content, gamma))
+        words = done("import", "grid", tmp_path / "src", tmp_path / unit).stderr
+        found, picture = imported_light(tmp_path / unit)
+        assert (found, picture.max()) == (unit, white)
+        assert ("curve of sRGB" in words) == (unit == "relative")
 
 
 def test_16_bit_pictures_are_linear_unless_stated(tmp_path: Path, done: Command) -> None:
     values = np.array([[0, 257, 32896, 65535]] * 4, np.uint16)
     src = one_picture(tmp_path / "src", values)
     done("import", "grid", src, tmp_path / "linear")
-    assert settings_of(tmp_path / "linear").units.light == "dn"
-    np.testing.assert_array_equal(imported_pixels(tmp_path / "linear"), values)
+    assert imported_light(tmp_path / "linear")[0] == "dn"
+    assert (tmp_path / "linear" / "a.png").read_bytes() == (src / "a.png").read_bytes()
+    assert load_set(tmp_path / "linear").noise.saturation_dn == 65535.0
     done("import", "grid", src, tmp_path / "curved", "--srgb")
-    assert settings_of(tmp_path / "curved").units.light == "relative"
+    unit, picture = imported_light(tmp_path / "curved")
+    assert unit == "relative"
     # As 8-bit values 0, 1, 128 and 255
-    np.testing.assert_array_equal(imported_pixels(tmp_path / "curved")[0], [0, 20, 14146, 65535])
+    np.testing.assert_array_equal(picture[0], [0, 20, 14146, 65535])
     assert load_set(tmp_path / "curved").image_paths[0].suffix == ".tiff"
 
 
@@ -126,12 +141,6 @@ def noisy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def stated_noise(folder: Path) -> Noise:
-    noise = load_set(folder).settings.noise
-    assert isinstance(noise, Noise)
-    return noise
-
-
 def origin(folder: Path) -> Any:
     return json.loads((folder / "provenance.json").read_text())["noise"]
 
@@ -142,7 +151,7 @@ def test_unstated_gain_and_noise_are_estimated(noisy: Path, tmp_path: Path, done
     assert noise.estimated
     assert noise.gain_dn_per_e == pytest.approx(GAIN, rel=0.15)
     assert noise.read_noise_e == pytest.approx(READ_E, rel=0.2)
-    assert settings_of(tmp_path / "out").units.light == "dn"
+    assert imported_light(tmp_path / "out")[0] == "dn"
     assert "estimated from the differences of neighbouring views" in words
     assert re.search(r"the variance of a pixel is \S+ · light \+ \S+², in DN$", words, re.MULTILINE)
     record = origin(tmp_path / "out")
@@ -154,48 +163,23 @@ def test_unstated_gain_and_noise_are_estimated(noisy: Path, tmp_path: Path, done
     assert len(record["mean_dn"]) == len(record["variance_dn2"]) >= 3
 
 
-@pytest.mark.parametrize(
-    ("option", "noise", "unit"),
-    [(("--gain-dn-per-e", 4), (4.0, READ_E), "electrons"), (("--read-noise-e", 7), (GAIN, 7.0), "dn")],
-)
-def test_stated_noise_stays_beside_estimates(
-    option: tuple[object, ...], noise: tuple[float, float], unit: str, noisy: Path, tmp_path: Path, done: Command
-) -> None:
-    done("import", "grid", noisy, tmp_path / "out", "--offset-dn", BLACK_DN, *option)
-    record = stated_noise(tmp_path / "out")
-    assert (record.gain_dn_per_e, record.read_noise_e) == pytest.approx(noise, rel=0.15)
-    assert (record.estimated, settings_of(tmp_path / "out").units.light) == (True, unit)
-    assert option[1] in (record.gain_dn_per_e, record.read_noise_e)
-
-
-def test_stated_gain_and_noise_are_not_estimated(tmp_path: Path, done: Command) -> None:
-    src = one_picture(tmp_path / "src", np.zeros((8, 8), np.uint16))
-    done("import", "grid", src, tmp_path / "out", "--gain-dn-per-e", 3, "--read-noise-e", 5)
-    noise = stated_noise(tmp_path / "out")
-    assert (noise.gain_dn_per_e, noise.read_noise_e, noise.estimated) == (3.0, 5.0, False)
-    assert origin(tmp_path / "out") == {"how": "stated"}
+def test_stated_noise_stays_beside_estimates(noisy: Path, tmp_path: Path, done: Command) -> None:
+    cases = (("--gain-dn-per-e", 4.0, (4.0, READ_E), "electrons"), ("--read-noise-e", 7.0, (GAIN, 7.0), "dn"))
+    for option, value, expected, unit in cases:
+        done("import", "grid", noisy, tmp_path / unit, "--offset-dn", BLACK_DN, option, value)
+        noise = stated_noise(tmp_path / unit)
+        assert (noise.gain_dn_per_e, noise.read_noise_e) == pytest.approx(expected, rel=0.15)
+        assert (noise.estimated, imported_light(tmp_path / unit)[0]) == (True, unit)
+        assert value in (noise.gain_dn_per_e, noise.read_noise_e)
 
 
 def test_noise_without_evidence_is_assumed_and_announced(tmp_path: Path, done: Command) -> None:
     words = done("import", "grid", one_picture(tmp_path / "src", np.zeros((8, 8), np.uint16)), tmp_path / "out").stderr
     assert "gain and noise are not stated and cannot be estimated (0 blocks of 16 x 16 px" in words
-    assert (
-        "it is assumed that the variance of a pixel is 1 · light + 0², in DN; correct [noise] in elemental.toml"
-        in words
-    )
+    assert "assumed that the variance of a pixel is 1 · light + 0², in DN; correct [noise] in elemental.toml" in words
     noise = stated_noise(tmp_path / "out")
     assert (noise.gain_dn_per_e, noise.read_noise_e, noise.estimated) == (1.0, 0.0, True)
     assert origin(tmp_path / "out")["how"] == "assumed"
-
-
-def test_assumed_noise_of_8_bits_is_rounding(tmp_path: Path, done: Command) -> None:
-    done("import", "grid", one_picture(tmp_path / "src", EVERY_VALUE), tmp_path / "out")
-    noise = stated_noise(tmp_path / "out")
-    white_step_dn = 65535 * 2.4 / 1.055 / 255  # slope of the curve at white
-    dark_step_dn = 65535 / 12.92 / 255
-    at_white_dn2 = noise.gain_dn_per_e * 65535 + (noise.gain_dn_per_e * noise.read_noise_e) ** 2
-    assert at_white_dn2 == pytest.approx(white_step_dn**2 / 12, rel=0.02)
-    assert noise.gain_dn_per_e * noise.read_noise_e == pytest.approx(dark_step_dn / 12**0.5, rel=0.01)
 
 
 def test_images_of_colmap_lose_their_curve_alike(tmp_path: Path, done: Command) -> None:
@@ -204,6 +188,6 @@ def test_images_of_colmap_lose_their_curve_alike(tmp_path: Path, done: Command) 
     (src / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n")
     for options, unit, white in (((), "relative", 65535), (("--linear",), "dn", 255)):
         done("import", "colmap", src, tmp_path / unit, *options)
-        assert settings_of(tmp_path / unit).units.light == unit
-        assert imported_pixels(tmp_path / unit).max() == white
+        found, picture = imported_light(tmp_path / unit)
+        assert (found, picture.max()) == (unit, white)
         assert stated_noise(tmp_path / unit).estimated

@@ -48,19 +48,16 @@ def results(larger_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return out
 
 
-OVERVIEW = {"overview.json", "integral_image.png", "reference_view.png", "noise_reference.png"}
-PLANES = {f"plane_{depth}.{suffix}" for depth in ("00500.0", "00700.0") for suffix in ("tiff", "png", "json")}
-
-
 def test_results_and_inputs_of_methods_are_recorded(results: Path, larger_scene: Path) -> None:
-    own = {f"{method}/{name}" for method in METHODS for name in (*PLANES, "reconstruction.json")}
+    planes = {f"plane_{depth}.{suffix}" for depth in ("00500.0", "00700.0") for suffix in ("tiff", "png", "json")}
+    own = {f"{method}/{name}" for method in METHODS for name in (*planes, "reconstruction.json")}
+    overview = {"overview.json", "integral_image.png", "reference_view.png", "noise_reference.png"}
     names = {str(path.relative_to(results)) for path in results.rglob("*") if path.is_file()}
-    assert names == own | OVERVIEW | {"report.html", "metrics.json"}
+    assert names == own | overview | {"report.html", "metrics.json"}
     views = {f"view_r{row}_c{column}.tiff" for row in range(5) for column in range(5)}
     for method in METHODS:
         record = read_record(results / method)
-        planes = [(plane["method"], plane["depth_mm"]) for plane in record["planes"]]
-        assert planes == [(method, 500.0), (method, 700.0)]
+        assert [plane["depth_mm"] for plane in record["planes"] if plane["method"] == method] == [500.0, 700.0]
         assert (record["format"], record["command"], record["focus"]) == (1, "reconstruct", None)
         assert (record["options"]["method"], record["options"]["depth_mm"]) == (method, [500.0, 700.0])
         assert set(record["inputs"]) == views | {"elemental.toml", "flat.tiff"}
@@ -120,24 +117,20 @@ def test_pmlem_has_certificate_and_weight_curve(results: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "key", "value"),
-    [
-        (("--penalty", "quadratic"), "penalty", "quadratic"),
-        (("--penalty", "none", "--passes", 3), "penalty", "none"),
-        (("--likelihood", "poisson-gaussian"), "likelihood", "poisson-gaussian"),
-        (("--likelihood", "least-squares"), "likelihood", "least-squares"),
-    ],
+    ("penalty", "likelihood"),
+    [("quadratic", "poisson-gaussian"), ("none", "poisson-gaussian"), ("tv", "least-squares")],
 )
 def test_likelihoods_and_penalties_can_be_chosen(
-    scene: Path, tmp_path: Path, done: Command, options: tuple[object, ...], key: str, value: str
+    simulated_scene: Path, tmp_path: Path, done: Command, penalty: str, likelihood: str
 ) -> None:
-    done("reconstruct", scene, "--out", tmp_path / "out", "--depth-mm", 500, "--prior", "tv", *options)
+    words = ("--depth-mm", 500, "--prior", "tv", "--penalty", penalty, "--likelihood", likelihood, "--passes", 3)
+    done("reconstruct", simulated_scene, "--out", tmp_path / "out", *words)
     (plane,) = read_record(tmp_path / "out")["planes"]
-    assert (plane[key]["name"] if key == "penalty" else plane[key]) == value
+    assert (plane["penalty"]["name"], plane["likelihood"]) == (penalty, likelihood)
     pixels = tifffile.imread(tmp_path / "out" / plane["file"])
     assert np.isfinite(pixels).all()
     assert pixels.min() >= 0
-    assert (plane["penalty_weight"] > 0) == (value != "none")
+    assert (plane["penalty_weight"] > 0) == (penalty != "none")
 
 
 def test_options_take_effect_and_are_recorded(scene: Path, tmp_path: Path, done: Command) -> None:
@@ -153,21 +146,16 @@ def test_options_take_effect_and_are_recorded(scene: Path, tmp_path: Path, done:
     total = tifffile.imread(tmp_path / "out" / plane["file"]).sum(dtype=float)
     assert plane["flux_e"] == pytest.approx(total * samples_per_px, rel=1e-6)
     stated = {"method": "pmlem", "depth_mm": [500.0], "penalty_weight": 0.25, "passes": 3, "pitch_mm": 10.0}
-    others = {"poses": "stated", "penalty": "tv", "likelihood": "auto", "uncertainty": False, "focus": False}
-    others |= {"depth_map": None, "plane_pose": {}, "prior": "auto"}
-    assert record["options"] == stated | others
+    assert stated.items() <= record["options"].items()
 
 
 def test_penalised_planes_have_a_third_of_the_error(results: Path) -> None:
     metrics = json.loads((results / "metrics.json").read_text())
-    errors = {(row["method"], row["depth_mm"]): row for row in metrics["planes"]}
+    errors = {(row["method"], row["depth_mm"]): row["mse_bright"] for row in metrics["planes"]}
     assert set(errors) == {(method, depth) for method in METHODS for depth in (500.0, 700.0)}
-    for depth in (500.0, 700.0):
-        mean, published, certified = (
-            errors[method, depth]["mse_bright"] for method in ("backprojection", "pmlem-osl", "pmlem")
-        )
-        assert max(published, certified) < mean / 3
-        assert max(published, certified) < 0.04  # 25 views instead of 49
+    for (method, depth), error in errors.items():
+        if method.startswith("pmlem"):
+            assert error < min(errors["backprojection", depth] / 3, 0.04)  # 25 views instead of 49
 
 
 def test_errors_refer_to_noise_free_plane_and_texture(
@@ -195,17 +183,13 @@ def test_errors_refer_to_noise_free_plane_and_texture(
 
 def test_errors_of_earlier_planes_do_not_stay(scene: Path, tmp_path: Path, done: Command) -> None:
     out = tmp_path / "out"
-    done("reconstruct", scene, "--out", out, "--depth-mm", 500, "--method", "backprojection")
+    words = ("reconstruct", scene, "--out", out, "--method", "backprojection", "--depth-mm")
+    done(*words, 500, "--sweep-mm", "500:600:2", "--depth-mm", 500)
+    assert [plane["depth_mm"] for plane in read_record(out)["planes"]] == [500.0, 600.0], "no depth twice"
     assert (out / "metrics.json").is_file()
-    done("reconstruct", scene, "--out", out, "--depth-mm", 600, "--method", "backprojection")
+    done(*words, 600)
     assert not (out / "metrics.json").exists()
     assert "Errors against the truth" not in (out / "report.html").read_text()
-
-
-def test_depths_given_twice_are_reconstructed_once(scene: Path, tmp_path: Path, done: Command) -> None:
-    words = ("--depth-mm", 500, "--sweep-mm", "500:600:2", "--depth-mm", 500, "--method", "backprojection")
-    done("reconstruct", scene, "--out", tmp_path / "out", *words)
-    assert [plane["depth_mm"] for plane in read_record(tmp_path / "out")["planes"]] == [500.0, 600.0]
 
 
 def test_colour_set_gives_colour_planes(tmp_path: Path, done: Command, small_options: tuple[object, ...]) -> None:
@@ -258,19 +242,14 @@ def test_impossible_planes_are_refused_before_writing(
     words: tuple[object, ...], code: int, message: str, simulated_scene: Path, tmp_path: Path, faintfield: Command
 ) -> None:
     ended = faintfield("reconstruct", simulated_scene, "--out", tmp_path / "out", *words)
-    assert ended.returncode == code
+    assert (ended.returncode, ended.stdout, len(ended.stderr.splitlines())) == (code, "", 1)
     assert message in ended.stderr
-    assert len(ended.stderr.splitlines()) == 1
-    assert ended.stdout == ""
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("method", ["pmlem", "joint"])
-def test_plane_without_light_is_called_black(
-    method: str, scene: Path, edit: Edit, tmp_path: Path, done: Command
-) -> None:
+def test_plane_without_light_is_called_black(scene: Path, edit: Edit, tmp_path: Path, done: Command) -> None:
     edit(scene, lambda settings: settings["noise"].update(offset_dn=200.0))
-    words = ("--depth-mm", 500, "--method", method, "--prior", "tv")
-    ended = done("reconstruct", scene, "--out", tmp_path / "out", *words)
-    assert "1 of 1 planes are black" in ended.stderr
-    assert read_frame(tmp_path / "out" / "plane_00500.0.tiff").pixels_dn.max() < 1e-4
+    for method in ("pmlem", "joint"):
+        words = ("--out", tmp_path / method, "--depth-mm", 500, "--method", method, "--prior", "tv")
+        assert "1 of 1 planes are black" in done("reconstruct", scene, *words).stderr
+        assert read_frame(tmp_path / method / "plane_00500.0.tiff").pixels_dn.max() < 1e-4

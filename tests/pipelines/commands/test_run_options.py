@@ -34,28 +34,26 @@ def test_only_options_of_sets_are_missing_from_run() -> None:
     assert options["run"] - options["reconstruct"] == {"SESSION", "--lens", "--limit-px"}
 
 
-@pytest.mark.parametrize(
-    ("command", "words", "message"),
-    [
-        ("run", "--depth-mm auto --depth-mm 500", "--depth-mm auto finds all depths; give others in a call of their"),
-        ("run", "--depth-mm auto --sweep auto", "--sweep auto makes all planes of a range, and --depth-mm auto leaves"),
-        ("run", "--depth-mm 500 --depth 700 --depth-map", "--depth-map compares depths, and 2 are given; give at"),
-        ("run", "--depth-mm 500 --method mlem --uncertainty", "--uncertainty is for pmlem, joint and occlusion, not"),
-        ("run", "--depth-mm 500 --joint --penalty none --prior auto", "--prior auto starts from total variation"),
-        ("run", "--depth-mm 500 --prior tv --proposal", "--proposal saves what a prior proposes, and tv proposes"),
-        ("run", "--surface --depth-range-mm 4:9 --disparity-range-px 1:2", "--depth-range-mm and --disparity-range-px"),
-        ("run", "--depth-mm 500 --workers 2 --scheduler here", "--workers starts processes here, --scheduler names"),
-        ("run", "--sweep-mm 400:900", "--sweep-mm 400:900: is no sweep; give FIRST:LAST:COUNT"),
-        ("reconstruct", "--surface --depth-range-mm 4:9 --disparity-range-px 1:2", "--depth-range-mm and --disparity"),
-    ],
-)
-def test_options_that_exclude_each_other_are_refused(
-    command: str, words: str, message: str, recorded_session: Path, faintfield: Command
-) -> None:
-    ended = faintfield(command, recorded_session, *words.split())
-    assert ended.returncode == 2
-    assert ended.stderr.startswith(f"faintfield: wrong usage: {message}")
-    assert len(ended.stderr.splitlines()) == 1
+EXCLUDED = [
+    ("run", "--depth-mm auto --depth-mm 500", "--depth-mm auto finds all depths; give others in a call of their"),
+    ("run", "--depth-mm auto --sweep auto", "--sweep auto makes all planes of a range, and --depth-mm auto leaves"),
+    ("run", "--depth-mm 500 --depth 700 --depth-map", "--depth-map compares depths, and 2 are given; give at"),
+    ("run", "--depth-mm 500 --method mlem --uncertainty", "--uncertainty is for pmlem, joint and occlusion, not"),
+    ("run", "--depth-mm 500 --joint --penalty none --prior auto", "--prior auto starts from total variation"),
+    ("run", "--depth-mm 500 --prior tv --proposal", "--proposal saves what a prior proposes, and tv proposes"),
+    ("run", "--surface --depth-range-mm 4:9 --disparity-range-px 1:2", "--depth-range-mm and --disparity-range-px"),
+    ("run", "--depth-mm 500 --workers 2 --scheduler here", "--workers starts processes here, --scheduler names"),
+    ("run", "--sweep-mm 400:900", "--sweep-mm 400:900: is no sweep; give FIRST:LAST:COUNT"),
+    ("reconstruct", "--surface --depth-range-mm 4:9 --disparity-range-px 1:2", "--depth-range-mm and --disparity"),
+]
+
+
+def test_options_that_exclude_each_other_are_refused(recorded_session: Path, faintfield: Command) -> None:
+    for command, words, message in EXCLUDED:
+        ended = faintfield(command, recorded_session, *words.split())
+        assert ended.returncode == 2
+        assert ended.stderr.startswith(f"faintfield: wrong usage: {message}")
+        assert len(ended.stderr.splitlines()) == 1
 
 
 def _fail(*_: object) -> None:
@@ -107,20 +105,13 @@ def test_range_of_sweep_is_searched_only_once(session: Path, monkeypatch: pytest
     assert "auto_sweep" not in read_record(session / "reconstructions")["options"]
 
 
-def test_depth_map_is_made_once(seen: Searches, session: Path) -> None:
-    asked: dict[str, Any] = {"sweep_mm": "480:520:5", "depth_map": True, "method": ["backprojection"], "pitch_mm": 16.0}
+def test_depth_map_of_disparities_is_made_once(seen: Searches, session: Path) -> None:
+    asked: dict[str, Any] = {"sweep_px": "-60:-50:5", "depth_map": True, "method": ["backprojection"], "pitch_mm": 16.0}
     assert _ran(session, **asked) == ["reconstruct"]
+    assert len(read_record(session / "reconstructions")["planes"]) == 5
     assert _ran(session, **asked) == []
-    (session / "reconstructions" / "depth_mm.tiff").unlink()
+    (session / "reconstructions" / "disparity_px.tiff").unlink()
     assert _ran(session, **asked) == ["reconstruct"]
-
-
-def test_disparities_of_session_are_depths(session: Path) -> None:
-    asked: dict[str, Any] = {"disparity_px": [-60.0, -50.0], "method": ["backprojection"], "pitch_mm": 8.0}
-    assert _ran(session, **asked) == ["reconstruct"]
-    assert len(read_record(session / "reconstructions")["planes"]) == 2
-    assert _ran(session, **asked) == []
-    assert _ran(session, **{**asked, "disparity_px": [-60.0]}) == ["reconstruct"]
 
 
 def test_prior_applies_to_planes_and_surface() -> None:

@@ -4,6 +4,7 @@ import json
 import shutil
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -23,10 +24,9 @@ pytestmark = pytest.mark.usefixtures("undrawn")
 
 
 def _ran(session: Path, *, depth_mm: list[float] | None = None, depth_range_mm: str = RANGE) -> list[str]:
-    planes: dict[str, Any] = {"depth_mm": depth_mm, "method": ["backprojection"]} if depth_mm else {}
+    planes: dict[str, Any] = {"depth_mm": depth_mm, "method": ["backprojection"], "pitch_mm": 16.0} if depth_mm else {}
     asked = Options(surface=True, depth_range_mm=depth_range_mm, penalty_weight=0.5, passes=2, **planes)
-    outcome = run(session, options=asked)
-    return [step.step for step in outcome.steps if step.ran]
+    return [step.step for step in run(session, options=asked).steps if step.ran]
 
 
 def test_only_outdated_surface_is_made_again(seen: Searches, session: Path) -> None:
@@ -62,11 +62,8 @@ def test_interrupt_leaves_no_page_of_earlier_surface(
 ) -> None:
     _ran(session)
 
-    def interrupted(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
     with monkeypatch.context() as patch:
-        patch.setattr("faintfield.pipelines.pages.report.write_report", interrupted)
+        patch.setattr("faintfield.pipelines.pages.report.write_report", mock.Mock(side_effect=KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             _ran(session, depth_range_mm="400:1000")
     assert not (session / "reconstructions" / "report.html").exists()
@@ -76,9 +73,7 @@ def test_interrupt_leaves_no_page_of_earlier_surface(
 
 
 def test_failed_surface_leaves_planes(seen: Searches, session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def nothing(*_: object) -> None:
-        raise NothingInFocus("nothing there; use more light")
-
+    nothing = mock.Mock(side_effect=NothingInFocus("nothing there; use more light"))
     monkeypatch.setattr("faintfield.pipelines.reconstruction.surface_depths.estimate_surface", nothing)
     with pytest.raises(NothingInFocus, match=r"more light; mend that .* still to be done: surface, report"):
         _ran(session, depth_mm=[500.0])

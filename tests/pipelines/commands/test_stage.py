@@ -1,13 +1,15 @@
 """`faintfield stage` on simulated stages: results on standard output, words on standard error, exit codes."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from faintfield.pipelines import cli
 from faintfield.rig.stages.conformance import Check
+from tests.pipelines.conftest import Command
+from tests.pipelines.refusals import assert_refused
 
 RIG = """
 [stage]
@@ -24,94 +26,62 @@ backend = "simulated"
 """
 
 
-class Shell:
-    """Runs commands and keeps what they printed."""
-
-    def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
-        self._capsys = capsys
-        self.words = ""
-
-    def run(self, *arguments: str) -> int:
-        code = cli.run(["stage", *arguments])
-        self.output, self.words = self._capsys.readouterr()
-        return code
-
-    def result(self, *arguments: str) -> Any:
-        assert self.run(*arguments, "--json") == 0
-        return json.loads(self.output)
+GRBL, MARLIN = ("--port", "simulated:grbl"), ("--port", "simulated:marlin")
 
 
 @pytest.fixture
-def shell(capsys: pytest.CaptureFixture[str]) -> Shell:
-    return Shell(capsys)
+def result(done: Command) -> Callable[..., Any]:
+    return lambda *words: json.loads(done("--json", "stage", *words).stdout)
 
 
 @pytest.mark.parametrize("stage", ["grbl", "marlin"])
-def test_info_names_the_firmware(shell: Shell, stage: str) -> None:
-    identity = shell.result("info", "--port", f"simulated:{stage}")
+def test_info_and_conformance_are_printed(stage: str, result: Callable[..., Any], done: Command) -> None:
+    port = ("--port", f"simulated:{stage}")
+    identity = result("info", *port)
     assert stage in identity["firmware"].lower()
     assert identity["settings"]
-    assert shell.run("info", "--port", f"simulated:{stage}") == 0
-    assert shell.output == ""
-    assert "travel [" in shell.words
+    ended = done("stage", "info", *port)
+    assert ended.stdout == ""
+    assert "travel [" in ended.stderr
+    names = ["settings", "homing", "limits", "speed", "arrival", "report rate", "repeatability"]
+    assert [(check["name"], check["passed"]) for check in result("test", *port)] == [(name, True) for name in names]
 
 
-def test_goto_needs_homing(shell: Shell) -> None:
-    assert shell.run("goto", "-100", "-100", "--port", "simulated:grbl") == 1
-    assert "NotHomed" in shell.words
-    position = shell.result("goto", "-100", "-120.5", "--home", "--port", "simulated:grbl")
-    assert position["point"] == [-100.0, -120.5]
-    assert shell.result("home", "--port", "simulated:marlin")["trusted"] is True
-    position = shell.result("jog", "-1", "-2", "--unlock", "--port", "simulated:grbl")
+def test_goto_needs_homing(result: Callable[..., Any], faintfield: Command) -> None:
+    assert_refused(faintfield("stage", "goto", "-100", "-100", *GRBL), "NotHomed")
+    assert result("goto", "-100", "-120.5", "--home", *GRBL)["point"] == [-100.0, -120.5]
+    assert result("home", *MARLIN)["trusted"] is True
+    position = result("jog", "-1", "-2", "--unlock", *GRBL)
     assert (position["point"], position["trusted"]) == ([-1.0, -2.0], False)
 
 
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (("goto", "5", "5", "--home"), "OutsideTravel"),
-        (("jog", "1", "1"), "StageAlarm"),
+        (("goto", "5", "5", "--home", *GRBL), "OutsideTravel"),
+        (("jog", "1", "1", *GRBL), "StageAlarm"),
         (("home", "--port", "/dev/no-such-port"), "StageLost"),
     ],
 )
-def test_failures_are_one_line_with_a_name(shell: Shell, arguments: tuple[str, ...], named: str) -> None:
-    port = () if {"--port", "--rig"} & set(arguments) else ("--port", "simulated:grbl")
-    assert shell.run(*arguments, *port) == 1
-    assert shell.words.count("\n") == 1
-    assert shell.words.startswith(f"faintfield: {named}: ")
-    assert "; " in shell.words
+def test_failures_are_one_line_with_a_name(arguments: tuple[str, ...], named: str, faintfield: Command) -> None:
+    ended = faintfield("stage", *arguments)
+    assert_refused(ended, named, "; ")
+    assert ended.stderr.count("\n") == 1
 
 
-@pytest.mark.parametrize("stage", ["grbl", "marlin"])
-def test_conformance_checks_are_listed(shell: Shell, stage: str) -> None:
-    checks = shell.result("test", "--port", f"simulated:{stage}")
-    assert [check["name"] for check in checks] == [
-        "settings", "homing", "limits", "speed", "arrival", "report rate", "repeatability",
-    ]  # fmt: skip
-    assert all(check["passed"] for check in checks)
-    assert "repeatability" in shell.words
-
-
-def test_unfit_stage_is_a_named_failure(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unfit_stage_is_a_named_failure(faintfield: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     checks = [Check("homing", True, "2 s", "60 s"), Check("speed", False, "3 mm/s", "at least 50 mm/s")]
     monkeypatch.setattr("faintfield.pipelines.commands.stage.check_conformance", lambda stage: iter(checks))
-    assert shell.run("test", "--port", "simulated:grbl") == 1
-    assert "StageUnfit: speed: 3 mm/s, and at least 50 mm/s is asked for" in shell.words
+    words = "speed: 3 mm/s, and at least 50 mm/s is asked for"
+    assert_refused(faintfield("stage", "test", *GRBL), "StageUnfit", words)
 
 
-def test_rig_file_brings_its_limits(shell: Shell, tmp_path: Path) -> None:
+def test_rig_file_brings_its_limits(tmp_path: Path, faintfield: Command) -> None:
     rig = tmp_path / "rig.toml"
     rig.write_text(RIG)
-    assert shell.run("goto", "-350", "-50", "--home", "--rig", str(rig)) == 1
-    assert "OutsideTravel" in shell.words
-    assert shell.run("goto", "-150", "-150", "--home", "--rig", str(rig)) == 1
-    assert "KeepOutCrossed" in shell.words
-    assert shell.run("goto", "-50", "-150", "--home", "--rig", str(rig)) == 0
-
-
-def test_mistake_in_rig_file_is_named(shell: Shell, tmp_path: Path) -> None:
-    rig = tmp_path / "rig.toml"
+    goto = ("stage", "goto", "--home", "--rig", rig)
+    assert_refused(faintfield(*goto, "-350", "-50"), "OutsideTravel")
+    assert_refused(faintfield(*goto, "-150", "-150"), "KeepOutCrossed")
+    assert faintfield(*goto, "-50", "-150").returncode == 0
     rig.write_text(RIG.replace("port =", "prot =", 1))
-    assert shell.run("info", "--rig", str(rig)) == 1
-    assert "UnknownKey" in shell.words
-    assert str(rig) in shell.words
+    assert_refused(faintfield("stage", "info", "--rig", rig), "UnknownKey", str(rig))

@@ -60,9 +60,8 @@ def test_lossless_files_keep_pixels_and_type(
     assert [frame.mosaic, frame.black_dn, frame.saturation_dn, frame.exposure_s] == [None] * 4
 
 
-@pytest.mark.parametrize("shape", [(40, 50), (40, 50, 3)], ids=["grey", "RGB"])
-def test_frames_are_written_uncompressed_in_one_piece(shape: tuple[int, ...], tmp_path: Path) -> None:
-    pixels = _pixels(np.uint16, *shape)
+def test_frames_are_written_uncompressed_in_one_piece(tmp_path: Path) -> None:
+    pixels = _pixels(np.uint16, 40, 50, 3)
     write_frame(tmp_path / "frame.tiff", pixels)
     content = (tmp_path / "frame.tiff").read_bytes()
     assert pixels.tobytes() in content
@@ -78,15 +77,12 @@ def test_photograph_is_read_as_red_green_blue(tmp_path: Path) -> None:
     np.testing.assert_allclose(pixels, np.broadcast_to(colour, pixels.shape), atol=2)
 
 
-@pytest.mark.parametrize("suffix", ["tiff", "png"])
-def test_opacity_is_left_out(suffix: str, tmp_path: Path) -> None:
+def test_opacity_is_left_out(tmp_path: Path) -> None:
     rgba = _pixels(np.uint8, 9, 8, 4)
-    path = tmp_path / f"frame.{suffix}"
-    if suffix == "tiff":
-        tifffile.imwrite(path, rgba, photometric="rgb", extrasamples=["unassalpha"])
-    else:
-        cv2.imwrite(str(path), np.ascontiguousarray(rgba[:, :, [2, 1, 0, 3]]))
-    np.testing.assert_array_equal(read_frame(path).pixels_dn, rgba[:, :, :3])
+    tifffile.imwrite(tmp_path / "frame.tiff", rgba, photometric="rgb", extrasamples=["unassalpha"])
+    cv2.imwrite(str(tmp_path / "frame.png"), np.ascontiguousarray(rgba[:, :, [2, 1, 0, 3]]))
+    for path in tmp_path.iterdir():
+        np.testing.assert_array_equal(read_frame(path).pixels_dn, rgba[:, :, :3])
 
 
 ALL_KINDS = {**LOSSLESS, "JPEG": ("jpg", _opencv())}
@@ -118,17 +114,16 @@ def test_damaged_png_is_refused_without_printing(tmp_path: Path, capfd: pytest.C
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("tag", [256, 257, 258], ids=["width", "length", "bits"])
-def test_tiff_of_impossible_size_is_refused(tag: int, tmp_path: Path) -> None:
+def test_tiff_of_impossible_size_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "frame.tiff"
     tifffile.imwrite(path, _pixels(np.uint16, 40, 50), byteorder="<")
-    content = bytearray(path.read_bytes())
-    count = struct.unpack_from("<H", content, 8)[0]
-    entry = next(at for at in range(10, 10 + 12 * count, 12) if struct.unpack_from("<H", content, at)[0] == tag)
-    struct.pack_into("<HII", content, entry + 2, 4, 1, 0x7FFFFFFF)
-    path.write_bytes(content)
-    with pytest.raises(UnreadableImage, match=r"frame\.tiff: "):
-        read_frame(path)
+    whole = path.read_bytes()
+    for tag in (b"\0\1", b"\1\1", b"\2\1"):  # width, length and bits
+        entry, content = whole.index(tag, 10), bytearray(whole)
+        struct.pack_into("<HII", content, entry + 2, 4, 1, 0x7FFFFFFF)
+        path.write_bytes(content)
+        with pytest.raises(UnreadableImage, match=r"frame\.tiff: "):
+            read_frame(path)
 
 
 def test_stacks_missing_and_endless_files_are_refused(tmp_path: Path) -> None:
@@ -142,35 +137,25 @@ def test_stacks_missing_and_endless_files_are_refused(tmp_path: Path) -> None:
         read_frame(tmp_path / "view.jpg")
 
 
-class TestRawFile:
+def test_raw_file_is_a_mosaic_without_margins(real_data: Path, tmp_path: Path) -> None:
     """A raw file of a real camera: a Bayer mosaic with masked margins, EXIF without an exposure."""
-
-    @pytest.fixture
-    def path(self, real_data: Path) -> Path:
-        return real_data / "raw" / "colorchart.dng"
-
-    def test_mosaic_is_kept_without_its_margins(self, path: Path) -> None:
-        frame = read_frame(path)
-        assert frame.pixels_dn.shape == (1156, 1734)
-        assert frame.pixels_dn.dtype == np.uint16
-        assert frame.mosaic == ("RG", "GB")
-        assert frame.saturation_dn == 15000.0
-        # The two greens of a period see the same light, the other colours do not
-        (red, green), (other_green, blue) = [
-            [float(frame.pixels_dn[row::2, column::2].mean()) for column in (0, 1)] for row in (0, 1)
-        ]
-        assert abs(green - other_green) < 0.1 * min(green - red, green - blue)
-        assert frame.black_dn is not None
-        assert frame.black_dn.shape == (2, 2)
-        assert 2040 < frame.black_dn.min() <= frame.black_dn.max() < 2052  # of masked pixels; the file states 2056
-
-    @pytest.mark.parametrize("part", [0.001, 0.5, 0.999])
-    def test_truncated_raw_file_is_refused(self, path: Path, part: float, tmp_path: Path) -> None:
-        whole = path.read_bytes()
+    path = real_data / "raw" / "colorchart.dng"
+    frame = read_frame(path)
+    assert frame.pixels_dn.shape == (1156, 1734)
+    assert frame.pixels_dn.dtype == np.uint16
+    assert frame.mosaic == ("RG", "GB")
+    assert frame.saturation_dn == 15000.0
+    # The two greens of a period see the same light, the other colours do not
+    red, green, other_green, blue = (float(frame.pixels_dn[r::2, c::2].mean()) for r, c in np.ndindex(2, 2))
+    assert abs(green - other_green) < 0.1 * min(green - red, green - blue)
+    assert frame.black_dn is not None
+    assert frame.black_dn.shape == (2, 2)
+    assert 2040 < frame.black_dn.min() <= frame.black_dn.max() < 2052  # of masked pixels; the file states 2056
+    whole = path.read_bytes()
+    for part in (0.001, 0.5, 0.999):
         (tmp_path / "short.dng").write_bytes(whole[: int(part * len(whole))])
-        with pytest.raises(UnreadableImage, match=r"short\.dng: cannot be decoded") as refused:
+        with pytest.raises(UnreadableImage, match=r"short\.dng: cannot be decoded[^\n]*$"):
             read_frame(tmp_path / "short.dng")
-        assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize("name", ["view.tiff", "view.jpg"])
@@ -241,7 +226,5 @@ def test_impossible_files_are_refused(
     name: str, content: bytes, failure: type[Exception], words: str, tmp_path: Path
 ) -> None:
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(failure) as caught:
+    with pytest.raises(failure, match=rf"{words}[^\n]*$"):
         read_frame(tmp_path / name)
-    assert words in str(caught.value)
-    assert "\n" not in str(caught.value)

@@ -45,23 +45,17 @@ def test_positions_alone_give_rows_and_columns() -> None:
     assert read(names) == [(r, 3 - c) for r, c in NODES]
 
 
-@pytest.mark.parametrize("template", ["input_Cam{:03}.png", "scene2024_{:03}.png"])
-def test_running_numbers_are_a_square(template: str) -> None:
-    names = [template.format(number) for number in range(5, 14)]
-    nodes, words = nodes_of(places_by_habit(names))
-    assert nodes == [divmod(number, 3) for number in range(9)]
-    assert "9 pictures by one number; they are taken as 3 x 3, row by row" in words
-
-
 @given(
     first=st.integers(0, 10**6),
     side=st.integers(2, 12),
     width=st.integers(1, 8),
-    text=st.sampled_from(["", "IMG_", "a-"]),
+    text=st.sampled_from(["", "IMG_", "a-", "scene2024_"]),
 )
 def test_running_number_is_never_split_into_digits(first: int, side: int, width: int, text: str) -> None:
     names = [f"{text}{first + number:0{width}}.png" for number in range(side**2)]
-    assert read(names) == [divmod(number, side) for number in range(side**2)]
+    nodes, words = nodes_of(places_by_habit(names))
+    assert nodes == [divmod(number, side) for number in range(side**2)]
+    assert f"{side**2} pictures by one number; they are taken as {side} x {side}, row by row" in words
 
 
 @pytest.mark.parametrize(
@@ -75,9 +69,6 @@ def test_running_number_is_never_split_into_digits(first: int, side: int, width:
 def test_missing_places_are_asked_for(names: list[str], words: str) -> None:
     with pytest.raises(BadValue, match=re.escape(words)):
         read(names)
-
-
-def test_numbers_of_no_square_are_one_row() -> None:
     assert read([f"cam_0_{n}.png" for n in range(7)]) == [(0, n) for n in range(7)]
     assert read([f"cam_{n}_3.png" for n in range(7)]) == [(n, 3) for n in range(7)]
 
@@ -104,17 +95,14 @@ def test_positions_are_those_of_their_fields() -> None:
     assert [(place.row, place.column, place.y, place.x) for place in stanford] == expected
 
 
-@pytest.mark.parametrize(
-    ("pattern", "words"),
-    [
+def test_unfit_pattern_is_refused() -> None:
+    for pattern, words in (
         ("{row}_{column}.tif", "1_2.png does not match it, 0 of 2 pictures do; correct the pattern"),
         ("{row}_*.png", "says neither {row} and {column}, nor {x} and {y}, nor {index}"),
         ("{row}_{row}.png", "{row} is no field, or is there twice; use each of {name}, {row}"),
-    ],
-)
-def test_unfit_pattern_is_refused(pattern: str, words: str) -> None:
-    with pytest.raises(BadValue, match=re.escape(words)):
-        read(["1_2.png", "1_34_5.png"], pattern)
+    ):
+        with pytest.raises(BadValue, match=re.escape(words)):
+            read(["1_2.png", "1_34_5.png"], pattern)
 
 
 @given(st.lists(st.text(max_size=40), min_size=1, max_size=6), st.text(max_size=12))
@@ -144,20 +132,13 @@ def test_measured_steps_are_true_in_any_directions(signs: tuple[int, int]) -> No
     scale = np.polyfit([c for _, c in true], [place[0] for place in true.values()], 1)[0]
     for node, place in true.items():
         np.testing.assert_allclose(steps[node], (place - true[0, 0]) / scale, atol=1e-9)
-
-
-def test_steps_across_one_row_are_zero() -> None:
     steps = measured_steps({(0, c): (10.0 * c, 0.3 * c % 0.7) for c in range(5)})
     np.testing.assert_allclose([steps[0, c] for c in range(5)], [(c, 0) for c in range(5)], atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "positions",
-    [
-        {(r, c): (float(r), float(c)) for r in range(3) for c in range(3)},  # exchanged
-        {(r, c): (float((5 * c + r) % 7), float((3 * r + c) % 5)) for r in range(3) for c in range(3)},
-    ],
-)
-def test_positions_without_grid_are_refused(positions: dict[Node, tuple[float, float]]) -> None:
-    with pytest.raises(BadValue, match=r"exchange \{x\} and \{y\} in --pattern, or put \* in their place"):
-        measured_steps(positions)
+def test_positions_without_grid_are_refused() -> None:
+    exchanged = {(r, c): (float(r), float(c)) for r in range(3) for c in range(3)}
+    scattered = {(r, c): (float((5 * c + r) % 7), float((3 * r + c) % 5)) for r in range(3) for c in range(3)}
+    for positions in (exchanged, scattered):
+        with pytest.raises(BadValue, match=r"exchange \{x\} and \{y\} in --pattern, or put \* in their place"):
+            measured_steps(positions)

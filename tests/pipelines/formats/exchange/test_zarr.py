@@ -59,18 +59,6 @@ def test_sweep_is_in_mm_and_milliradians(sweep: Path, tmp_path: Path, done: Comm
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_planes_of_one_pitch_are_in_mm(scene: Path, tmp_path: Path, done: Command) -> None:
-    out, stack = tmp_path / "out", tmp_path / "sweep.ome.zarr"
-    done("reconstruct", scene, "--out", out, "--sweep-mm", "500:501:2", "--method", "backprojection", "--pitch-mm", 5)
-    done("export", "zarr", out, stack)
-    _, multiscale = _image(stack)
-    assert [axis.unit for axis in multiscale.axes] == [None, "millimeter", "millimeter", "millimeter"]
-    ((scale, translation),) = _scales(multiscale)
-    assert scale == [1.0, pytest.approx(1.0), 5.0, 5.0]
-    assert translation[2:] == [pytest.approx(value) for value in _planes(out)[0]["origin_mm"][::-1]]
-
-
-@pytest.mark.usefixtures("undrawn")
 def test_large_colour_planes_have_several_resolutions(
     tmp_path: Path, done: Command, small_options: tuple[object, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -114,19 +102,21 @@ def test_only_earlier_exports_are_replaced(sweep: Path, tmp_path: Path, done: Co
 
 
 @pytest.mark.usefixtures("undrawn")
-@pytest.mark.parametrize(
-    ("words", "reason"),
-    [
-        (("--depth-mm", 500, "--depth-mm", 550, "--depth-mm", 700), "not in equal steps"),
-        (("--depth-mm", 500, "--method", "mlem"), "holds planes of 2 calls or methods"),
-    ],
-)
-def test_planes_without_stack_are_refused(
-    words: tuple[object, ...], reason: str, simulated_scene: Path, tmp_path: Path, done: Command, faintfield: Command
+def test_only_planes_in_equal_steps_are_stacked(
+    simulated_scene: Path, tmp_path: Path, done: Command, faintfield: Command
 ) -> None:
-    out = tmp_path / "out"
-    done("reconstruct", simulated_scene, "--out", out, *words, "--method", "backprojection")
-    ended = faintfield("export", "zarr", out, tmp_path / "stack.zarr")
-    assert ended.returncode == 1
-    assert reason in ended.stderr
-    assert not (tmp_path / "stack.zarr").exists()
+    """Planes of one pitch are in mm."""
+    out, stack = tmp_path / "out", tmp_path / "stack.zarr"
+    words = ("reconstruct", simulated_scene, "--method", "backprojection", "--out")
+    done(*words, out, "--depth-mm", 500, "--depth-mm", 550, "--depth-mm", 700)
+    assert_refused(faintfield("export", "zarr", out, stack), "BadValue", "not in equal steps")
+    done(*words, out, "--depth-mm", 500, "--method", "mlem")
+    assert_refused(faintfield("export", "zarr", out, stack), "BadValue", "calls or methods; name one")
+    assert not stack.exists()
+    done(*words, tmp_path / "mm", "--sweep-mm", "500:501:2", "--pitch-mm", 5)
+    done("export", "zarr", tmp_path / "mm", stack)
+    _, multiscale = _image(stack)
+    assert [axis.unit for axis in multiscale.axes] == [None, "millimeter", "millimeter", "millimeter"]
+    ((scale, translation),) = _scales(multiscale)
+    assert scale == [1.0, pytest.approx(1.0), 5.0, 5.0]
+    assert translation[2:] == [pytest.approx(value) for value in _planes(tmp_path / "mm")[0]["origin_mm"][::-1]]

@@ -1,7 +1,7 @@
 """Sets of noise: series of frames, warnings about their temperatures, and `noise.json` with its maps in a set."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -42,16 +42,13 @@ class TestNoiseJson:
     @pytest.fixture
     def folder(self, make_set: SetMaker, grey_images: Sequence[NDArray[np.uint16]]) -> Path:
         folder = make_set(grey_images, noise="noise.json")
-        self.write(folder)
+        (folder / "noise.json").write_text(json.dumps(FITTED | {"hot_pixels": [[3, 15], [11, 0]]}))
         return folder
 
-    @staticmethod
-    def write(folder: Path, **changes: Any) -> None:
-        (folder / "noise.json").write_text(json.dumps(FITTED | changes))
-
     def test_unknown_dark_current_counts_as_zero(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        unknown = {"value": None, "why": "all exposures are equally long"}
-        self.write(folder, quantum_efficiency=0.5, saturation_dn={"value": 4095.0}, dark_current_e_per_s=unknown)
+        changes = {"quantum_efficiency": 0.5, "saturation_dn": {"value": 4095.0}}
+        changes["dark_current_e_per_s"] = {"value": None, "why": "all exposures are equally long"}
+        (folder / "noise.json").write_text(json.dumps(FITTED | changes))
         elemental_set = load_set(folder)
         noise = elemental_set.noise
         assert (noise.offset_dn, noise.gain_dn_per_e, noise.read_noise_e) == (100.0, 2.0, 3.0)
@@ -60,47 +57,28 @@ class TestNoiseJson:
         words = "dark_current_e_per_s is not known (all exposures are equally long); 0 is taken"
         assert words in capsys.readouterr().err
 
-    @pytest.mark.parametrize(
-        ("content", "words"),
-        [
+    def test_bad_noise_results_are_refused(self, folder: Path) -> None:
+        for content, words in (
             ("{", "is not the result"),
             (json.dumps({"offset_dn": {"value": 10.0}}), "gain_dn_per_e"),
             (json.dumps(FITTED | {"gain_dn_per_e": {"value": -2.0}}), "gain_dn_per_e"),
             (json.dumps(FITTED | {"hot_pixels": [[1, 1], [12, 0]]}), r"hot pixel \[12, 0\] is not one of"),
             (json.dumps(FITTED | {"hot_pixels": [[-1, 0]]}), r"hot pixel \[-1, 0\] is not one of"),
             (json.dumps(FITTED | {"read_noise_e": {"value": None, "why": "x"}}), r"read_noise_e is not known \(x\)"),
-        ],
-    )
-    def test_bad_noise_results_are_refused(self, folder: Path, content: str, words: str) -> None:
-        (folder / "noise.json").write_text(content)
-        with pytest.raises(BadValue, match=rf"(noise\.json|elemental\.toml): .*{words}"):
-            load_set(folder)
-
-    @pytest.mark.parametrize(
-        ("maps", "words"),
-        [
-            ({"offset_dn": np.array({"a": 1}, object)}, r"noise_maps\.npz: cannot be read"),
-            ({"offset_dn": np.ones((16, 12), bool)}, r"offset_dn has shape \(16, 12\), expected is \(12, 16\)"),
-        ],
-        ids=["pickled", "another sensor"],
-    )
-    def test_bad_maps_are_refused(self, folder: Path, maps: dict[str, Any], words: str) -> None:
-        np.savez(folder / "noise_maps.npz", allow_pickle=True, **maps)
-        with pytest.raises(BadValue, match=words):
+        ):
+            (folder / "noise.json").write_text(content)
+            with pytest.raises(BadValue, match=rf"(noise\.json|elemental\.toml): .*{words}"):
+                load_set(folder)
+        (folder / "noise.json").write_text(json.dumps(FITTED))
+        np.savez(folder / "noise_maps.npz", offset_dn=np.ones((16, 12), bool))
+        with pytest.raises(BadValue, match=r"offset_dn has shape \(16, 12\), expected is \(12, 16\)"):
             load_set(folder)
 
     def test_maps_replace_numbers(self, folder: Path) -> None:
-        self.write(folder, hot_pixels=[[3, 15], [11, 0]])
         offset_dn, response = np.arange(192.0).reshape(12, 16), np.linspace(0.5, 1.5, 192).reshape(12, 16)
         mask = np.zeros((12, 16), bool)
         mask[5, 6] = True
-        maps: dict[str, Any] = {
-            "offset_dn": offset_dn,
-            "relative_response": response,
-            "mask": mask,
-            "other": np.zeros(3),
-        }
-        np.savez(folder / "noise_maps.npz", **maps)
+        np.savez(folder / "noise_maps.npz", offset_dn=offset_dn, relative_response=response, mask=mask, other=[0, 0])
         elemental_set = load_set(folder)
         np.testing.assert_array_equal(elemental_set.noise.offset_dn, offset_dn)
         assert elemental_set.noise.gain_dn_per_e == 2.0
@@ -109,11 +87,8 @@ class TestNoiseJson:
         assert elemental_set.flat is not None
         usable = ~elemental_set.unusable
         np.testing.assert_allclose(elemental_set.flat[usable], response[usable], rtol=1e-6)
-
-    def test_noise_and_maps_are_inputs(self, folder: Path) -> None:
-        np.savez(folder / "noise_maps.npz", offset_dn=np.zeros((12, 16)))
         names = {"elemental.toml", "noise.json", "noise_maps.npz", "view_0.tiff", "view_1.tiff"}
-        assert load_set(folder).input_hashes() == {name: sha256(folder / name) for name in names}
+        assert elemental_set.input_hashes() == {name: sha256(folder / name) for name in names}
 
 
 def grouped(warmth: list[float | None], doubling_k: float | None = None) -> list[tuple[list[int], float | None, float]]:
@@ -151,11 +126,8 @@ def test_dark_factor_is_that_of_temperature() -> None:
     assert [warmth for _, warmth, _ in grouped([20.0, 20.2], 4.0)] == [None], "steady: no name of its own"
 
 
-type Temperature = Callable[[StepKind, int], float]
-
-
-def session_at(folder: Path, temperature_c: Temperature, *steps: StepKind) -> Path:
-    """Capture a session whose sensor has a temperature that depends on the step and on the frames read before."""
+def test_only_darks_beyond_the_limit_are_named(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """The temperature of the sensor depends on the step and on the frames read before."""
     arrange = SimulatedLab.arrange
     now: list[Any] = ["dark_scene", 0]
 
@@ -163,32 +135,17 @@ def session_at(folder: Path, temperature_c: Temperature, *steps: StepKind) -> Pa
         now[:] = [kind, 0]
         arrange(lab, kind, sweep)
 
-    def read(camera: SimulatedCamera) -> float:
+    def temperature_c(_: SimulatedCamera) -> float:
         now[1] += 1
-        return temperature_c(now[0], now[1])
+        dark = -18.0 + 0.5 * (now[1] <= 2) - 4.5 * (now[1] == 3)
+        temperatures_c: dict[str, float] = {"dark_scene": -20.0, "dark": dark, "flat": 10.0}
+        return temperatures_c[now[0]]
 
     with (
         mock.patch.object(SimulatedLab, "arrange", arranged),
-        mock.patch.object(SimulatedCamera, "temperature_c", read),
+        mock.patch.object(SimulatedCamera, "temperature_c", temperature_c),
     ):
-        return captured(folder, rig_toml(steps, rows=1, columns=2))
-
-
-def test_session_without_scene_temperature_warns_of_nothing(tmp_path: Path) -> None:
-    warm = session_at(tmp_path / "no scene", lambda kind, number: {"dark": 5.0}.get(kind, -20.0), "bright", "dark")
-    assert scene_temperature_warnings(*load_noise_set(warm)) == []
-    (warm / "noise.toml").write_text(
-        (write_frames(tmp_path / "set", take_set(*specimen(1))) / "noise.toml").read_text()
-    )
-    assert scene_temperature_warnings(warm, load_noise_set(tmp_path / "set")[1]) == []
-
-
-def test_only_darks_beyond_the_limit_are_named(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    def temperature_c(kind: StepKind, number: int) -> float:
-        dark = -18.0 + 0.5 * (number <= 2) - 4.5 * (number == 3)
-        return {"dark_scene": -20.0, "dark": dark, "flat": 10.0}[kind]
-
-    session = session_at(tmp_path, temperature_c, "dark_scene", "dark", "flat")
+        session = captured(tmp_path, rig_toml(["dark_scene", "dark", "flat"], rows=1, columns=2))
     darks = [f"frames/{path.name}" for frame, _, path in taken_frames(session) if frame.kind == "dark"]
     capfd.readouterr()
     record = measure_sensor(session)
@@ -199,3 +156,5 @@ def test_only_darks_beyond_the_limit_are_named(tmp_path: Path, capfd: pytest.Cap
         f"3 of 32 dark frames are more than 2 K away from the scene ({named}): "
         "they have -22.5 to -17.5 °C, the 2 frames of the scene -20.0 to -20.0 °C; "
     )
+    alone = load_noise_set(write_frames(tmp_path / "set", take_set(*specimen(1))))
+    assert scene_temperature_warnings(*alone) == []
