@@ -22,14 +22,14 @@ CAMERAS = {
 POINTS = [[0.0, 0.0, 1.0], [0.3, -0.2, 1.2], [-0.35, 0.25, 0.9], [0.1, 0.3, 1.5]]
 
 
-def model(cameras: dict[str, list[float]]) -> tuple[pycolmap.Reconstruction, dict[str, list[list[float]]]]:
-    """Return a model with one image per camera, and where each image sees the points, in COLMAP's own pixels."""
-    generator, made, seen = np.random.default_rng(1), pycolmap.Reconstruction(), {}
-    for number, (kind, parameters) in enumerate(cameras.items(), start=1):
+def write(folder: Path) -> None:
+    """Write a model with one image per camera in text and in binary, and the points in COLMAP's own pixels."""
+    generator, model, pixels = np.random.default_rng(1), pycolmap.Reconstruction(), {}
+    for number, (kind, parameters) in enumerate(CAMERAS.items(), start=1):
         camera = pycolmap.Camera(
             camera_id=number, model=kind, width=SIZE_PX[0], height=SIZE_PX[1], params=np.array(parameters)
         )
-        made.add_camera_with_trivial_rig(camera)
+        model.add_camera_with_trivial_rig(camera)
         axis = generator.normal(size=3)
         turn = pycolmap.Rotation3d(axis / np.linalg.norm(axis) * generator.uniform(0.05, 0.3))
         pose = pycolmap.Rigid3d(turn, generator.normal(size=3) * 0.05)
@@ -37,20 +37,14 @@ def model(cameras: dict[str, list[float]]) -> tuple[pycolmap.Reconstruction, dic
         image = pycolmap.Image(
             name=name, camera_id=number, image_id=10 * number, keypoints=generator.uniform(0, 400, (number % 3, 2))
         )
-        made.add_image_with_trivial_frame(image, pose)
+        model.add_image_with_trivial_frame(image, pose)
         in_camera = [pose.rotation.matrix() @ np.array(point) + pose.translation for point in POINTS]
-        seen[name] = [camera.img_from_cam(point).tolist() for point in in_camera]
-    return made, seen
-
-
-def write(folder: Path) -> None:
-    """Write the model in text and in binary, and what its images see."""
-    made, seen = model(CAMERAS)
+        pixels[name] = [camera.img_from_cam(point).tolist() for point in in_camera]
     for kind in ("text", "binary"):
         (folder / kind).mkdir(parents=True, exist_ok=True)
-    made.write_text(str(folder / "text"))
-    made.write_binary(str(folder / "binary"))
-    content = {"pycolmap": pycolmap.__version__, "points": POINTS, "seen": seen}
+    model.write_text(str(folder / "text"))
+    model.write_binary(str(folder / "binary"))
+    content = {"pycolmap": pycolmap.__version__, "points": POINTS, "seen": pixels}
     (folder / "seen.json").write_text(json.dumps(content, indent=1) + "\n")
 
 

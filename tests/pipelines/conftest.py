@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.cli import run
 from faintfield.pipelines.commands.run import run as run_session
-from faintfield.pipelines.formats.image_files import encoded, write_frame
+from faintfield.pipelines.formats.image_files import encoded
 from faintfield.pipelines.reconstruction import penalised, surface, surface_depths, surface_files
 from faintfield.pipelines.reconstruction.options import Options
 from faintfield.recon.surface.estimate import SurfaceEstimate
+from tests.pipelines.by_hand import View, write_set
 from tests.pipelines.sessions import captured, rig_toml
 from tests.pipelines.surfaces import Searches, found_at_once
 
@@ -86,6 +87,12 @@ def drawing_nothing() -> Iterator[None]:
         yield
 
 
+def run_undrawn(*words: object) -> None:
+    """Run one command that must end well, with empty drawings."""
+    with drawing_nothing():
+        assert run([str(word) for word in words]) == 0
+
+
 @pytest.fixture
 def undrawn() -> Iterator[None]:
     """Pages with empty drawings, for tests of something else."""
@@ -96,23 +103,15 @@ def undrawn() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def simulated_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small dark set with its truth, to be read only."""
-
-    def make(folder: Path) -> None:
-        assert run([str(word) for word in ("simulate", folder / "scene", *SMALL)]) == 0
-
-    return made_once(tmp_path_factory, "simulated", make) / "scene"
+    folder = made_once(tmp_path_factory, "simulated", lambda folder: run_undrawn("simulate", folder / "scene", *SMALL))
+    return folder / "scene"
 
 
 @pytest.fixture(scope="session")
 def sweep(simulated_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A sweep of five planes, to be read only."""
-
-    def make(folder: Path) -> None:
-        words = ("--out", folder / "out", "--sweep-mm", "500:700:5", "--method", "backprojection")
-        with drawing_nothing():
-            assert run([str(word) for word in ("reconstruct", simulated_scene, *words)]) == 0
-
-    return made_once(tmp_path_factory, "sweep-for-export", make) / "out"
+    words = ("reconstruct", simulated_scene, "--sweep-mm", "500:700:5", "--method", "backprojection", "--out")
+    return made_once(tmp_path_factory, "sweep-for-export", lambda folder: run_undrawn(*words, folder / "out")) / "out"
 
 
 @pytest.fixture(scope="session")
@@ -197,25 +196,8 @@ def make_set(tmp_path: Path) -> SetMaker:
         camera: dict[str, Any] | None = None,
         exposure_s: float = 0.5,
     ) -> Path:
-        folder = tmp_path / name
-        folder.mkdir()
-        height, width = images[0].shape[:2]
-        views = []
-        for column, image in enumerate(images):
-            write_frame(folder / f"view_{column}.tiff", image)
-            pose = [0.0, 0.0, 0.0, -10.0 * column, 0.0, 0.0]
-            views.append({"image": f"view_{column}.tiff", "rt_cam_ref": pose, "node": [0, column]})
-        lens = {"fx_px": 50.0, "fy_px": 50.0, "cx_px": (width - 1) / 2, "cy_px": (height - 1) / 2}
-        settings = {
-            "format": 1,
-            "exposure_s": exposure_s,
-            "reference_view": 0,
-            "camera": {"size_px": [width, height], **lens, **(camera or {})},
-            "noise": noise or {"offset_dn": 100.0, "gain_dn_per_e": 2.0, "read_noise_e": 3.0},
-            "view": views,
-        }
-        (folder / "elemental.toml").write_text(tomli_w.dumps(settings))
-        return folder
+        views = [View(image, (0, column), (0, 0, 0, -10.0 * column, 0, 0)) for column, image in enumerate(images)]
+        return write_set(tmp_path / name, views, noise=noise, camera=camera, exposure_s=exposure_s)
 
     return make
 

@@ -13,8 +13,19 @@ def read_record(folder: Path, name: str = "reconstruction.json") -> dict[str, An
     return record
 
 
+def plane_files(folder: Path) -> dict[str, bytes]:
+    """Return the contents of the files of all planes below a folder."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("plane_*")}
+
+
 def form(value: Any) -> Any:
-    """Return a JSON value's keys, in their order, and the types of its values; a list has the forms of its elements."""
+    """Return a JSON value's keys, in their order, and the types of its values; a list has the forms of its elements.
+
+    A quantity has a value with its error, or none with the reason: which of the two is a matter of the frames.
+    """
+    if isinstance(value, dict) and list(value) in (["value", "se", "ci95"], ["value", "why"]):
+        assert (value["value"] is None) == ("why" in value)
+        return "quantity"
     if isinstance(value, dict):
         return [(key, form(one)) for key, one in value.items()]
     if isinstance(value, list):
@@ -32,21 +43,6 @@ def form_of_result(path: Path) -> Any:
     return form(content)
 
 
-def layout(value: Any) -> Any:
-    """Return a JSON value with the type of each scalar in its place; keys in their order, lists by their first item.
-
-    A quantity has a value with its error, or none with the reason: which of the two is a matter of the frames.
-    """
-    if isinstance(value, dict) and list(value) in (["value", "se", "ci95"], ["value", "why"]):
-        assert (value["value"] is None) == ("why" in value)
-        return "quantity"
-    if isinstance(value, dict):
-        return [(key, layout(part)) for key, part in value.items()]
-    if isinstance(value, list):
-        return [layout(part) for part in value[:1]]
-    return type(value).__name__
-
-
 def check_layout(made: Path, golden: str, *later: str) -> None:
     """The keys of a result, their order, and the types of their values are those of a golden file; some came later."""
     found, wanted = (json.loads(path.read_text()) for path in (made, GOLDEN / golden))
@@ -57,4 +53,4 @@ def check_layout(made: Path, golden: str, *later: str) -> None:
         assert all(isinstance(warning, str) for warning in record.pop("warnings", []))
     for plane in found.get("planes", []):
         del plane["fit"], plane["emva1288"]  # came later
-    assert layout(found) == layout(wanted)
+    assert form(found) == form(wanted)

@@ -13,24 +13,15 @@ from rich.console import Console
 from faintfield.pipelines import cli, console
 from faintfield.pipelines.console import _Report, _reports, conceal, inform, progress, working
 from tests.pipelines.conftest import Command
-
-
-class Clock:
-    """A clock that a test sets."""
-
-    def __init__(self) -> None:
-        self.now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
+from tests.pipelines.refusals import assert_refused
 
 
 def test_lines_are_due_after_2_and_12_s() -> None:
-    clock = Clock()
-    report = _Report("solving", total=8, done=2, clock=clock)
+    now = 100.0
+    report = _Report("solving", total=8, done=2, clock=lambda: now)
     lines = {}
     for tenth in range(250):
-        clock.now = 100 + tenth / 10
+        now = 100 + tenth / 10
         if (line := report.line()) is not None:
             lines[tenth / 10] = line
     assert list(lines) == [2.0, 12.0, 22.0]
@@ -38,15 +29,9 @@ def test_lines_are_due_after_2_and_12_s() -> None:
     assert report.wait_s() == pytest.approx(32 - 24.9)
 
 
-@pytest.fixture
-def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lines after 0.05 s instead of 2 s, and as often."""
+def test_part_speaks_for_whole_unless_short(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(console, "_FIRST_LINE_S", 0.05)
     monkeypatch.setattr(console, "_NEXT_LINE_S", 0.05)
-
-
-@pytest.mark.usefixtures("hurried")
-def test_part_speaks_for_the_whole(capfd: pytest.CaptureFixture[str]) -> None:
     for _ in progress([1], "whole"):
         with working("part"):
             time.sleep(0.3)
@@ -54,10 +39,6 @@ def test_part_speaks_for_the_whole(capfd: pytest.CaptureFixture[str]) -> None:
     parts = [line for line in lines if line.startswith("part: ")]
     assert len(parts) >= 2
     assert len(lines) - len(parts) <= 1  # before the part has spoken
-
-
-@pytest.mark.usefixtures("hurried")
-def test_whole_speaks_while_its_parts_are_short(capfd: pytest.CaptureFixture[str]) -> None:
     for _ in progress(range(60), "whole"):
         with working("part"):
             time.sleep(0.005)
@@ -70,13 +51,11 @@ def test_whole_speaks_while_its_parts_are_short(capfd: pytest.CaptureFixture[str
 def test_bar_goes_on_while_a_part_works(monkeypatch: pytest.MonkeyPatch) -> None:
     screen = io.StringIO()
     monkeypatch.setattr(console, "console", Console(file=screen, force_terminal=True, width=80))
-    taken = []
-    for item in progress([1, 2], "whole"):
+    for _ in progress([1, 2], "whole"):
         with working("[part]"):
-            taken.append(item)
+            pass
     with working("[alone]"):
         pass
-    assert taken == [1, 2]
     assert "[alone]" in screen.getvalue()
     assert "[part]" not in screen.getvalue()
 
@@ -130,30 +109,14 @@ def test_success_and_failure_share_a_log(tmp_path: Path, faintfield: Command) ->
     assert f"by OutputExists: {rig}: exists and is not overwritten" in words[6]
 
 
-def test_log_keeps_warnings_and_tracebacks_without_secrets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object) -> None:
-        logging.getLogger("some.library").warning("the wind has turned")
-        conceal("sesame")
-        inform("the word is sesame")
-        raise ZeroDivisionError("sesame")
-
-    monkeypatch.setattr("faintfield.pipelines.pages.report.write_report", fail)
-    log = tmp_path / "day.log"
-    with pytest.raises(ZeroDivisionError):
-        cli.run(["report", "folder", "--log", str(log)])
-    assert ("WARNING", "the wind has turned") in _entries(log)
-    assert ("INFO", "the word is (concealed)") in _entries(log)
-    assert _entries(log)[-1][1].endswith("by ZeroDivisionError: (concealed)")
-    assert "Traceback (most recent call last)" in log.read_text()
-    assert "sesame" not in log.read_text()
-
-
-def test_no_name_can_forge_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_log_keeps_tracebacks_without_secrets_or_forged_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     forged = "a\n2026-01-01T00:00:00.000Z INFO done in 1.0 s\x1b[2K\u2028\udcff"
 
     def fail(*_: object) -> None:
         logging.getLogger("some.library").warning(forged)
-        raise ZeroDivisionError(forged)
+        conceal("sesame")
+        inform("the word is sesame")
+        raise ZeroDivisionError(f"sesame {forged}")
 
     monkeypatch.setattr("faintfield.pipelines.pages.report.write_report", fail)
     # pytest keeps what is logged, and its workers cannot send what is not UTF-8
@@ -163,21 +126,19 @@ def test_no_name_can_forge_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         cli.run(["report", forged, "--log", str(log)])
     escaped = r"a\n2026-01-01T00:00:00.000Z INFO done in 1.0 s\x1b[2K\u2028\udcff"
     levels, words = zip(*_entries(log), strict=True)
-    assert levels == ("INFO", "INFO", "WARNING", "ERROR")
+    assert levels == ("INFO", "INFO", "WARNING", "INFO", "ERROR")
     assert words[0].startswith(f"begins: faintfield report {escaped} (in ")
-    assert words[2] == escaped
-    assert words[3].endswith(f"by ZeroDivisionError: {escaped}")
+    assert words[2:4] == (escaped, "the word is (concealed)")
+    assert words[4].endswith(f"by ZeroDivisionError: (concealed) {escaped}")
+    assert "Traceback (most recent call last)" in log.read_text()
+    assert "sesame" not in log.read_text()
     assert all(line.isprintable() for line in log.read_text().split("\n"))
 
 
-def test_unwritable_log_is_refused_before_the_command(tmp_path: Path, faintfield: Command) -> None:
+def test_unwritable_log_is_refused_but_full_disk_tolerated(tmp_path: Path, faintfield: Command) -> None:
     ended = faintfield("init", tmp_path / "rig.toml", "--log", tmp_path / "absent" / "day.log")
-    assert ended.returncode == 1
-    assert ended.stderr.startswith("faintfield: CannotWrite: --log ")
+    assert_refused(ended, "CannotWrite", "--log ")
     assert not (tmp_path / "rig.toml").exists()
-
-
-def test_full_disk_ends_log_but_not_command(tmp_path: Path, faintfield: Command) -> None:
     before = list(logging.getLogger().handlers)
     ended = faintfield("--log", "/dev/full", "init", tmp_path / "rig.toml")
     assert ended.returncode == 0

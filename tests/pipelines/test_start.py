@@ -32,14 +32,10 @@ for command in ["--version", *sys.argv[1:]]:
 # A file with two kernels, and a command that calls both.
 _KERNELS = """
 from faintfield.recon.numba_tools import compiled
-
 @compiled
-def double(x):
-    return x + x
-
+def double(x): return x + x
 @compiled
-def square(x):
-    return x * x
+def square(x): return x * x
 """
 _COMMAND = """
 from faintfield.pipelines import cli, launcher
@@ -54,15 +50,9 @@ cli.main([])
 
 def _complaint(program: str, *words: str, cwd: Path | None = None, **environment: str) -> str:
     """Return the standard error of a program in a process of its own."""
-    ended = subprocess.run(
-        [sys.executable, "-c", program, *words],
-        capture_output=True,
-        text=True,
-        check=True,
-        cwd=cwd,
-        env=os.environ | environment,
-    )
-    return ended.stderr
+    command = [sys.executable, "-c", program, *words]
+    environ = os.environ | environment
+    return subprocess.run(command, capture_output=True, text=True, check=True, cwd=cwd, env=environ).stderr
 
 
 def _commands(parent: App, before: str = "") -> Iterator[str]:
@@ -77,11 +67,11 @@ def test_version_and_help_load_nothing_heavy() -> None:
     commands = list(_commands(app))
     assert {"run", "demo", "stage test", "import grid", "export zarr"} <= {*commands}
     lines = _complaint(_LOADED_BY_EACH, *commands).split("\n")[:-1]
-    elemental_set = {name: {*modules} for name, *modules in (line.split(",") for line in lines)}
-    assert elemental_set.keys() == {"--version", *commands}
-    assert "faintfield.pipelines.cli" in elemental_set["--version"]
-    assert not elemental_set["--version"] & {"cyclopts", "rich", "msgspec", "logging"}
-    for command, modules in elemental_set.items():
+    modules_of = {name: {*modules} for name, *modules in (line.split(",") for line in lines)}
+    assert modules_of.keys() == {"--version", *commands}
+    assert "faintfield.pipelines.cli" in modules_of["--version"]
+    assert not modules_of["--version"] & {"cyclopts", "rich", "msgspec", "logging"}
+    for command, modules in modules_of.items():
         assert "0" in modules
         assert not modules & HEAVY, command
 

@@ -1,4 +1,4 @@
-"""`report`: one page that needs nothing but itself."""
+"""`report`: one page of planes or surfaces that needs nothing but itself."""
 
 import base64
 import json
@@ -6,6 +6,7 @@ import re
 import shutil
 from collections.abc import Callable
 from html.parser import HTMLParser
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,13 @@ import numpy as np
 import pytest
 import tifffile
 
-from faintfield.pipelines.cli import run
 from faintfield.pipelines.formats.image_files import grey_levels, white_level
+from faintfield.pipelines.pages import report_surface
 from tests.pipelines.by_hand import write_by_hand
-from tests.pipelines.conftest import Command, drawing_nothing
+from tests.pipelines.conftest import Command, run_undrawn
+from tests.pipelines.forms import read_record
+from tests.pipelines.refusals import assert_refused
+from tests.pipelines.surfaces import write_example
 
 pytestmark = pytest.mark.usefixtures("undrawn")
 
@@ -30,6 +34,7 @@ class _Page(HTMLParser):
 
     def __init__(self, text: str) -> None:
         super().__init__()
+        self.text = text
         self.elements: list[tuple[str, dict[str, str | None]]] = []
         self.open: list[str] = []
         self.words = ""
@@ -42,11 +47,8 @@ class _Page(HTMLParser):
         if tag not in VOID:
             self.open.append(tag)
 
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.elements.append((tag, dict(attrs)))
-
     def handle_endtag(self, tag: str) -> None:
-        if not self.open or self.open.pop() != tag:
+        if tag not in VOID and (not self.open or self.open.pop() != tag):
             self.mistakes.append(f"</{tag}> at line {self.getpos()[0]}")
 
     def handle_data(self, data: str) -> None:
@@ -62,9 +64,7 @@ def original(simulated_scene: Path, tmp_path_factory: pytest.TempPathFactory) ->
     """Three depths by two methods, with a focus curve; to be read only."""
     out = tmp_path_factory.mktemp("report") / "<planes & more>"
     methods = [word for name in METHOD_TITLES for word in ("--method", name)]
-    words = ["--sweep-mm", "500:700:3", *methods, "--passes", "3"]
-    with drawing_nothing():
-        assert run(["reconstruct", str(simulated_scene), "--out", str(out), *words]) == 0
+    run_undrawn("reconstruct", simulated_scene, "--out", out, "--sweep-mm", "500:700:3", *methods, "--passes", 3)
     return out
 
 
@@ -75,25 +75,18 @@ def planes(original: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def text(original: Path) -> str:
-    return (original / "report.html").read_text()
+def page(original: Path) -> _Page:
+    return _Page((original / "report.html").read_text())
 
 
-@pytest.fixture(scope="module")
-def page(text: str) -> _Page:
-    return _Page(text)
-
-
-def test_page_is_well_formed_and_fetches_nothing(text: str, page: _Page) -> None:
+def test_page_is_well_formed_and_self_contained(page: _Page) -> None:
+    text = page.text
     assert text.startswith("<!doctype html>")
     assert page.mistakes == []
     assert page.open == []
     (policy,) = [a["content"] for tag, a in page.elements if tag == "meta" and "http-equiv" in a]
     assert policy is not None
     assert policy.startswith("default-src 'none'; img-src data:;")
-
-
-def test_page_needs_nothing_from_elsewhere(text: str, page: _Page) -> None:
     addresses = set(re.findall(r"[a-z]+://[^\s\"'<>)]+", text))
     names_of_formats = ("http://www.w3.org/", "http://purl.org/dc/", "http://creativecommons.org/ns#")
     assert {address for address in addresses if not address.startswith(names_of_formats)} == set()
@@ -105,38 +98,18 @@ def test_page_needs_nothing_from_elsewhere(text: str, page: _Page) -> None:
     assert not re.search(r"@import|\bfetch\(|XMLHttpRequest|import\(", text)
     for target in re.findall(r"url\(([^)]*)\)", text):
         assert target.strip("'\"").startswith(("#", "data:"))
-
-
-def test_every_picture_can_be_decoded(text: str, page: _Page) -> None:
     sources = {*page.attributes("img", "src"), *re.findall(r'"src": "(data:[^"]+)"', text)}
     assert len(sources) >= 3 + 3 * 2 + 3 * 2  # the set, the planes side by side, the slider
     for source in sources:
         kind, content = source.split(";base64,")
         assert kind in ("data:image/png", "data:image/jpeg", "data:image/webp")
-        picture = cv2.imdecode(np.frombuffer(base64.b64decode(content), np.uint8), cv2.IMREAD_UNCHANGED)
-        assert picture is not None
-
-
-def test_page_has_all_methods_and_depths(text: str, page: _Page) -> None:
-    alternatives = page.attributes("img", "alt")
-    for title in METHOD_TITLES.values():
-        for depth in (500, 600, 700):
-            assert f"{title} at {depth} mm" in alternatives
-    found = re.search(r"const columns = (.*);\n", text)
-    assert found is not None
-    columns = json.loads(found[1])
-    assert [column["title"] for column in columns] == list(METHOD_TITLES.values())
-    for column in columns:
-        assert [plane["depth"] for plane in column["planes"]] == [500.0, 600.0, 700.0]
+        assert cv2.imdecode(np.frombuffer(base64.b64decode(content), np.uint8), cv2.IMREAD_UNCHANGED) is not None
 
 
 def test_planes_share_grey_scale_of_least_noisy_method(page: _Page, original: Path) -> None:
-    planes = {
-        (name, depth): tifffile.imread(original / name / f"plane_{depth:07.1f}.tiff")
-        for name in METHOD_TITLES
-        for depth in (500.0, 600.0, 700.0)
-    }
-    white = min(max(white_level(planes[name, depth]) for depth in (500.0, 600.0, 700.0)) for name in METHOD_TITLES)
+    places = product(METHOD_TITLES, (500.0, 600.0, 700.0))
+    planes = {(name, z): tifffile.imread(original / name / f"plane_{z:07.1f}.tiff") for name, z in places}
+    white = min(max(white_level(planes[name, z]) for z in (500.0, 600.0, 700.0)) for name in METHOD_TITLES)
     assert f"{white:.3g} e⁻ per pixel" in page.words
     shown = {a["alt"]: a["src"] or "" for tag, a in page.elements if tag == "img"}
     for (name, depth), plane in planes.items():
@@ -146,26 +119,20 @@ def test_planes_share_grey_scale_of_least_noisy_method(page: _Page, original: Pa
 
 
 def test_page_shows_digests_brightness_and_errors(page: _Page, original: Path) -> None:
-    record = json.loads((original / "pmlem-osl" / "reconstruction.json").read_text())
-    for digest in record["inputs"].values():
+    for digest in read_record(original / "pmlem-osl")["inputs"].values():
         assert digest in page.words
-    overview = json.loads((original / "overview.json").read_text())
-    for figure in (overview["brightness"]["snr"], overview["brightness"]["photons_from_moments"]):
+    light = read_record(original, "overview.json")["brightness"]
+    for figure in (light["snr"], light["photons_from_moments"]):
         assert f"{figure:.3g}" in page.words
-    for plane in json.loads((original / "metrics.json").read_text())["planes"]:
+    for plane in read_record(original, "metrics.json")["planes"]:
         assert f"{plane['mse_bright']:.4f}" in page.words
     assert "<planes & more>: planes at 3 depths, 500 to 700 mm" in page.words
 
 
-def test_drawing_again_gives_same_page(planes: Path, text: str, done: Command) -> None:
+def test_drawn_again_alone_and_together(planes: Path, page: _Page, tmp_path: Path, done: Command) -> None:
     (planes / "report.html").unlink()
-    ended = done("report", planes)
-    assert ended.stdout == f"{planes / 'report.html'}\n"
-    assert (planes / "report.html").read_text() == text
-
-
-def test_results_in_folders_are_shown_together(planes: Path, tmp_path: Path, done: Command) -> None:
-    (planes / "report.html").unlink()
+    assert done("report", planes).stdout == f"{planes / 'report.html'}\n"
+    assert (planes / "report.html").read_text() == page.text
     shutil.copytree(planes, tmp_path / "both" / "left")
     shutil.copytree(planes, tmp_path / "both" / "right")
     done("report", tmp_path / "both")
@@ -194,34 +161,22 @@ def test_titles_say_whether_occlusion_was_kept(kept: bool, planes: Path, done: C
     assert "--joint" not in page.words
 
 
-# What a report has always needed of each kind of result; earlier versions did not write all the other keys.
-NEEDED = {
-    "reconstruction.json": {"planes", "options", "versions", "inputs", "wall_time_s"},
-    "overview.json": {"set", "views", "size_px", "exposure_s", "read_noise_e", "brightness"},
-    "metrics.json": {"planes"},
-}
-NEEDED_OF_PLANES = {
-    "reconstruction.json": {
-        *("file", "depth_mm", "method", "channel", "pitch_mm", "penalty_weight", "penalty_weight_chosen"),
-        *("passes", "flux_e", "certificate"),
-    },
-    "metrics.json": {"depth_mm", "object", "method", "poses", "mse_bright", "mse_texture", "psnr_db"},
-}
-
-
-def _only(record: dict[str, Any], keys: set[str]) -> dict[str, Any]:
-    return {key: value for key, value in record.items() if key in keys}
+# What a report has always needed of results and their planes; earlier versions did not write all the other keys.
+NEEDED = """
+planes options versions inputs wall_time_s set views size_px exposure_s read_noise_e brightness file depth_mm method
+channel pitch_mm penalty_weight penalty_weight_chosen passes flux_e certificate object poses mse_bright mse_texture
+psnr_db
+""".split()
 
 
 def test_results_with_fewest_keys_are_shown(planes: Path, done: Command) -> None:
-    for name, keys in NEEDED.items():
-        for path in planes.rglob(name):
-            record = _only(json.loads(path.read_bytes()), keys)
-            if name in NEEDED_OF_PLANES:
-                record["planes"] = [_only(plane, NEEDED_OF_PLANES[name]) for plane in record["planes"]]
-            if "options" in record:
-                record["options"] = {"method": record["planes"][0]["method"]}
-            write_by_hand(path, record)
+    for path in [*planes.rglob("reconstruction.json"), planes / "overview.json", planes / "metrics.json"]:
+        record = {key: value for key, value in json.loads(path.read_bytes()).items() if key in NEEDED}
+        if "planes" in record:
+            record["planes"] = [{key: plane[key] for key in NEEDED if key in plane} for plane in record["planes"]]
+        if "options" in record:
+            record["options"] = {"method": record["planes"][0]["method"]}
+        write_by_hand(path, record)
     done("report", planes)
     text = (planes / "report.html").read_text()
     assert "grey scale: black" not in text
@@ -233,7 +188,6 @@ def test_results_with_fewest_keys_are_shown(planes: Path, done: Command) -> None
     [
         ("backprojection/reconstruction.json", lambda record: record.pop("planes"), "BadValue"),
         ("backprojection/reconstruction.json", lambda record: record.update(planes=[]), "BadValue"),
-        ("backprojection/reconstruction.json", lambda record: record["planes"][0].update(depth_mm="far"), "BadValue"),
         ("backprojection/reconstruction.json", lambda record: record["planes"][0].update(file="a.tiff"), "MissingFile"),
         ("overview.json", lambda record: record.pop("brightness"), "BadValue"),
         ("metrics.json", lambda record: record.update(planes=[{"depth_mm": 500.0}]), "BadValue"),
@@ -248,26 +202,92 @@ def test_damaged_result_is_named(
     write_by_hand(path, record)
     before = (planes / "report.html").read_bytes()
     ended = faintfield("report", planes)
-    assert ended.returncode == 1
-    assert ended.stderr.startswith(f"faintfield: {failure}: ")
-    assert path.parent.name in ended.stderr
+    assert_refused(ended, failure, path.parent.name)
     assert len(ended.stderr.splitlines()) == 1
     assert (planes / "report.html").read_bytes() == before
 
 
-def test_plane_that_is_missing_or_damaged_is_named(planes: Path, faintfield: Command) -> None:
+def test_missing_or_damaged_planes_are_named(planes: Path, tmp_path: Path, faintfield: Command) -> None:
     path = planes / "pmlem-osl" / "plane_00600.0.tiff"
     path.write_bytes(path.read_bytes()[:1000])
-    ended = faintfield("report", planes)
-    assert (ended.returncode, "UnreadableImage" in ended.stderr, str(path) in ended.stderr) == (1, True, True)
+    assert_refused(faintfield("report", planes), "UnreadableImage", str(path))
     path.unlink()
-    ended = faintfield("report", planes)
-    assert (ended.returncode, "MissingFile" in ended.stderr, str(path) in ended.stderr) == (1, True, True)
-    assert "reconstruct again" in ended.stderr
+    assert_refused(faintfield("report", planes), "MissingFile", str(path), "reconstruct again")
+    (tmp_path / "empty").mkdir()
+    assert_refused(faintfield("report", tmp_path / "empty"), "MissingFile")
+    assert not list((tmp_path / "empty").iterdir())
 
 
-def test_folder_without_results_is_refused(tmp_path: Path, faintfield: Command) -> None:
-    ended = faintfield("report", tmp_path)
-    assert ended.returncode == 1
-    assert "MissingFile" in ended.stderr
-    assert not list(tmp_path.iterdir())
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A surface in mm and one in px, to be read only."""
+    folder = tmp_path_factory.mktemp("surfaces")
+    write_example(folder / "in mm")
+    write_example(folder / "in px", unit="px", colours=3)
+    return folder
+
+
+@pytest.fixture
+def surface(written: Path, tmp_path: Path) -> Path:
+    """A copy of the surface in mm that a test may change."""
+    return Path(shutil.copytree(written / "in mm", tmp_path / "<toys & more>"))
+
+
+def _section(folder: Path, done: Command) -> str:
+    """Return the part of the page that shows the surface."""
+    done("report", folder)
+    page = (folder / "report.html").read_text()
+    return page[page.index('<section id="surface">') :].partition("</section>")[0]
+
+
+def _words(html: str) -> str:
+    return " ".join(re.sub(r"<[^>]*>", " ", html).split())
+
+
+def test_folder_with_surface_alone_has_report(surface: Path, done: Command) -> None:
+    message = _words(_section(surface, done))
+    assert "Depth searched 400 to 900 mm found in the views; 64 depths compared in bins of 2 × 2 pixels" in message
+    for words in ("Known 98 %", "Sure 12 %", "3 of the views", "surface 1.012", "planes 1.340", "predicts them best"):
+        assert words in message
+    page = (surface / "report.html").read_text()
+    assert "<title>faintfield · &lt;toys &amp; more&gt;: a surface</title>" in page
+    assert "What all views show, sharp everywhere." in page
+    assert "The planes below" not in page
+    assert "within 0.40 % of the optimum" in page  # in the provenance
+    assert "total variation" in page
+
+
+def test_pictures_are_those_of_folder(surface: Path, done: Command) -> None:
+    section = _section(surface, done)
+    shown = {base64.b64decode(found) for found in re.findall(r'<img src="data:[^,]*,([^"]*)"', section)}
+    names = ("depth_mm.png", "depth_sigma_mm.png", "picture_sigma.png", "depth_confidence.png", "visibility.png")
+    assert shown == {(surface / name).read_bytes() for name in (*names, "parallax.webp")}
+    still = base64.b64encode((surface / "picture.png").read_bytes()).decode()
+    assert f'<source media="(prefers-reduced-motion: reduce), print" srcset="data:image/png;base64,{still}">' in section
+    above = (surface / "report.html").read_text().partition('<section id="surface">')[0]
+    assert still in above  # the picture leads the page
+
+
+def test_disparities_are_no_lengths(written: Path, tmp_path: Path, done: Command) -> None:
+    message = _words(_section(Path(shutil.copytree(written / "in px", tmp_path / "out")), done))
+    assert "Disparity searched −14.0 to −6.00 px" in message
+    assert "Disparity, px." in message
+    assert not re.search(r"\bmm\b|\bdepth, |point cloud", message)
+
+
+def test_what_is_not_there_is_not_shown(surface: Path, done: Command) -> None:
+    record = read_record(surface, "surface.json")
+    record["surface"] |= {"held_out": None, "film": None, "points": None, "median": None, "range_found": False}
+    write_by_hand(surface / "surface.json", record)
+    (surface / "visibility.png").unlink()
+    section = _section(surface, done)
+    message = _words(section)
+    assert "as asked for" in message
+    assert "Median depth –" in message
+    for absent in ("left out", "Moving.", "Seen by.", "point cloud", "webp"):
+        assert absent not in section
+
+
+def test_overlarge_picture_is_refused(surface: Path, faintfield: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(report_surface, "MAX_PREVIEW_BYTES", 1000)
+    assert_refused(faintfield("report", surface), "MissingFile")

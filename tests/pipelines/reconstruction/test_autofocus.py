@@ -2,56 +2,40 @@
 
 import contextlib
 import re
-import tomllib
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-import tomli_w
 from numpy.typing import NDArray
 
-from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
+from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.autofocus import best_focus, searched_range_mm
 from faintfield.pipelines.reconstruction.comparison import BinnedViews, binned_views
 from faintfield.pipelines.reconstruction.significance import _shuffles, check_places
 from faintfield.recon.errors import NothingInFocus
 from tests.calib.light_fields import Layer, light_field, with_noise
-from tests.pipelines.conftest import Command
-
-pytestmark = pytest.mark.usefixtures("undrawn")
+from tests.pipelines.by_hand import View, write_set
+from tests.pipelines.conftest import Command, Edit
 
 type Node = tuple[int, int]
 
 NODES, SIZE_PX = 5, (96, 72)
-OFFSET_DN, GAIN_DN_PER_E, READ_NOISE_E = 100.0, 2.0, 3.0
 CARDS = (Layer(0.0), Layer(-2.5, (-22, -15), (19, 15)), Layer(-4.0, (22, 8), (15, 19)))
 
 
 def _write_grid(folder: Path, picture: Callable[[Node], NDArray[np.floating]]) -> Path:
     """Write a set of a square grid, 10 mm apart, of what each node sees, in electrons."""
-    folder.mkdir()
-    random, middle, views = np.random.default_rng(7), NODES // 2, []
+    random, views = np.random.default_rng(7), []
     for row, column in np.ndindex(NODES, NODES):
-        electrons = random.poisson(picture((row, column))) + random.normal(0, READ_NOISE_E, SIZE_PX[::-1])
-        name = f"view_r{row}_c{column}.tiff"
-        cv2.imwrite(str(folder / name), (OFFSET_DN + GAIN_DN_PER_E * electrons).round().astype(np.uint16))
-        pose = [0.0, 0.0, 0.0, -10.0 * (column - middle), -10.0 * (row - middle), 0.0]
-        views.append({"image": name, "rt_cam_ref": pose, "node": [row, column]})
-    width, height = SIZE_PX
-    lens = {"fx_px": 100.0, "fy_px": 100.0, "cx_px": (width - 1) / 2, "cy_px": (height - 1) / 2}
-    settings = {
-        "format": 1,
-        "exposure_s": 0.5,
-        "reference_view": len(views) // 2,
-        "camera": {"size_px": [width, height], **lens},
-        "noise": {"offset_dn": OFFSET_DN, "gain_dn_per_e": GAIN_DN_PER_E, "read_noise_e": READ_NOISE_E},
-        "view": views,
-    }
-    (folder / "elemental.toml").write_text(tomli_w.dumps(settings))
-    return folder
+        electrons = random.poisson(picture((row, column))) + random.normal(0, 3.0, SIZE_PX[::-1])
+        pose = (0, 0, 0, -10 * (column - NODES // 2), -10 * (row - NODES // 2), 0)
+        views.append(View((100 + 2 * electrons).round().astype(np.uint16), (row, column), pose))
+    return write_set(folder, views, camera={"fx_px": 100.0, "fy_px": 100.0}, reference_view=NODES**2 // 2)
 
 
 @pytest.fixture(scope="module")
@@ -72,31 +56,18 @@ def test_depths_up_to_infinity_are_found(scene: Path, tmp_path: Path) -> None:
     _check_disparities(-1000 / np.array(focus.depth_mm))  # 100 px of focal length, nodes 10 mm apart
 
 
-def _reordered(scene: Path, folder: Path, seen_by: Callable[[int, int], Node]) -> ElementalSet:
-    """Return the scene with each node's picture replaced by that of another."""
-    folder.mkdir()
-    settings = tomllib.loads((scene / "elemental.toml").read_text())
-    for view in settings["view"]:
-        row, column = seen_by(*view["node"])
-        view["image"] = f"view_r{row}_c{column}.tiff"
-        (folder / view["image"]).write_bytes((scene / view["image"]).read_bytes())
-    (folder / "elemental.toml").write_text(tomli_w.dumps(settings))
-    return load_set(folder)
+def test_another_order_is_refused_with_its_option(scene: Path, tmp_path: Path, edit: Edit) -> None:
+    folder = Path(shutil.copytree(scene, tmp_path / "set"))
 
+    def reorder(settings: dict[str, Any]) -> None:
+        for view in settings["view"]:
+            row, column = view["node"]
+            view["image"] = f"view_{NODES * (NODES - 1 - column) + row}.tiff"
 
-@pytest.mark.parametrize(
-    ("seen_by", "remedy"),
-    [
-        pytest.param(lambda r, c: (r, NODES - 1 - c), "reversed columns (--flip-columns)", marks=pytest.mark.deep),
-        (lambda r, c: (NODES - 1 - c, r), "rows and columns exchanged, and rows reversed (--transpose --flip-rows)"),
-    ],
-)
-def test_another_order_is_refused_with_its_option(
-    seen_by: Callable[[int, int], Node], remedy: str, scene: Path, tmp_path: Path
-) -> None:
-    elemental_set = _reordered(scene, tmp_path / "set", seen_by)
+    edit(folder, reorder)
+    remedy = "rows and columns exchanged, and rows reversed (--transpose --flip-rows)"
     with pytest.raises(NothingInFocus, match=re.escape(f"the views agree better with {remedy}: by ")):
-        best_focus(elemental_set, tmp_path)
+        best_focus(load_set(folder), tmp_path)
 
 
 def test_views_that_show_no_depth_are_refused(tmp_path: Path, faintfield: Command) -> None:
@@ -123,18 +94,14 @@ def test_meaningless_sets_are_accepted_as_rarely_as_stated(kind: str, scene: Pat
         if kind == "noise":
             electrons = random.poisson(200, images.electrons.shape).astype(np.float32)
         if kind == "other scenes":
-            electrons = 200 * 64 * np.stack([_small_scene(random, (width, height)) for _ in electrons])
+            seeds = random.integers(2**40, size=NODES**2).tolist()
+            electrons = 200 * 64 * np.stack([light_field(CARDS, (1, 1), (width, height), seed=s)[0, 0] for s in seeds])
         meaningless = BinnedViews(
             elemental_set, [(layout, replace(images, electrons=electrons.astype(np.float32)))], views.bins_px
         )
         with contextlib.suppress(NothingInFocus):
             accepted += check_places(meaningless, range_mm) is not None
     assert accepted <= 2  # 0.2 are expected; more than two in one of 900 such tests
-
-
-def _small_scene(random: np.random.Generator, size_px: tuple[int, int]) -> NDArray[np.floating]:
-    """Return a picture of an own wall and cards."""
-    return light_field(CARDS, (1, 1), size_px, seed=int(random.integers(2**40)))[0, 0]
 
 
 def test_shuffles_differ_and_are_complete() -> None:
@@ -145,14 +112,13 @@ def test_shuffles_differ_and_are_complete() -> None:
         assert all(sorted(places) == list(range(count)) for places in orders)
 
 
-def test_blind_views_do_not_hide_others(scene: Path, tmp_path: Path) -> None:
-    _reordered(scene, tmp_path / "set", lambda row, column: (row, column))
-    settings = tomllib.loads((tmp_path / "set" / "elemental.toml").read_text())
-    settings["noise"]["saturation_dn"] = 65535.0
-    cv2.imwrite(str(tmp_path / "set" / settings["view"][3]["image"]), np.full(SIZE_PX[::-1], 65535, np.uint16))
-    settings["view"][5]["rt_cam_ref"] = [0.0, 3.0, 0.0, 50.0, 50.0, 0.0]  # looks backwards
-    (tmp_path / "set" / "elemental.toml").write_text(tomli_w.dumps(settings))
-    assert best_focus(load_set(tmp_path / "set"), tmp_path).p_value == 0.002
+def test_blind_views_do_not_hide_others(scene: Path, tmp_path: Path, edit: Edit) -> None:
+    folder = Path(shutil.copytree(scene, tmp_path / "set"))
+    cv2.imwrite(str(folder / "view_3.tiff"), np.full(SIZE_PX[::-1], 65535, np.uint16))
+    edit(folder, lambda settings: settings["noise"].update(saturation_dn=65535.0))
+    # One view looks backwards
+    edit(folder, lambda settings: settings["view"][5].update(rt_cam_ref=[0.0, 3.0, 0.0, 50.0, 50.0, 0.0]))
+    assert best_focus(load_set(folder), tmp_path).p_value == 0.002
 
 
 def test_depth_of_alignment_does_not_matter(tmp_path: Path, done: Command) -> None:

@@ -29,8 +29,11 @@ from tests.pipelines.conftest import Edit, SetMaker
 BAYER = ["RG", "GB"]
 
 
-def _threads(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", count)
+@pytest.fixture(params=[1, 3])
+def threads(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> int:
+    """The number of threads that read frames."""
+    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", request.param)
+    return int(request.param)
 
 
 def _pictures(views: int, shape: tuple[int, int] = (150, 34)) -> list[NDArray[np.uint16]]:
@@ -50,53 +53,38 @@ def _with_maps(elemental_set: ElementalSet) -> ElementalSet:
     return replace(elemental_set, noise=noise)
 
 
-def _plain(elemental_set: ElementalSet, phase: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """One phase of the mosaic of all views by whole arrays, one frame after the other."""
-    noise, electrons, valid = elemental_set.noise, [], []
+def _plain(elemental_set: ElementalSet) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
+    """Electrons of all views (view, row, column) by whole arrays, and where no frame is saturated."""
+    noise, electrons, valid = elemental_set.noise, np.zeros(()), np.ones((), bool)
     assert noise.response is not None
-
-    def of(pixels: Any) -> Any:
-        return pixels[phase[0] :: 2, phase[1] :: 2]
-
-    for view in range(len(elemental_set.settings.view)):
-        parts, over = [], []
-        for path in elemental_set.frame_paths(view):
-            pixels = of(tifffile.imread(path))
-            signal = (pixels.astype(np.float32) - of(noise.offset_dn).astype(np.float32)).astype(float)
-            within = np.clip(signal, 0, of(noise.response.up_to_dn))
-            first, second = of(noise.response.bends_per_dn[0]), noise.response.bends_per_dn[1]
-            slope = 1 + 2 * first * within + 3 * second * within**2
-            charge = within * (1 + first * within + second * within**2) + (signal - within) * slope
-            parts.append(charge.astype(np.float32) / of(noise.gain_dn_per_e).astype(np.float32))
-            over.append(pixels >= 999.5)
-        electrons.append(sum(parts[1:], start=parts[0]))
-        valid.append(~np.any(over, axis=0))
-    return np.stack(electrons), np.stack(valid)
+    first, second = noise.response.bends_per_dn
+    for frame in range(2):
+        pixels = np.stack([tifffile.imread(elemental_set.frame_paths(view)[frame]) for view in range(3)])
+        signal = pixels - noise.offset_dn
+        within = np.clip(signal, 0, noise.response.up_to_dn)
+        slope = 1 + 2 * first * within + 3 * second * within**2
+        charge = within * (1 + first * within + second * within**2) + (signal - within) * slope
+        electrons, valid = electrons + charge / noise.gain_dn_per_e, valid & (pixels < 999.5)
+    return electrons, valid
 
 
-@pytest.mark.parametrize("threads", [1, 3])
-def test_colour_is_that_of_plain_arithmetic(
-    threads: int, make_set: SetMaker, edit: Edit, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.usefixtures("threads")
+def test_colour_is_that_of_plain_arithmetic(make_set: SetMaker, edit: Edit) -> None:
     """Two frames a view, a map of everything, and more rows than are converted at a time."""
-    _threads(threads, monkeypatch)
     folder = make_set(_pictures(6), camera={"mosaic": BAYER})
 
     def add_up_in_twos(settings: dict[str, Any]) -> None:
-        names = [view["image"] for view in settings["view"]]
-        settings["view"] = [
-            view | {"repeats": [second]} for view, second in zip(settings["view"][:3], names[3:], strict=True)
-        ]
+        settings["view"] = [settings["view"][k] | {"repeats": [f"view_{k + 3}.tiff"]} for k in range(3)]
 
     edit(folder, add_up_in_twos)
     elemental_set = _with_maps(load_set(folder))
     green = next(layout for layout in channel_layouts(elemental_set) if layout.name == "green")
     images = load_channel(elemental_set, green)
     assert images.valid is not None
-    for index, phase in enumerate([(0, 1), (1, 0)]):
-        electrons, valid = _plain(elemental_set, phase)
-        np.testing.assert_allclose(images.electrons[index::2], electrons, rtol=3e-7, atol=1e-5)
-        np.testing.assert_array_equal(images.valid[index::2], valid)
+    electrons, valid = _plain(elemental_set)
+    for index, phase in enumerate([np.s_[:, 0::2, 1::2], np.s_[:, 1::2, 0::2]]):
+        np.testing.assert_allclose(images.electrons[index::2], electrons[phase], rtol=3e-7, atol=1e-5)
+        np.testing.assert_array_equal(images.valid[index::2], valid[phase])
     assert not images.valid.all()
 
 
@@ -119,18 +107,15 @@ class _CountedReader:
                 self.at_work -= 1
 
 
-def _grey(make_set: SetMaker, views: int) -> tuple[ElementalSet, Any]:
-    elemental_set = load_set(make_set(_pictures(views)))
+def _grey(make_set: SetMaker, views: int, shape: tuple[int, int] = (150, 34)) -> tuple[ElementalSet, Any]:
+    elemental_set = load_set(make_set(_pictures(views, shape)))
     (layout,) = channel_layouts(elemental_set)
     return elemental_set, layout
 
 
-@pytest.mark.parametrize("threads", [1, 3])
-def test_memory_is_that_of_frames_at_work(threads: int, make_set: SetMaker, monkeypatch: pytest.MonkeyPatch) -> None:
-    _threads(threads, monkeypatch)
+def test_memory_is_that_of_frames_at_work(threads: int, make_set: SetMaker) -> None:
     shape, views = (300, 400), 24
-    elemental_set = load_set(make_set(_pictures(views, shape)))
-    (layout,) = channel_layouts(elemental_set)
+    elemental_set, layout = _grey(make_set, views, shape)
     load_channel(elemental_set, layout)
     tracemalloc.start()
     try:
@@ -144,11 +129,7 @@ def test_memory_is_that_of_frames_at_work(threads: int, make_set: SetMaker, monk
     assert peak - images.electrons.nbytes < threads * (5 * pixels + 300_000)
 
 
-@pytest.mark.parametrize("threads", [1, 3])
-def test_first_damaged_frame_ends_reading_by_name(
-    threads: int, make_set: SetMaker, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _threads(threads, monkeypatch)
+def test_first_damaged_frame_ends_reading_by_name(threads: int, make_set: SetMaker) -> None:
     elemental_set, layout = _grey(make_set, 40)
     for view in (4, 5, 6):
         os.truncate(elemental_set.image_paths[view], 3000)
@@ -167,10 +148,10 @@ def test_first_damaged_frame_ends_reading_by_name(
     assert counted.begun <= 4 + threads
 
 
-def test_interrupt_ends_all_threads(make_set: SetMaker, monkeypatch: pytest.MonkeyPatch) -> None:
-    _threads(3, monkeypatch)
+@pytest.mark.parametrize("threads", [3], indirect=True)
+def test_interrupt_ends_all_threads(threads: int, make_set: SetMaker) -> None:
     elemental_set, layout = _grey(make_set, 40)
-    together = threading.Barrier(3)
+    together = threading.Barrier(threads)
 
     def interrupted(_: int) -> None:
         together.wait(HANG_S)
@@ -187,11 +168,11 @@ def test_interrupt_ends_all_threads(make_set: SetMaker, monkeypatch: pytest.Monk
 
 @pytest.mark.parametrize(
     ("free_bytes", "most_kept", "decoded"),
-    [(10**9, None, 4), (0, None, 12), (10**9, 3, 4 + 2 * 1)],  # the first colour, and one frame for each of the others
+    [(10**9, 256, 4), (0, 256, 12), (10**9, 3, 4 + 2 * 1)],  # the first colour, and one frame for each of the others
     ids=["with room", "without room on the disk", "few open files"],
 )
 def test_compressed_frames_are_decoded_once_for_all_colours(
-    free_bytes: int, most_kept: int | None, decoded: int, make_set: SetMaker, tmp_path: Path,
+    free_bytes: int, most_kept: int, decoded: int, make_set: SetMaker, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     folder, out, decoded_paths = make_set(_pictures(4), camera={"mosaic": BAYER}), tmp_path / "out", []
@@ -206,8 +187,7 @@ def test_compressed_frames_are_decoded_once_for_all_colours(
         return decode_tiff(file, path, *arguments)
 
     monkeypatch.setattr(channels, "disk_usage", lambda _: SimpleNamespace(free=free_bytes))
-    if most_kept:
-        monkeypatch.setattr(channels, "_MOST_KEPT", most_kept)
+    monkeypatch.setattr(channels, "_MOST_KEPT", most_kept)
     monkeypatch.setattr(frames, "decode_tiff", decode)
     keeping = keeping_frames(elemental_set, out)
     for layout, electrons in zip(layouts, plain, strict=True):

@@ -19,9 +19,8 @@ from faintfield.pipelines.reconstruction.run import reconstruct_set
 from faintfield.pipelines.reconstruction.solutions import Settings
 from faintfield.pipelines.reconstruction.tasks import PlaneTask
 from tests.pipelines.conftest import Command
-
-pytestmark = pytest.mark.usefixtures("undrawn")
-
+from tests.pipelines.forms import plane_files
+from tests.pipelines.refusals import assert_refused
 
 distributed = pytest.importorskip("distributed")
 
@@ -50,10 +49,6 @@ def _kill_one_that_works(cluster: Any) -> None:
     os.kill(processes[address], signal.SIGKILL)
 
 
-def _planes(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.glob("plane_*")}
-
-
 @pytest.mark.usefixtures("one_thread")
 def test_worker_killed_in_sweep_costs_one_plane(cluster: Any, simulated_scene: Path, tmp_path: Path) -> None:
     elemental_set = load_set(simulated_scene)
@@ -79,17 +74,14 @@ def test_worker_killed_in_sweep_costs_one_plane(cluster: Any, simulated_scene: P
     assert changes.count(("processing", "memory")) <= len(DEPTHS_MM) + 1
     assert {*done} == {*DEPTHS_MM}
     assert len(done) == len(DEPTHS_MM)
-    assert _planes(tmp_path / "spread") == _planes(tmp_path / "local")
+    assert plane_files(tmp_path / "spread") == plane_files(tmp_path / "local")
     assert not list((tmp_path / "spread").glob(f".*{UNFINISHED}"))
 
 
 def test_task_that_fails_is_failure_of_command(cluster: Any, scene: Path, tmp_path: Path, faintfield: Command) -> None:
-    words = ("--depth-mm", 500, "--method", "pmlem-osl", "--penalty-weight", 50)
-    ended = faintfield(
-        "reconstruct", scene, "--out", tmp_path / "out", *words, "--scheduler", cluster.scheduler_address
-    )
-    assert ended.returncode == 1
-    assert "NotConverged: penalty weight 50 makes most denominators" in ended.stderr
+    words = ("--out", tmp_path / "out", "--depth-mm", 500, "--method", "pmlem-osl", "--penalty-weight", 50)
+    ended = faintfield("reconstruct", scene, *words, "--scheduler", cluster.scheduler_address)
+    assert_refused(ended, "NotConverged", "penalty weight 50 makes most denominators")
     assert not (tmp_path / "out").exists()
 
 
@@ -105,35 +97,24 @@ def test_workers_give_same_colour_planes_with_saturated_pixels(
     text = settings.read_text()
     settings.write_text(text.replace("saturation_dn = 65535", "saturation_dn = 8000"))
     assert settings.read_text() != text
-    words = (
-        "reconstruct",
-        tmp_path / "set",
-        *("--depth-mm", 500, "--depth-mm", 700, "--passes", 1, "--penalty-weight", 1),
-        *options,
-    )
+    quick = ("--depth-mm", 500, "--depth-mm", 700, "--passes", 1, "--penalty-weight", 1)
+    words = ("reconstruct", tmp_path / "set", *quick, *options)
     done(*words, "--out", tmp_path / "local")
     done(*words, "--out", tmp_path / "spread", "--workers", 1)
-    assert _planes(tmp_path / "spread") == _planes(tmp_path / "local")
+    assert plane_files(tmp_path / "spread") == plane_files(tmp_path / "local")
 
 
-def test_only_scheduler_needs_dask(
+def test_scheduler_needs_dask_and_an_answer(
     simulated_scene: Path, tmp_path: Path, faintfield: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    monkeypatch.setitem(sys.modules, "dask", None)
-    words = ("reconstruct", simulated_scene, "--out", tmp_path / "out", "--depth-mm", 500, "--method", "backprojection")
-    ended = faintfield(*words, "--scheduler", "tcp://127.0.0.1:1")
-    assert ended.returncode == 1
-    assert "MissingPackage: dask.distributed is not installed" in ended.stderr
-    assert "pip install 'faintfield[cluster]'" in ended.stderr
-    assert faintfield(*words, "--workers", 2).returncode == 0
-
-
-def test_missing_scheduler_is_named(simulated_scene: Path, tmp_path: Path, faintfield: Command) -> None:
     import dask
 
-    words = ("--depth-mm", 500, "--scheduler", "tcp://127.0.0.1:1")
+    words = ("reconstruct", simulated_scene, "--out", tmp_path / "out", "--depth-mm", 500, "--method", "backprojection")
     with dask.config.set({"distributed.comm.timeouts.connect": "0.2s"}):
-        ended = faintfield("reconstruct", simulated_scene, "--out", tmp_path / "out", *words)
-    assert ended.returncode == 1
-    assert "ClusterFailed: no scheduler answers at tcp://127.0.0.1:1" in ended.stderr
+        ended = faintfield(*words, "--scheduler", "tcp://127.0.0.1:1")
+    assert_refused(ended, "ClusterFailed", "no scheduler answers at tcp://127.0.0.1:1")
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    monkeypatch.setitem(sys.modules, "dask", None)
+    ended = faintfield(*words, "--scheduler", "tcp://127.0.0.1:1")
+    assert_refused(ended, "MissingPackage", "pip install 'faintfield[cluster]'")
+    assert faintfield(*words, "--workers", 2).returncode == 0

@@ -1,85 +1,87 @@
-"""Depth maps, all-in-focus pictures and planes of best focus, of simulated scenes whose truth is known."""
+"""Depth maps, their errors, all-in-focus pictures and planes of best focus, of scenes whose truth is known."""
 
+import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from faintfield.pipelines.cli import run
+from faintfield.pipelines.errors import InputError
+from faintfield.pipelines.formats.files import write_json
 from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.image_files import ONE_PIXEL, write_plane
 from faintfield.pipelines.formats.sets.elemental_set import load_set
-from faintfield.pipelines.formats.sets.ground_truth import read_truth, texture_and_region
+from faintfield.pipelines.formats.sets.ground_truth import (
+    TRUE_DEPTH_FILE,
+    TrueDepth,
+    read_true_depth_mm,
+    read_truth,
+    texture_and_region,
+)
 from faintfield.pipelines.reconstruction.autofocus import searched_range_mm
 from faintfield.pipelines.reconstruction.comparison import binned_views
+from faintfield.pipelines.reconstruction.depth_accuracy import write_depth_errors
 from faintfield.recon.depth.focus import SURE
 from faintfield.recon.surface import confidence
-from tests.pipelines.conftest import Command, Edit, drawing_nothing
+from tests.pipelines.conftest import Command, Edit, SetMaker, run_undrawn
 from tests.pipelines.forms import read_record
-from tests.pipelines.surfaces import FOUND_CONFIDENCE, Searches
-
-pytestmark = pytest.mark.usefixtures("undrawn")
+from tests.pipelines.refusals import assert_refused
+from tests.pipelines.surfaces import FOUND_CONFIDENCE, FOUND_MM, Searches
 
 SWEEP = ("--sweep-mm", "400:900:11", "--method", "backprojection", "--depth-map")
-SMALL = ("--size-px", 160, 120, "--rows", 5, "--columns", 5)
 MAPS = ("depth_mm.tiff", "depth_confidence.tiff", "all_in_focus.tiff")
 
 
-def _run(*words: object) -> None:
-    with drawing_nothing():
-        assert run([str(word) for word in words]) == 0
-
-
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def large_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("depth") / "scene"
-    _run("simulate", folder, "--snr", 2, *SMALL)
+    run_undrawn("simulate", folder, "--snr", 2, "--size-px", 160, 120, "--rows", 5, "--columns", 5)
     return folder
 
 
 @pytest.fixture(scope="module")
-def swept(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def swept(large_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("swept")
-    _run("reconstruct", scene, "--out", out, *SWEEP)
+    run_undrawn("reconstruct", large_scene, "--out", out, *SWEEP)
     return out
 
 
-def test_sure_depths_are_right_within_two_percent(swept: Path, scene: Path) -> None:
-    depth_mm, confidence, _ = (read_frame(swept / name).pixels_dn for name in MAPS)
+def test_sure_depths_and_all_in_focus_are_right(swept: Path, large_scene: Path) -> None:
+    depth_mm, confidence, picture = (read_frame(swept / name).pixels_dn for name in MAPS)
     assert np.array_equal(np.isfinite(depth_mm), confidence >= 0.9)
-    truth = read_truth(scene)
+    truth = read_truth(large_scene)
     assert truth is not None
     anywhere = np.zeros(depth_mm.shape, bool)
     for plane in truth.planes:
-        _, region = texture_and_region(scene, plane)
+        _, region = texture_and_region(large_scene, plane)
         sure = np.isfinite(depth_mm) & region
         assert sure.sum() > 0.5 * region.sum()
         assert np.median(np.abs(depth_mm[sure] / plane.depth_mm - 1)) <= 0.02
         anywhere |= region
     away = cv2.dilate(anywhere.astype(np.uint8), np.ones((17, 17))) == 0
     assert np.isfinite(depth_mm[away]).mean() < 0.02
-
-
-def test_all_in_focus_shows_each_objects_own_plane(swept: Path, scene: Path) -> None:
-    picture = read_frame(swept / "all_in_focus.tiff").pixels_dn
-    depth_mm = read_frame(swept / "depth_mm.tiff").pixels_dn
     for at_mm in (500, 700):
-        plane = read_frame(swept / f"plane_{at_mm:07.1f}.tiff").pixels_dn
+        pixels = read_frame(swept / f"plane_{at_mm:07.1f}.tiff").pixels_dn
         there = np.abs(depth_mm - at_mm) < 3
         assert there.sum() > 300
-        unlike = np.sqrt(np.mean((picture - plane)[there] ** 2))
-        assert unlike < 0.25 * np.std(plane[there])
+        assert np.sqrt(np.mean((picture - pixels)[there] ** 2)) < 0.25 * np.std(pixels[there])
 
 
-def test_focus_marks_depths_of_objects(swept: Path) -> None:
+def test_focus_and_map_are_recorded(swept: Path) -> None:
     focus = read_record(swept)["focus"]
     np.testing.assert_allclose(focus["depth_mm"], np.linspace(400, 900, 11))
     assert len(focus["detail_e2"]) == len(focus["sigma_e2"]) == 11
     assert min(focus["sigma_e2"]) > 0
     np.testing.assert_allclose(focus["sharp_mm"], [500, 700], atol=25)  # half a step
+    depth_map = read_record(swept)["depth_map"]
+    assert (depth_map["unit"], depth_map["file"]) == ("mm", "depth_mm.tiff")
+    assert 0.02 < depth_map["sure_share"] < 0.5
+    assert 480 < depth_map["median"] < 720
+    assert 'id="depth-map"' in (swept / "report.html").read_text()
 
 
 def test_surfaces_have_no_stairs_and_end_with_sweep(tmp_path: Path, done: Command) -> None:
@@ -93,16 +95,6 @@ def test_surfaces_have_no_stairs_and_end_with_sweep(tmp_path: Path, done: Comman
     assert sure[true_mm > 770].mean() < 0.02
     # Neighbouring planes of the sweep are farther apart than 4 %: depths at the nearest plane would mostly be wrong
     assert (np.abs(depth_mm[sure] / true_mm[sure] - 1) < 0.02).mean() > 0.9
-
-
-def test_maps_are_recorded_and_on_page(swept: Path) -> None:
-    found = read_record(swept)["depth_map"]
-    assert (found["unit"], found["file"]) == ("mm", "depth_mm.tiff")
-    assert 0.02 < found["sure_share"] < 0.5
-    assert 480 < found["median"] < 720
-    page = (swept / "report.html").read_text()
-    assert 'id="depth-map"' in page
-    assert "Hatched where it is not known" in page
 
 
 def test_only_damaged_maps_are_made_again(seen: Searches, simulated_scene: Path, tmp_path: Path, done: Command) -> None:
@@ -130,8 +122,8 @@ def test_disparities_and_colours_are_kept(
     assert read_record(out)["depth_map"]["unit"] == "px"
 
 
-def test_range_that_is_searched_is_where_views_overlap(scene: Path) -> None:
-    elemental_set = load_set(scene)
+def test_range_that_is_searched_is_where_views_overlap(large_scene: Path) -> None:
+    elemental_set = load_set(large_scene)
     near_mm, far_mm = searched_range_mm(elemental_set)
     camera = elemental_set.settings.camera
     width, height = camera.size_px
@@ -141,54 +133,38 @@ def test_range_that_is_searched_is_where_views_overlap(scene: Path) -> None:
     assert far_mm > 1000 * near_mm  # infinity is in view
 
 
-def _copied(folder: Path) -> None:
+def _copy(paths: list[Path]) -> None:
     """Give each view the picture of the first."""
-    first, *others = sorted(folder.glob("view_*.tiff"))
-    for path in others:
-        shutil.copyfile(first, path)
+    for path in paths[1:]:
+        shutil.copyfile(paths[0], path)
 
 
-def _shuffled(folder: Path) -> None:
+def _shuffle(paths: list[Path]) -> None:
     """Give each view the picture of another."""
-    paths = sorted(folder.glob("view_*.tiff"))
     pictures = [path.read_bytes() for path in paths]
     for path, index in zip(paths, np.random.default_rng(3).permutation(len(paths)), strict=True):
         path.write_bytes(pictures[index])
 
 
-def _four(settings: dict[str, Any]) -> None:
-    settings.update(view=[settings["view"][index] for index in (0, 1, 3, 4)], reference_view=3)
-
-
-IN_RANGE = ("--surface", "--depth-range-mm", "400:900")
-MAP = ("--sweep-mm", "400:900:5", "--depth-map")
-
-
 @pytest.mark.parametrize(
-    ("words", "change", "few"),
+    ("words", "change", "views"),
     [
-        (IN_RANGE, _copied, True),
-        (IN_RANGE, _shuffled, False),
-        (MAP, _copied, False),
+        (("--surface", "--depth-range-mm", "400:900"), _copy, (0, 1, 3, 4)),
+        (("--surface", "--depth-range-mm", "400:900"), _shuffle, range(9)),
+        (("--sweep-mm", "400:900:5", "--depth-map"), _copy, range(9)),
     ],
 )
 def test_views_that_show_no_depth_have_no_map(
-    words: tuple[str, ...],
-    change: Callable[[Path], None],
-    few: bool,
-    simulated_scene: Path,
-    edit: Edit,
-    tmp_path: Path,
-    faintfield: Command,
-) -> None:
-    folder = Path(shutil.copytree(simulated_scene, tmp_path / "set"))
-    change(folder)
-    if few:
-        edit(folder, _four)
-    ended = faintfield("reconstruct", folder, "--out", tmp_path / "out", *words)
-    assert ended.returncode == 1
-    assert "faintfield: NothingInFocus: " in ended.stderr
-    assert f"{folder}: the views agree no better than shuffled ones (p = " in ended.stderr
+    words: tuple[str, ...], change: Callable[[list[Path]], None], views: Sequence[int],
+    scene: Path, edit: Edit, tmp_path: Path, faintfield: Command,
+) -> None:  # fmt: skip
+    change(sorted(scene.glob("view_*.tiff")))
+    edit(
+        scene,
+        lambda settings: settings.update(view=[settings["view"][k] for k in views], reference_view=views.index(4)),
+    )
+    ended = faintfield("reconstruct", scene, "--out", tmp_path / "out", *words)
+    assert_refused(ended, "NothingInFocus", f"{scene}: the views agree no better than shuffled ones (p = ")
     assert not list((tmp_path / "out").glob("*.tiff"))
 
 
@@ -227,3 +203,85 @@ def test_planes_of_one_pitch_make_one_picture(
     assert own.shape == farthest.shape != usual.shape
     same = cv2.resize(own, usual.shape[::-1], interpolation=cv2.INTER_AREA)
     assert np.corrcoef(same.ravel(), usual.ravel())[0, 1] > 0.9
+
+
+SHAPE = (12, 16)
+
+
+def bring_truth(folder: Path, depth_mm: NDArray[np.floating]) -> None:
+    write_plane(folder / "true_depth_mm.tiff", depth_mm, ONE_PIXEL)
+    write_json(folder / TRUE_DEPTH_FILE, TrueDepth(1, "true_depth_mm.tiff", "truth.pfm", "0" * 64))
+
+
+@pytest.fixture
+def a_set(make_set: SetMaker, grey_images: list[NDArray[np.uint16]]) -> Path:
+    folder = make_set(grey_images)
+    true_mm = 1000.0 + 10.0 * np.indices(SHAPE)[0]
+    true_mm[0] = np.nan  # nobody knows the first row
+    bring_truth(folder, true_mm)
+    return folder
+
+
+def test_errors_are_those_of_what_is_known(a_set: Path, tmp_path: Path) -> None:
+    found = 1000.0 + 10.0 * np.indices(SHAPE)[0]
+    found[:, :2] *= 1.5  # an eighth of the known ones, once the columns from 8 on are not known
+    found[:, 2:] *= 0.99
+    found[:, 8:] = np.nan
+    write_plane(tmp_path / "depth_mm.tiff", found, ONE_PIXEL)
+    errors = write_depth_errors(load_set(a_set), tmp_path, "depth_mm.tiff", "mm")
+    assert errors is not None
+    assert errors.samples == 11 * 8
+    assert errors.share == 0.5
+    assert errors.median_relative_error == pytest.approx(0.01, rel=1e-4)
+    # Rows 1 to 11 have 6 samples each at 1 % and 2 at 50 %: the median of 88 lies 44th to 45th of the 66 at 1 %
+    median_mm = np.median(np.repeat(10.0 + 0.1 * np.arange(1, 12), 6)[43:45])
+    assert errors.median_error_mm == pytest.approx(median_mm, rel=1e-3)
+    assert errors.within_2_percent == 0.75
+    # Nodes are 10 mm apart and the focal length is 50 px: a point at z mm moves by -500/z px from node to node
+    write_plane(tmp_path / "disparity_px.tiff", -500.0 / (1.02 * (1000.0 + 10.0 * np.indices(SHAPE)[0])), ONE_PIXEL)
+    errors = write_depth_errors(load_set(a_set), tmp_path, "disparity_px.tiff", "px")
+    assert errors is not None
+    assert errors.median_relative_error == pytest.approx(0.02, rel=1e-4)
+
+
+def test_what_cannot_be_compared_leaves_no_file(a_set: Path, tmp_path: Path) -> None:
+    for shape in (SHAPE, (6, 8)):
+        (tmp_path / "depth_errors.json").write_text("of an earlier map")
+        write_plane(tmp_path / "depth_mm.tiff", np.full(shape, np.nan), ONE_PIXEL)
+        assert write_depth_errors(load_set(a_set), tmp_path, "depth_mm.tiff", "mm") is None
+        assert not (tmp_path / "depth_errors.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b'{"format":1,"depth_mm":"../x.tiff","source":"","sha256":""}', "leaves the folder"),
+        (b'{"format":1,"depth_mm":"a.tiff","source":"","sha256":"","more":1}', "import the set again"),
+    ],
+)
+def test_damaged_truth_is_refused(content: bytes, words: str, tmp_path: Path) -> None:
+    (tmp_path / TRUE_DEPTH_FILE).write_bytes(content)
+    with pytest.raises(InputError, match=words):
+        read_true_depth_mm(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--sweep-mm", "400:900:5", "--method", "backprojection", "--depth-map"),
+        ("--surface", "--depth-range-mm", "400:900", "--penalty-weight", 0.5, "--passes", 2),
+    ],
+    ids=["depth map", "surface"],
+)
+def test_reconstruction_with_depth_writes_its_errors(
+    options: tuple[object, ...], scene: Path, tmp_path: Path, done: Command, seen: Searches,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    out = tmp_path / "out"
+    bring_truth(scene, np.full((72, 96), FOUND_MM * 1.25))
+    monkeypatch.setattr(confidence, "SURE", 0.9 * FOUND_CONFIDENCE)
+    message = done("reconstruct", scene, "--out", out, *options).stderr
+    assert seen
+    written = json.loads((out / "depth_errors.json").read_text())
+    assert written["median_relative_error"] == pytest.approx(0.2, rel=1e-4)
+    assert "median error 150 mm (20.00%)" in message

@@ -1,6 +1,5 @@
 """Planes found together: nearer the truth than each alone, and as files no different from other planes."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -8,32 +7,22 @@ import pytest
 import tifffile
 
 from tests.pipelines.conftest import Command
-
-pytestmark = pytest.mark.usefixtures("undrawn")
-
+from tests.pipelines.forms import plane_files, read_record
+from tests.pipelines.refusals import assert_refused
 
 BOTH = ("--depth-mm", 500, "--depth-mm", 700, "--prior", "tv")
-
-
-def _errors(folder: Path) -> dict[str, float]:
-    """Return the mean over both planes of their error over the whole plane, by method."""
-    rows = json.loads((folder / "metrics.json").read_text())["planes"]
-    methods = dict.fromkeys(row["method"] for row in rows)
-    return {name: float(np.mean([row["mse_plane"] for row in rows if row["method"] == name])) for name in methods}
-
-
-def _files(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.glob("plane_*")}
 
 
 def test_joint_and_occlusion_lower_the_error(tmp_path: Path, done: Command) -> None:
     done("simulate", tmp_path / "set", "--size-px", 96, 72, "--rows", 5, "--columns", 5, "--snr", 2)
     out = tmp_path / "out"
     done("reconstruct", tmp_path / "set", *BOTH, "--method", "pmlem", "--joint", "--occlusion", "--out", out)
-    errors = _errors(out)
+    errors = dict.fromkeys(("pmlem", "joint", "occlusion"), 0.0)
+    for row in read_record(out, "metrics.json")["planes"]:
+        errors[row["method"]] += row["mse_plane"]
     assert errors["joint"] < 0.5 * errors["pmlem"]
     assert errors["occlusion"] < 0.8 * errors["joint"]
-    together = json.loads((out / "occlusion" / "reconstruction.json").read_text())["planes"]
+    together = read_record(out / "occlusion")["planes"]
     assert [plane["occlusion"] for plane in together] == [True, True]
     opacity = tifffile.imread(out / "occlusion" / together[0]["opacity_file"])
     texture = tifffile.imread(tmp_path / "set" / "truth" / "plane_00500.0.tiff")
@@ -45,21 +34,20 @@ def test_altered_sigma_makes_its_plane_again(scene: Path, tmp_path: Path, done: 
     out = tmp_path / "out"
     words = ("reconstruct", scene, *BOTH, "--joint", "--passes", 2, "--penalty-weight", 1, "--out", out)
     done(*words, "--uncertainty")
-    first, sigma = _files(out), out / "plane_00700.0_sigma.tiff"
+    first, sigma = plane_files(out), out / "plane_00700.0_sigma.tiff"
     assert "2 of 2 planes are there" in done(*words, "--uncertainty").stderr
     sigma.write_bytes(sigma.read_bytes()[:-4] + b"\0\0\x80\x3f")
     assert "1 of 2 planes are there" in done(*words, "--uncertainty").stderr
-    assert _files(out) == first
+    assert plane_files(out) == first
     assert "Uncertainty: the standard deviation" in (out / "report.html").read_text()
     done(*words)
-    assert set(_files(out)) == {name for name in first if "sigma" not in name}
+    assert set(plane_files(out)) == {name for name in first if "sigma" not in name}
 
 
 def test_occlusion_keeps_penalty_and_lowers_objective(scene: Path, tmp_path: Path, done: Command) -> None:
     options = ("--penalty", "huber-tv", "--likelihood", "least-squares", "--penalty-weight", 1)
     done("reconstruct", scene, *BOTH, *options, "--joint", "--occlusion", "--out", tmp_path)
-    records = [tmp_path / name / "reconstruction.json" for name in ("joint", "occlusion")]
-    joint, occlusion = (json.loads(path.read_text())["planes"][0] for path in records)
+    joint, occlusion = (read_record(tmp_path / name)["planes"][0] for name in ("joint", "occlusion"))
     assert joint["penalty"] == occlusion["penalty"]  # its δ follows the noise, which another start would shift
     assert occlusion["objective"] <= joint["objective"]
     assert occlusion["occlusion"] != ("occlusion_left_out" in occlusion)
@@ -70,5 +58,4 @@ def test_what_memory_has_no_room_for_is_refused(
 ) -> None:
     monkeypatch.setattr("faintfield.pipelines.reconstruction.joint.available_bytes", lambda: 100_000)
     ended = faintfield("reconstruct", scene, *BOTH, "--occlusion", "--out", tmp_path / "out")
-    assert ended.returncode == 1
-    assert "MemoryShort: planes found together need" in ended.stderr
+    assert_refused(ended, "MemoryShort", "planes found together need")

@@ -21,7 +21,7 @@ from faintfield.recon.solver.initialization import back_projection
 
 _FILE = resources.files("faintfield.pipelines.reconstruction") / "networks" / "plane_prior.onnx"
 
-# By training/reference.py, sums in numpy for the input of `waves`.
+# By training/reference.py, sums in numpy for waves.
 _VALUES = {(0, 0): -0.050578, (3, 5): 0.375013, (11, 15): 0.026569, (23, 8): 0.191935}
 _ROOT_MEAN_SQUARE = 0.236324
 
@@ -44,27 +44,17 @@ def known_of(light_e: Image, seed: int, views: int = 25, read_noise_e: float = 3
     random = np.random.default_rng(seed)
     homographies = np.stack([np.eye(3)] * views)
     homographies[:, :2, 2] = random.uniform(-1.5, 0.5, (views, 2))
-    axes = np.meshgrid(*(np.arange(length + 1.0) for length in light_e.shape[::-1]))
-    operator = PlaneOperator(
-        homographies,
-        np.stack(axes, axis=-1),
-        PlaneGrid((light_e.shape[0], light_e.shape[1]), 1.0, (0.0, 0.0)),
-        workers=1,
-    )
+    rows, columns = light_e.shape
+    borders = np.stack(np.meshgrid(np.arange(columns + 1.0), np.arange(rows + 1.0)), axis=-1)
+    operator = PlaneOperator(homographies, borders, PlaneGrid((rows, columns), 1.0, (0.0, 0.0)), workers=1)
     light = operator.forward(light_e.astype(np.float32))
     electrons = random.poisson(light) + random.normal(0, read_noise_e, light.shape)
     images = ElementalImages(electrons.astype(np.float32), 0.0, read_noise_e**2)
-    weight = 0.9 * np.sqrt(views) / read_noise_e
-    plane = solve(operator, images, "pmlem", Settings(penalty_weight=float(weight))).plane
+    plane = solve(operator, images, "pmlem", Settings(penalty_weight=0.9 * views**0.5 / read_noise_e)).plane
     noise = noise_of_back_projection(operator, images, plane)
     pilot, picture = operator.adjoint_of_forward(plane) / operator.coverage(), back_projection(operator, images)
     patches = collaborative_wiener(picture, pilot, noise, Patches(8, 4, 16, 64), workers=1)
     return Known(picture, pilot, patches, noise, back_projection(operator, ElementalImages(light)))
-
-
-def waves(rows: int = 24, columns: int = 16) -> NDArray[np.float32]:
-    phase = np.arange(rows)[:, np.newaxis] * 0.7 + np.arange(columns) * 0.4
-    return np.stack([np.sin(phase * (k + 1)) + 0.1 * k for k in range(4)]).astype(np.float32)
 
 
 def made_up(shape: tuple[int, int], seed: int = 2) -> tuple[Image, Image, Image, Image]:
@@ -76,19 +66,17 @@ def made_up(shape: tuple[int, int], seed: int = 2) -> tuple[Image, Image, Image,
     return y, patches + 0.1 * random.normal(size=shape), patches, variance
 
 
-def test_network_output_equals_sums_in_numpy() -> None:
+def test_network_equals_sums_and_estimate_its_mean() -> None:
     network = cv2.dnn.readNetFromONNX(np.frombuffer(_FILE.read_bytes(), np.uint8))
-    network.setInput(waves()[np.newaxis])
+    phase = np.arange(24)[:, np.newaxis] * 0.7 + np.arange(16) * 0.4
+    network.setInput(np.stack([np.sin(phase * (k + 1)) + 0.1 * k for k in range(4)]).astype(np.float32)[np.newaxis])
     output = network.forward()[0, 0]
     assert np.sqrt(np.mean(np.square(output))) == pytest.approx(_ROOT_MEAN_SQUARE, abs=1e-4)
     for at, value in _VALUES.items():
         assert output[at] == pytest.approx(value, abs=1e-4)
-
-
-def test_estimate_is_the_mean_over_four_turns() -> None:
+    # The estimate is the mean over four turns
     y, u, p, v = made_up((16, 24))
     inputs, deviation = network_input(y, u, p, v)
-    network = cv2.dnn.readNetFromONNX(np.frombuffer(_FILE.read_bytes(), np.uint8))
     change = np.zeros(p.shape)
     for turn in range(4):
         network.setInput(np.ascontiguousarray(np.rot90(inputs, turn, (1, 2)))[np.newaxis])
@@ -167,25 +155,18 @@ def known_noise(shape: tuple[int, int] = (64, 64)) -> Noise:
     return Noise(np.full(shape, 0.25, np.float32), np.outer([0.25, 1, 0.25], [0.25, 1, 0.25]))
 
 
-def test_what_it_was_trained_for_is_accepted() -> None:
-    assert outside_range(np.ones((64, 64)), known_noise()) is None
-
-
 @pytest.mark.parametrize(
     ("light_e", "noise", "message"),
     [
+        (1.0, known_noise(), ""),
         (500.0, known_noise(), "times its noise"),
         (1.0, known_noise((16, 64)), "samples"),
         (1.0, known_noise()._replace(kernel=np.full((3, 3), 0.6)), "neighbours"),
         (1.0, known_noise()._replace(variance=np.full((64, 64), np.inf, np.float32)), "seen"),
-        (
-            1.0,
-            known_noise()._replace(variance=np.geomspace(1e-3, 1e3, 4096, dtype=np.float32).reshape(64, 64)),
-            "its median",
-        ),
+        (1.0, known_noise()._replace(variance=np.tile(np.geomspace(1e-3, 1e3, 64, dtype="f4"), (64, 1))), "its median"),
     ],
 )
 def test_what_it_was_not_trained_for_is_named(light_e: float, noise: Noise, message: str) -> None:
-    reason = outside_range(np.full(noise.variance.shape, light_e), noise)
-    assert reason is not None
+    reason = outside_range(np.full(noise.variance.shape, light_e), noise) or ""
     assert message in reason
+    assert bool(reason) == bool(message)

@@ -27,15 +27,6 @@ def _frames(*shape: int) -> list[NDArray[np.uint16]]:
     return list(np.random.default_rng(1).integers(100, 900, (2, *shape)).astype(np.uint16))
 
 
-def _summed(frame: NDArray[np.uint16], bins: int) -> NDArray[np.float64]:
-    """Electrons of light in whole bins, pixel by pixel."""
-    rows, columns = frame.shape[0] // bins, frame.shape[1] // bins
-    sums = np.zeros((rows, columns))
-    for row, column in np.ndindex(rows * bins, columns * bins):
-        sums[row // bins, column // bins] += float(np.sum((frame[row, column] - 100.0) / 2.0 - BACKGROUND_E))
-    return sums
-
-
 @pytest.mark.parametrize(
     ("mosaic", "bins", "colours"),
     [(None, 3, ()), (BAYER, 4, ()), (["RGB"], 3, ()), (["RGGB", "GBRG"], 4, ()), (None, 2, (3,))],
@@ -46,8 +37,11 @@ def test_bins_add_pixels_of_all_colours(
     frames = _frames(14, 18, *colours)
     views = _light(make_set(frames, noise=NOISE, camera={"mosaic": mosaic} if mosaic else None), bins)
     assert views.light_e.dtype == np.float32
+    rows, columns = 14 // bins, 18 // bins
     for light, frame in zip(views.light_e, frames, strict=True):
-        np.testing.assert_allclose(light, _summed(frame, bins), rtol=1e-5, atol=1e-3)
+        electrons = (frame[: rows * bins, : columns * bins] - 100.0) / 2.0 - BACKGROUND_E
+        expected = electrons.reshape(rows, bins, columns, bins, -1).sum(axis=(1, 3, 4))
+        np.testing.assert_allclose(light, expected, rtol=1e-5, atol=1e-3)
     samples = bins**2 * (3 if colours else 1)
     assert views.variance_e2 == pytest.approx(samples * (BACKGROUND_E + READ_VARIANCE_E2), rel=1e-6)
 
@@ -98,19 +92,17 @@ def test_point_lands_where_pinhole_camera_sees_it(ray: tuple[float, float], bins
     np.testing.assert_allclose(views.pixel_from_surface[0] @ [*ray, 1, 0], [*expected, 1], rtol=1e-5)
 
 
-def test_beyond_distorted_picture_there_is_no_number(make_set: SetMaker) -> None:
+def test_beyond_picture_and_beside_unknown_is_unknown(make_set: SetMaker) -> None:
     folder = make_set([np.full((48, 64), 900, np.uint16)], camera=LENS | {"distortion": [0.3]})
     light = _light(folder, 1).light_e[0]
     assert light[24, 32] == pytest.approx(400)
     assert (light[[0, 0, -1, -1], [0, -1, 0, -1]] == UNKNOWN).all()
     assert set(np.unique(light)) == {UNKNOWN, np.float32(400)}
-
-
-def test_interpolation_beside_unknown_bins_is_unknown(make_set: SetMaker) -> None:
     frame = np.full((48, 64), 900, np.uint16)
     frame[24, 50] = 4000
     noise = {"offset_dn": 100.0, "gain_dn_per_e": 2.0, "read_noise_e": 3.0, "saturation_dn": 4000.0}
-    light = _light(make_set([frame], noise=noise, camera=LENS | {"distortion": [-0.1]}), 1).light_e[0]
+    folder = make_set([frame], name="saturated", noise=noise, camera=LENS | {"distortion": [-0.1]})
+    light = _light(folder, 1).light_e[0]
     unknown = np.argwhere(light == UNKNOWN)
     assert 1 <= len(unknown) <= 9
     assert np.abs(unknown - [24, 50]).max() <= 2
@@ -124,21 +116,15 @@ def test_views_follow_pose_and_principal_point(make_set: SetMaker, edit: Edit) -
     # 100 mm in front of the reference camera, 10 mm from the second one's axis: f = 50 px
     point = np.array([20.0, -12.0, 100.0])
     for matrix, centre, x_mm in zip(views.pixel_from_surface, [(6.0, 7.0), (9.5, 2.25)], (20.0, 10.0), strict=True):
-        seen = matrix @ [*point / 100, 1 / 100]
+        place = matrix @ [*point / 100, 1 / 100]
         pixel = np.array([50 * x_mm / 100 + centre[0], 50 * -12 / 100 + centre[1]])
-        np.testing.assert_allclose(seen[:2] / seen[2], (pixel + 0.5) / 2 - 0.5, rtol=1e-5)
+        np.testing.assert_allclose(place[:2] / place[2], (pixel + 0.5) / 2 - 0.5, rtol=1e-5)
     assert views.grid.shape == (6, 8)
 
 
 @pytest.mark.parametrize(
     ("size", "mosaic", "bins"),
-    [
-        ((64, 48), None, 1),
-        ((64, 48), BAYER, 2),
-        ((64, 48), ["RGGB", "GBRG"], 4),
-        ((1040, 780), None, 4),
-        ((800, 600), BAYER, 4),
-    ],
+    [((64, 48), None, 1), ((64, 48), BAYER, 2), ((64, 48), ["RGGB", "GBRG"], 4), ((1040, 780), None, 4)],
 )
 def test_bins_hold_whole_periods(
     size: tuple[int, int], mosaic: list[str] | None, bins: int, make_set: SetMaker

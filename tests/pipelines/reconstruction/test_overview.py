@@ -14,13 +14,8 @@ from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.overview import OBJECT_REGION, brightness, object_region, segmented
 from tests.pipelines.conftest import SetMaker
 
-NOISE: dict[str, Any] = {
-    "offset_dn": 100.0,
-    "gain_dn_per_e": 2.0,
-    "read_noise_e": 3.0,
-    "dark_current_e_per_s": 0.4,
-    "quantum_efficiency": 0.5,
-}
+_SENSOR = {"offset_dn": 100.0, "gain_dn_per_e": 2.0, "read_noise_e": 3.0}
+NOISE: dict[str, Any] = _SENSOR | {"dark_current_e_per_s": 0.4, "quantum_efficiency": 0.5}
 DARK_E = 0.2  # in 0.5 s
 
 # 4, 6, −1 and 3 electrons
@@ -29,16 +24,12 @@ VIEW = np.array([[108, 112], [98, 106]], np.uint16)
 SIZE = (48, 64)
 
 
-@pytest.fixture
-def folder(make_set: SetMaker) -> Path:
-    return make_set([VIEW], noise=NOISE)
-
-
 def _write_region(folder: Path, region: NDArray[np.bool_]) -> None:
     write_png(folder / OBJECT_REGION, mask_picture(region))
 
 
-def test_brightness_of_whole_view_by_noise_model(folder: Path) -> None:
+def test_brightness_by_noise_model_and_noise_reference(make_set: SetMaker) -> None:
+    folder = make_set([VIEW], noise=NOISE)
     found = brightness(load_set(folder))
     assert (found.region, found.noise_from) == ("whole view", "noise model")
     noise_power = 9 + 1 / 48 + DARK_E + DARK_E**2
@@ -51,9 +42,6 @@ def test_brightness_of_whole_view_by_noise_model(folder: Path) -> None:
     mean_e = 0.5 * found.photons_from_moments
     excess = (mean_e + DARK_E) ** 2 + mean_e - DARK_E**2
     assert excess / (9 + DARK_E + DARK_E**2) == pytest.approx(found.snr, rel=1e-9)
-
-
-def test_brightness_of_object_against_noise_reference(folder: Path) -> None:
     _write_region(folder, np.array([[True, True], [False, False]]))
     tifffile.imwrite(folder / "noise_reference.tiff", np.array([[104, 96], [104, 98]], np.uint16))
     found = brightness(load_set(folder))
@@ -62,15 +50,13 @@ def test_brightness_of_object_against_noise_reference(folder: Path) -> None:
     assert found.mean_signal_e == pytest.approx(5.0 - DARK_E, rel=1e-6)
 
 
-def test_negative_snr_counts_no_photons(make_set: SetMaker) -> None:
+def test_no_snr_or_negative_counts_no_photons(make_set: SetMaker) -> None:
     found = brightness(load_set(make_set([np.full((2, 2), 101, np.uint16)], noise=NOISE)))
     assert found.snr is not None
     assert found.snr < 0
     assert found.photons_linear is found.photons_from_moments is None
-
-
-def test_no_read_noise_gives_no_snr(make_set: SetMaker) -> None:
-    found = brightness(load_set(make_set([VIEW], noise=NOISE | {"read_noise_e": 0.0})))
+    noiseless = make_set([VIEW], name="noiseless", noise=NOISE | {"read_noise_e": 0.0})
+    found = brightness(load_set(noiseless))
     assert found.snr is found.photons_linear is found.photons_from_moments is None
     assert found.mean_signal_e == pytest.approx(3.0 - DARK_E, rel=1e-6)
 
@@ -105,9 +91,6 @@ def test_dark_parts_of_object_belong_to_it() -> None:
     assert region is not None
     assert not region[2, 3]
     assert np.mean(region == _object()) > 0.995
-
-
-def test_view_of_one_brightness_has_no_region() -> None:
     assert segmented(np.full(SIZE, 7.0, np.float32), np.ones(SIZE, bool)) is None
 
 

@@ -20,12 +20,6 @@ def _two_planes() -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
     return picture, inverse_depth
 
 
-def test_viewpoint_that_is_that_of_picture_shows_picture() -> None:
-    picture, inverse_depth = _two_planes()
-    (still,) = render_parallax(picture, inverse_depth, PITCH, np.zeros((1, 2)))
-    np.testing.assert_array_equal(still, picture)
-
-
 @pytest.mark.parametrize("moved_px", [(-12, 0), (8, -8)])
 def test_box_moves_whole_before_wall(moved_px: tuple[int, int]) -> None:
     picture, inverse_depth = _two_planes()
@@ -82,8 +76,10 @@ def test_slanted_plane_has_no_cracks() -> None:
     assert np.abs(error[:, 3:-3]).max() < 4
 
 
-def test_colours_stay_what_they_are() -> None:
+def test_colours_and_view_from_place_of_picture() -> None:
     picture, inverse_depth = _two_planes()
+    (still,) = render_parallax(picture, inverse_depth, PITCH, np.zeros((1, 2)))
+    np.testing.assert_array_equal(still, picture)
     colours = np.dstack([picture, picture // 2, picture // 4])
     (frame,) = render_parallax(colours, inverse_depth, PITCH, np.array([[20.0, 0.0]]))
     (grey,) = render_parallax(picture, inverse_depth, PITCH, np.array([[20.0, 0.0]]))
@@ -91,15 +87,12 @@ def test_colours_stay_what_they_are() -> None:
     assert frame.shape == (*grey.shape, 3)
 
 
-def test_large_pictures_are_reduced() -> None:
+def test_large_picture_is_reduced_and_strip_stays() -> None:
     picture = np.random.default_rng(1).integers(0, 255, (600, 800)).astype(np.uint8)
     ramp = np.linspace(FAR, NEAR, 600 * 800).reshape(600, 800)
     frames = render_parallax(picture, ramp, 1 / 1000, np.array([[5.0, 0.0], [0.0, 5.0]]))
     assert {frame.shape[1] for frame in frames} == {480}
     assert len({frame.shape for frame in frames}) == 1
-
-
-def test_strip_keeps_its_middle() -> None:
     picture = np.zeros((24, 700), np.uint8)
     ramp = np.tile(np.linspace(FAR, NEAR, 700), (24, 1))
     frames = render_parallax(picture, ramp, 1 / 1000, viewpoints(ramp, 1 / 1000, (0.0, 300.0)))

@@ -1,6 +1,7 @@
-"""`reconstruct --prior`: the files and records it promises, what it refuses, and errors below those without it."""
+"""`reconstruct --prior`: its files and records, errors below those without it, and the light of other colours."""
 
 import json
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -8,13 +9,23 @@ import numpy as np
 import pytest
 import tifffile
 
-from faintfield.pipelines.cli import run
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
 from faintfield.pipelines.reconstruction import prior as prior_module
-from tests.pipelines.conftest import Command, drawing_nothing
-from tests.pipelines.forms import read_record
-
-pytestmark = pytest.mark.usefixtures("undrawn")
-
+from faintfield.pipelines.reconstruction import sweep, tasks
+from faintfield.pipelines.reconstruction.channels import ChannelLayout, channel_layouts, load_channel
+from faintfield.pipelines.reconstruction.joint import solve_together
+from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
+from faintfield.pipelines.reconstruction.penalised import Objective, solve_pmlem
+from faintfield.pipelines.reconstruction.planes import solve
+from faintfield.pipelines.reconstruction.prior import with_prior
+from faintfield.pipelines.reconstruction.solutions import Settings
+from faintfield.recon.errors import GeometryMismatch
+from faintfield.recon.likelihood.images import ElementalImages, Image
+from faintfield.recon.prior.evidence import Evidence
+from faintfield.recon.prior.patches import patch_candidates
+from faintfield.recon.solver.data_fit import SceneProblem
+from tests.pipelines.conftest import Command, run_undrawn
+from tests.pipelines.forms import plane_files, read_record
 
 PATCHES = ("--prior", "patches")
 NEAR = ("--depth-mm", 500)
@@ -22,24 +33,11 @@ BOTH = (*NEAR, "--depth-mm", 700)
 QUICK = ("--passes", 2, "--penalty-weight", 2)
 
 
-def _planes(folder: Path) -> list[dict[str, Any]]:
-    return list(read_record(folder)["planes"])
-
-
-def _run(*words: object) -> None:
-    with drawing_nothing():
-        assert run([str(word) for word in words]) == 0
-
-
-def _files(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.glob("plane_*")}
-
-
 @pytest.fixture(scope="module")
 def dark_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """5 x 5 views of 128 x 96 px at the darkness of the paper, to be read only."""
     folder = tmp_path_factory.mktemp("dark") / "scene"
-    _run("simulate", folder, "--size-px", 128, 96, "--rows", 5, "--columns", 5, "--snr", 0.16)
+    run_undrawn("simulate", folder, "--size-px", 128, 96, "--rows", 5, "--columns", 5, "--snr", 0.16)
     return folder
 
 
@@ -47,7 +45,7 @@ def dark_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def proposed(dark_set: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A plane of the dark set by patches, with what was proposed, to be read only."""
     out = tmp_path_factory.mktemp("proposed") / "out"
-    _run("reconstruct", dark_set, *NEAR, *PATCHES, "--proposal", "--uncertainty", "--out", out)
+    run_undrawn("reconstruct", dark_set, *NEAR, *PATCHES, "--proposal", "--uncertainty", "--out", out)
     return out
 
 
@@ -55,12 +53,12 @@ def proposed(dark_set: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def without(dark_set: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same plane by total variation alone, to be read only."""
     out = tmp_path_factory.mktemp("without") / "out"
-    _run("reconstruct", dark_set, *NEAR, "--prior", "tv", "--uncertainty", "--out", out)
+    run_undrawn("reconstruct", dark_set, *NEAR, "--prior", "tv", "--uncertainty", "--out", out)
     return out
 
 
-def test_proposal_and_change_are_written_beside_plane(proposed: Path) -> None:
-    (plane,) = _planes(proposed)
+def test_plane_has_proposal_change_mixtures_and_certificate(proposed: Path, without: Path) -> None:
+    (plane,) = read_record(proposed)["planes"]
     assert plane["proposal_file"] == "plane_00500.0_proposal.tiff"
     assert plane["moved_file"] == "plane_00500.0_moved.tiff"
     light, x, moved = (tifffile.imread(proposed / plane[key]) for key in ("file", "proposal_file", "moved_file"))
@@ -74,10 +72,7 @@ def test_proposal_and_change_are_written_beside_plane(proposed: Path) -> None:
     assert 0.1 < np.percentile(sigma, 1) < np.percentile(sigma, 99) < 10
     assert plane["prior"]["moved_sigma"] == pytest.approx(np.sqrt(np.mean(np.square(moved))), rel=0.02)
     assert 0 < plane["prior"]["moved_sigma"] < 1
-
-
-def test_record_has_mixtures_and_certificate(proposed: Path, without: Path) -> None:
-    (plane,), (first,) = _planes(proposed), _planes(without)
+    (first,) = read_record(without)["planes"]
     assert plane["prior"]["name"] == "patches"
     mixture = plane["prior"]["mixture"]
     assert set(mixture) == {"light, detail", "light, smooth", "dark, detail", "dark, smooth"}
@@ -95,21 +90,25 @@ def test_record_has_mixtures_and_certificate(proposed: Path, without: Path) -> N
     assert (options["prior"], options["proposal"]) == ("patches", True)
 
 
-def test_prior_lowers_error_at_darkness_of_paper(proposed: Path, without: Path) -> None:
+def _coverage_and_width(dark_set: Path, folder: Path) -> tuple[float, float]:
+    """Return how much of the near object 90 % intervals hold, and the root mean square of its standard deviation."""
+    truth = tifffile.imread(dark_set / "truth" / "plane_00500.0.tiff")
+    plane, sigma = (tifffile.imread(folder / f"plane_00500.0{end}.tiff")[truth > 0] for end in ("", "_sigma"))
+    coverage = np.mean(np.abs(plane - truth[truth > 0]) <= 1.645 * sigma)
+    return float(coverage), float(np.sqrt(np.mean(np.square(sigma, dtype=float))))
+
+
+def test_prior_lowers_error_and_covers_truth(dark_set: Path, proposed: Path, without: Path) -> None:
     errors = []
     for folder in (proposed, without):
-        (row,) = json.loads((folder / "metrics.json").read_text())["planes"]
+        (row,) = read_record(folder, "metrics.json")["planes"]
         errors.append((row["mse_bright"], row["mse_texture"]))
     assert np.all(np.less(errors[0], np.multiply(0.95, errors[1])))
+    assert min(_coverage_and_width(dark_set, folder)[0] for folder in (proposed, without)) > 0.7  # few small views
 
 
 @pytest.mark.parametrize(
-    ("words", "prior"),
-    [
-        (NEAR, "auto"),
-        ((*NEAR, "--method", "mlem"), None),
-        (("--sweep-mm", "480:520:2"), None),
-    ],
+    ("words", "prior"), [(NEAR, "auto"), ((*NEAR, "--method", "mlem"), None), (("--sweep-mm", "480:520:2"), None)]
 )
 def test_prior_is_auto_by_default(
     words: tuple[object, ...], prior: str | None, scene: Path, tmp_path: Path, done: Command
@@ -126,23 +125,11 @@ def test_total_variation_stays_where_no_candidate_is_better(
     dark_set: Path, without: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(prior_module, "patch_candidates", lambda evidence: {"tv": evidence.pilot})
-    _run("reconstruct", dark_set, *NEAR, *PATCHES, "--out", tmp_path)
-    (plane,) = _planes(tmp_path)
+    run_undrawn("reconstruct", dark_set, *NEAR, *PATCHES, "--proposal", "--out", tmp_path)
+    (plane,) = read_record(tmp_path)["planes"]
     assert plane["prior"] == {"name": "tv", "left_out": "total variation predicts held-out views best"}
+    assert not {"proposal_file", "moved_file"} & set(plane)
     assert (tmp_path / plane["file"]).read_bytes() == (without / plane["file"]).read_bytes()
-
-
-def _coverage_and_width(dark_set: Path, folder: Path) -> tuple[float, float]:
-    """Return how much of the near object 90 % intervals hold, and the root mean square of its standard deviation."""
-    truth = tifffile.imread(dark_set / "truth" / "plane_00500.0.tiff")
-    plane, sigma = (tifffile.imread(folder / f"plane_00500.0{end}.tiff")[truth > 0] for end in ("", "_sigma"))
-    coverage = np.mean(np.abs(plane - truth[truth > 0]) <= 1.645 * sigma)
-    return float(coverage), float(np.sqrt(np.mean(np.square(sigma, dtype=float))))
-
-
-def test_standard_deviation_covers_truth(dark_set: Path, proposed: Path, without: Path) -> None:
-    for folder in (proposed, without):
-        assert _coverage_and_width(dark_set, folder)[0] > 0.7  # few views of few pixels
 
 
 @pytest.mark.deep
@@ -160,7 +147,7 @@ def test_planes_found_together_have_proposal_and_certificate_each(scene: Path, t
     words = ("--joint", "--occlusion", *PATCHES, "--proposal", "--penalty-weight", 2)
     done("reconstruct", scene, *BOTH, *words, "--out", tmp_path)
     for method in ("joint", "occlusion"):
-        planes = _planes(tmp_path / method)
+        planes = read_record(tmp_path / method)["planes"]
         assert len(planes) == 2
         assert planes[0]["prior"]["mixture"] != planes[1]["prior"]["mixture"]
         for plane in planes:
@@ -173,23 +160,120 @@ def test_planes_found_together_have_proposal_and_certificate_each(scene: Path, t
 def test_only_planes_of_another_prior_are_made_again(scene: Path, tmp_path: Path, done: Command) -> None:
     words = ("reconstruct", scene, *NEAR, *QUICK, "--out", tmp_path)
     done(*words, *PATCHES)
-    by_patches = _files(tmp_path)
+    by_patches = plane_files(tmp_path)
     assert "1 of 1 planes are there" in done(*words, *PATCHES).stderr
     assert "are there" not in done(*words, *PATCHES, "--proposal").stderr
-    assert set(_files(tmp_path)) == {*by_patches, "plane_00500.0_proposal.tiff", "plane_00500.0_moved.tiff"}
+    assert set(plane_files(tmp_path)) == {*by_patches, "plane_00500.0_proposal.tiff", "plane_00500.0_moved.tiff"}
     assert "are there" not in done(*words, "--prior", "tv").stderr
-    by_variation = _files(tmp_path)
+    by_variation = plane_files(tmp_path)
     assert set(by_variation) == set(by_patches)
     assert by_variation["plane_00500.0.tiff"] != by_patches["plane_00500.0.tiff"]
 
 
-def test_too_few_views_give_plane_of_total_variation(tmp_path: Path, done: Command) -> None:
-    done("simulate", tmp_path / "set", "--size-px", 64, 48, "--rows", 1, "--columns", 3)
-    for name, words in (("tv", ()), ("patches", (*PATCHES, "--proposal"))):
-        done("reconstruct", tmp_path / "set", *NEAR, *words, "--out", tmp_path / name)
-    (plane,), (first,) = _planes(tmp_path / "patches"), _planes(tmp_path / "tv")
-    assert plane["prior"] == {"name": "tv", "left_out": "too few views to hold some out"}
-    assert not {"proposal_file", "moved_file"} & set(plane)
-    assert (tmp_path / "patches" / plane["file"]).read_bytes() == (tmp_path / "tv" / first["file"]).read_bytes()
-    again = done("reconstruct", tmp_path / "set", *NEAR, *PATCHES, "--proposal", "--out", tmp_path / "patches")
-    assert "1 of 1 planes are there" in again.stderr
+type Readings = list[tuple[str, list[str]]]
+
+
+@pytest.fixture(scope="module")
+def colour_plane(colour_set: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Readings]:
+    """A plane by patches, and its colours in the order in which they were read, each with those still in memory."""
+    out, read = tmp_path_factory.mktemp("whole"), list[tuple[str, list[str]]]()
+    alive: list[tuple[str, weakref.ref[ElementalImages]]] = []
+
+    def watched(elemental_set: ElementalSet, layout: ChannelLayout, *allocate: Any) -> ElementalImages:
+        read.append((layout.name, [name for name, images in alive if images() is not None]))
+        images = load_channel(elemental_set, layout, *allocate)
+        alive.append((layout.name, weakref.ref(images)))
+        return images
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sweep, "load_channel", watched)
+        run_undrawn("reconstruct", colour_set, *NEAR, *QUICK, *PATCHES, "--out", out)
+    return out, read
+
+
+def _by_hand(folder: Path, depth_mm: float, settings: Settings) -> list[Image]:
+    """Each colour of a plane by the prior, with the sum of the other colours by total variation."""
+    elemental_set = load_set(folder)
+    objectives, first = [], []
+    for layout in channel_layouts(elemental_set):
+        images = load_channel(elemental_set, layout)
+        operator = OperatorFactory(elemental_set, layout, images).at(depth_mm, plane_grid(elemental_set, depth_mm))
+        objectives.append(Objective.of(SceneProblem(operator, images), settings))
+        first.append(solve_pmlem(objectives[-1], settings))
+    red, green, blue = (one.plane for (one,) in first)
+    others = [green + blue, red + blue, red + green]
+    return [
+        with_prior(objective, one, settings, others=light)[0].plane
+        for objective, one, light in zip(objectives, first, others, strict=True)
+    ]
+
+
+def test_each_colour_begins_with_sum_of_others(
+    colour_set: Path, colour_plane: tuple[Path, Readings], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Held-out views judge candidates that know the other colours, too."""
+    judged: list[Evidence] = []
+
+    def watched(evidence: Evidence) -> dict[str, Image]:
+        judged.append(evidence)
+        return patch_candidates(evidence)
+
+    monkeypatch.setattr("faintfield.pipelines.reconstruction.prior.patch_candidates", watched)
+    plane = tifffile.imread(colour_plane[0] / "plane_00500.0.tiff")
+    expected = _by_hand(colour_set, 500.0, Settings(2.0, 2, prior="patches"))
+    np.testing.assert_allclose(np.moveaxis(plane, -1, 0), expected, atol=1e-4)
+    names = [(record["channel"], record["prior"]["name"]) for record in read_record(colour_plane[0])["planes"]]
+    assert names == [(channel, "patches") for channel in ("red", "green", "blue")]
+    # Memory holds one colour at a time
+    assert colour_plane[1] == [(name, []) for name in ("red", "green", "blue", "green", "red")]
+    assert len(judged) >= 3 * 3  # colours times two folds and the whole
+    assert len({evidence.coverage.sum(dtype=float) for evidence in judged}) == len(judged)
+    for evidence in judged:
+        assert evidence.others is not None
+        assert evidence.others[evidence.coverage > 0].min() > 0
+
+
+def test_joint_planes_begin_with_other_colours(
+    colour_set: Path, tmp_path: Path, done: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    light: list[dict[Any, Image]] = []
+    begun: list[dict[Any, tuple[Image, Image]]] = []
+
+    def watched(factory: Any, images: Any, grids: Any, methods: Any, settings: Any, pilots: Any = None) -> Any:
+        found = solve_together(factory, images, grids, methods, settings, pilots)
+        if pilots is None:
+            assert settings.prior == "tv"
+            light.append({place: one.plane for place, one in found["joint"].items()})
+        else:
+            begun.append({place: (one.solution.plane, one.others) for place, one in pilots.items()})
+        return found
+
+    monkeypatch.setattr(tasks, "solve_together", watched)
+    both = (*NEAR, "--depth-mm", 700, "--joint")
+    done("reconstruct", colour_set, *both, *QUICK, *PATCHES, "--out", tmp_path)
+    assert len(light) == len(begun) == 3
+    for own, pilots in zip(light, begun[::-1], strict=True):
+        for place, (plane, others) in pilots.items():
+            np.testing.assert_array_equal(plane, own[place])
+            np.testing.assert_allclose(plane + others, np.sum([one[place] for one in light], axis=0), rtol=1e-5)
+    assert len(plane_files(tmp_path)) == 2 * 3  # picture, preview and record
+
+
+def test_interrupted_colour_plane_is_completed_alike(
+    colour_set: Path, colour_plane: tuple[Path, Readings], tmp_path: Path, faintfield: Command,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    words = ("reconstruct", colour_set, *NEAR, *QUICK, *PATCHES, "--out", tmp_path)
+    calls = []
+
+    def failing(*arguments: Any) -> Any:
+        calls.append(arguments)
+        if len(calls) == 5:  # three colours by total variation, one by the prior
+            raise GeometryMismatch("made up; wait")
+        return solve(*arguments)
+
+    monkeypatch.setattr(tasks, "solve", failing)
+    assert faintfield(*words).returncode == 1
+    assert {path.suffix for path in (tmp_path / ".parts").iterdir()} == {".float32", ".json"}
+    assert faintfield(*words).returncode == 0
+    assert plane_files(tmp_path) == plane_files(colour_plane[0])
