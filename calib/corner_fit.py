@@ -95,15 +95,18 @@ def refine_corners(image: NDArray[np.float32], guesses: Array, squares_px: Array
     variances = np.diagonal(np.linalg.inv(normal), axis1=1, axis2=2)
     found = _accepted(state, variances, windows)
     found &= ((points >= 0) & (points <= np.array(image.shape[::-1]) - 1)).all(axis=1)
-    sigma_px = np.hypot(np.sqrt(variances[:, _PLACE].mean(axis=1)), _FLOOR_PX)
-    return np.where(found[:, np.newaxis], points, np.nan), np.where(found, sigma_px, np.nan)
+    place_variances = np.where(found, variances[:, _PLACE].mean(axis=1), np.nan)
+    return np.where(found[:, np.newaxis], points, np.nan), np.hypot(np.sqrt(place_variances), _FLOOR_PX)
 
 
 def _accepted(state: Array, variances: Array, windows: _Windows) -> NDArray[np.bool_]:
     """Return which corners (corner,) are near their guess, of sufficient contrast, and seen by enough pixels."""
     near = np.abs(state[:, _PLACE]).max(axis=1) <= _MAX_SHIFT_PX
-    contrast = np.abs(state[:, _CONTRAST]) >= _MIN_CONTRAST_SIGMAS * np.sqrt(variances[:, _CONTRAST])
-    return np.asarray(near & contrast & (windows.counts.sum(axis=1) >= _MIN_PIXELS))
+    variance = variances[:, _CONTRAST]
+    contrast = np.square(state[:, _CONTRAST]) >= _MIN_CONTRAST_SIGMAS**2 * variance
+    # Where the pixels say nothing, rounding can make a variance of the inverted matrix negative.
+    known = (variance > 0) & (variances[:, _PLACE].mean(axis=1) > 0)
+    return np.asarray(near & known & contrast & (windows.counts.sum(axis=1) >= _MIN_PIXELS))
 
 
 def _start(guesses: Array, squares_px: Array) -> Array:
