@@ -18,24 +18,11 @@ import msgspec
 from faintfield.rig.errors import SessionCorrupt, SessionUnreadable, SessionUnwritable
 from faintfield.rig.session.disk import require_kind, translate_errors, translate_read_errors, write_new
 
-# Format of the sessions that are begun now. In format 1 the tables are not strict, and nothing chains their rows.
-FORMAT = 2
+# Format of the sessions that are begun now. In format 1 the tables are not strict; format 2 has a chain of hashes over
+# all rows, which is not read any more.
+FORMAT = 3
 
-SCHEMAS = {
-    1: """
-CREATE TABLE IF NOT EXISTS event (
-    id INTEGER PRIMARY KEY AUTOINCREMENT, at TEXT NOT NULL, kind TEXT NOT NULL, frame INTEGER, detail TEXT NOT NULL);
-CREATE TABLE IF NOT EXISTS intent (
-    id INTEGER PRIMARY KEY AUTOINCREMENT, at TEXT NOT NULL, frame INTEGER NOT NULL);
-CREATE TABLE IF NOT EXISTS "commit" (
-    intent INTEGER PRIMARY KEY REFERENCES intent (id), at TEXT NOT NULL, file TEXT NOT NULL UNIQUE,
-    sha256 TEXT NOT NULL, bytes INTEGER NOT NULL, detail TEXT NOT NULL);
-CREATE TABLE IF NOT EXISTS void (
-    intent INTEGER PRIMARY KEY REFERENCES intent (id), at TEXT NOT NULL, why TEXT NOT NULL);
-CREATE TABLE IF NOT EXISTS traffic (
-    id INTEGER PRIMARY KEY AUTOINCREMENT, at_s REAL NOT NULL, direction TEXT NOT NULL, data BLOB NOT NULL);
-""",
-    2: """
+_TABLES = """
 CREATE TABLE event (
     id INTEGER PRIMARY KEY, at TEXT NOT NULL, kind TEXT NOT NULL, frame INTEGER, detail TEXT NOT NULL) STRICT;
 CREATE TABLE intent (
@@ -47,11 +34,26 @@ CREATE TABLE void (
     intent INTEGER PRIMARY KEY REFERENCES intent (id), at TEXT NOT NULL, why TEXT NOT NULL) STRICT;
 CREATE TABLE traffic (
     id INTEGER PRIMARY KEY, at_s REAL NOT NULL, direction TEXT NOT NULL, data BLOB NOT NULL) STRICT;
+"""
+_CHAIN = """
 CREATE TABLE chain (
     id INTEGER PRIMARY KEY, "table" TEXT NOT NULL, first INTEGER NOT NULL, last INTEGER NOT NULL,
     sha256 BLOB NOT NULL) STRICT;
-""",
-}
+"""
+_OLD_TABLES = """
+CREATE TABLE IF NOT EXISTS event (
+    id INTEGER PRIMARY KEY AUTOINCREMENT, at TEXT NOT NULL, kind TEXT NOT NULL, frame INTEGER, detail TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS intent (
+    id INTEGER PRIMARY KEY AUTOINCREMENT, at TEXT NOT NULL, frame INTEGER NOT NULL);
+CREATE TABLE IF NOT EXISTS "commit" (
+    intent INTEGER PRIMARY KEY REFERENCES intent (id), at TEXT NOT NULL, file TEXT NOT NULL UNIQUE,
+    sha256 TEXT NOT NULL, bytes INTEGER NOT NULL, detail TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS void (
+    intent INTEGER PRIMARY KEY REFERENCES intent (id), at TEXT NOT NULL, why TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS traffic (
+    id INTEGER PRIMARY KEY AUTOINCREMENT, at_s REAL NOT NULL, direction TEXT NOT NULL, data BLOB NOT NULL);
+"""
+SCHEMAS = {1: _OLD_TABLES, 2: _TABLES + _CHAIN, FORMAT: _TABLES}
 
 # Limits of what a journal may hold. A week of serial traffic takes a third of a gigabyte. The longest value is a list
 # of skipped frames, less than a megabyte.

@@ -1,8 +1,7 @@
 """Keep the journal of a session: a database of all that happened during a capture.
 
 The journal is SQLite in WAL mode with synchronous=FULL: once a call returns, what it recorded survives a power cut.
-Rows are only added, ordered by their numbers, and chained by hashes; times are for people, since clocks can be set
-back.
+Rows are only added, and ordered by their numbers; times are for people, since clocks can be set back.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,7 +16,6 @@ from msgspec import Meta, Struct
 from faintfield.rig.cameras.protocol import Metadata
 from faintfield.rig.errors import SessionCorrupt
 from faintfield.rig.plan import MAX_FRAMES
-from faintfield.rig.session.chain import add_rows, check_chain, insert_rows
 from faintfield.rig.session.database import check_database, connect, create_database, translate_sqlite_errors
 from faintfield.rig.session.names import is_plain_name
 from faintfield.rig.stages.protocol import Point
@@ -149,7 +147,7 @@ class Journal:
     Attributes
     ----------
     format : int
-        Format of the journal; rows are chained from format 2 on.
+        Format of the journal.
 
     Raises
     ------
@@ -267,8 +265,6 @@ class Journal:
         with self._translate_errors():
             self._db.execute("BEGIN")  # one state of the journal for all checks
             self.format = check_database(self._db, self.path)
-            if self.format > 1:
-                check_chain(self._db, self.path)
             self._db.execute("COMMIT")
             if not self._read_only:
                 self._db.execute("PRAGMA journal_mode = WAL")
@@ -291,10 +287,9 @@ class Journal:
         return file
 
     def _add(self, table: str, *rows: tuple[object, ...]) -> int:
-        """Insert rows with consecutive numbers into a table, chain them, and return the number of the last."""
-        if self.format == 1:
-            return insert_rows(self._db, table, rows)[1]
-        return add_rows(self._db, table, rows)
+        """Insert rows into a table, and return the number of the last."""
+        insert = f'INSERT INTO "{table}" VALUES ({", ".join("?" * len(rows[0]))})'
+        return [self._db.execute(insert, row).lastrowid or 0 for row in rows][-1]
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:

@@ -197,7 +197,7 @@ def find_no_problem(folder: Path) -> None:
         ('"approach_mm": 2.0', '"approach_mm": -2.0', "not negative"),
         ('"approach_mm": 2.0', f'"approach_mm": {"[" * 100_000}', ""),
         ('"frames_per_node": 2', '"frames_per_node": 1000000000', f"2000000012 frames, at most {MAX_FRAMES} are "),
-        ('"format": 2', '"format": 3', "format 3, formats 1 to 2 are read"),
+        ('"format": 3', '"format": 4', "format 4, formats 1 to 3 are read"),
         ('"seed": 1', '"seed": 10000000000000', r"plan\.rig\.camera\.seed = 1e\+13 in size is more"),
     ],
 )
