@@ -5,7 +5,6 @@ import fcntl
 import os
 import secrets
 import shutil
-import tempfile
 import time
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -128,12 +127,15 @@ def _put_in_place(building: Path, out: Path) -> None:
     if not out.exists():
         os.replace(building, out)
         return
-    replaced = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
-    os.replace(out, replaced)
+    replaced = out.with_name(f".{out.name}.{secrets.token_hex(4)}")
     try:
+        os.replace(out, replaced)
         os.replace(building, out)
-    except BaseException:
-        os.replace(replaced, out)
+    except BaseException:  # an interrupt may come after either of them was done
+        if out.exists():
+            shutil.rmtree(replaced, ignore_errors=True)
+        else:
+            os.replace(replaced, out)
         raise
     shutil.rmtree(replaced, ignore_errors=True)
 
