@@ -1,6 +1,6 @@
 """Figure 4 of the paper: the error of the reconstruction against the SNR, for four objects."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -21,6 +21,7 @@ from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_expe
 from faintfield.rig.simulation.objects import sailing_boat, shaded_ball, toy_airplane, toy_truck
 from faintfield.rig.simulation.scene import TexturedPlane, render
 
+OBJECTS = (toy_truck, toy_airplane, sailing_boat, shaded_ball)
 SNRS = tuple(round(0.16 + 0.01 * step, 2) for step in range(8))
 PAPERS_AXIS = (0.0, 0.12)
 
@@ -99,16 +100,13 @@ def measure_errors(size_px: tuple[int, int], seeds: int) -> list[ErrorPoint]:
     seeds : int
         Draws of the noise per object and SNR.
     """
-    makers = (toy_truck, toy_airplane, sailing_boat, shaded_ball)
-    cases = progress(_exposures(makers, size_px, seeds), "figure 4: exposures", len(makers) * seeds * len(SNRS))
+    cases = progress(_exposures(size_px, seeds), "figure 4: exposures", len(OBJECTS) * seeds * len(SNRS))
     return [error for stage, weights, seed, exposure in cases for error in _errors(stage, weights, seed, *exposure)]
 
 
-def _exposures(
-    makers: Sequence[Callable[[float, float, float], TexturedPlane]], size_px: tuple[int, int], seeds: int
-) -> Iterator[_Case]:
+def _exposures(size_px: tuple[int, int], seeds: int) -> Iterator[_Case]:
     """Yield every object at every SNR with every draw; an object's draws share the best weights."""
-    for make in makers:
+    for make in OBJECTS:
         stage = stage_object(make(0.0, 0.0, _DEPTH_MM).grey(), size_px)
         weights: _Weights = {}
         for seed in range(1, seeds + 1):

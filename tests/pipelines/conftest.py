@@ -10,6 +10,7 @@ from pathlib import Path
 from subprocess import CompletedProcess
 from typing import Any
 
+import numba
 import numpy as np
 import pytest
 import tomli_w
@@ -31,6 +32,14 @@ type SetMaker = Callable[..., Path]
 type Edit = Callable[[Path, Callable[[dict[str, Any]], object]], Path]
 
 SMALL = ("--size-px", 96, 72, "--rows", 3, "--columns", 3)
+
+
+@pytest.fixture(scope="package", autouse=True)
+def one_thread() -> Iterator[None]:
+    """Leave the second core to the second process of the tests; those of `recon` use threads."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(numba.config, "NUMBA_NUM_THREADS", 1)
+        yield
 
 
 @pytest.fixture

@@ -90,6 +90,7 @@ def test_depths_are_searched_only_once(session: Path, monkeypatch: pytest.Monkey
             _ran(session, depth_mm=["auto"], **asked, **other)
 
 
+@pytest.mark.deep
 def test_range_of_sweep_is_searched_only_once(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     range_found = "faintfield.pipelines.reconstruction.request.found_range_mm"
     monkeypatch.setattr(range_found, lambda *_: (497.0, 503.0))

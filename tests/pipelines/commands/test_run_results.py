@@ -102,16 +102,20 @@ class TestRun:
         next((session / "frames").glob("*_dark_scene_0_r0_c0_*")).touch()
         assert _ran(session, 500.0) == []
 
-    @pytest.mark.parametrize(("kind", "steps"), [("dark_scene", ["reconstruct"]), ("flat", ["noise", "reconstruct"])])
-    def test_altered_frame_is_named(
-        self, kind: str, steps: list[str], session: Path, capsys: pytest.CaptureFixture[str]
+    def test_altered_frame_is_named_and_begins_its_step(
+        self, session: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        frame = sorted((session / "frames").glob(f"*_{kind}_0_*"))[0]
-        pixels = read_frame(frame).pixels_dn.copy()
-        pixels[10, 20] += 7
-        write_frame(frame, pixels)
-        assert _ran(session) == steps
-        assert f"warning: frames/{frame.name} and 0 other frames are not what was captured" in capsys.readouterr().err
+        for kind in ("dark_scene", "flat"):
+            frame = sorted((session / "frames").glob(f"*_{kind}_0_*"))[0]
+            pixels = read_frame(frame).pixels_dn.copy()
+            pixels[10, 20] += 7
+            write_frame(frame, pixels)
+            if kind == "dark_scene":
+                assert _ran(session) == ["reconstruct"]
+                assert f"warning: frames/{frame.name} and 0 other frames are not what was" in capsys.readouterr().err
+        monkeypatch.setattr("faintfield.pipelines.commands.run.noise", _refuse)
+        with pytest.raises(BadValue, match="still to be done: noise, reconstruct, report"):
+            _ran(session)
 
     def test_missing_and_unreadable_results_are_made_again(self, session: Path) -> None:
         (session / "reconstructions" / "report.html").unlink()

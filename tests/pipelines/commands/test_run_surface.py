@@ -57,6 +57,7 @@ def test_run_keeps_surface_of_reconstruct(seen: Searches, session: Path) -> None
     assert _ran(session) == ["report"]
 
 
+@pytest.mark.deep
 def test_interrupt_leaves_no_page_of_earlier_surface(
     seen: Searches, session: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

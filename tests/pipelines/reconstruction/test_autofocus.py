@@ -112,6 +112,7 @@ def test_shuffles_differ_and_are_complete() -> None:
         assert all(sorted(places) == list(range(count)) for places in orders)
 
 
+@pytest.mark.deep
 def test_blind_views_do_not_hide_others(scene: Path, tmp_path: Path, edit: Edit) -> None:
     folder = Path(shutil.copytree(scene, tmp_path / "set"))
     cv2.imwrite(str(folder / "view_3.tiff"), np.full(SIZE_PX[::-1], 65535, np.uint16))

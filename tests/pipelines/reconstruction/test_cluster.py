@@ -7,7 +7,6 @@ from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import numba
 import pytest
 
 from faintfield.pipelines.formats.files import UNFINISHED
@@ -35,12 +34,6 @@ def cluster() -> Iterator[Any]:
         yield started
 
 
-@pytest.fixture
-def one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Sum in the order in which one thread does."""
-    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 1)
-
-
 def _kill_one_that_works(cluster: Any) -> None:
     """Kill a worker that is at a task, as nothing can be caught."""
     with distributed.Client(cluster, set_as_default=False) as client:
@@ -49,7 +42,6 @@ def _kill_one_that_works(cluster: Any) -> None:
     os.kill(processes[address], signal.SIGKILL)
 
 
-@pytest.mark.usefixtures("one_thread")
 def test_worker_killed_in_sweep_costs_one_plane(cluster: Any, simulated_scene: Path, tmp_path: Path) -> None:
     elemental_set = load_set(simulated_scene)
     request = Request(DEPTHS_MM, ["pmlem"], Settings(penalty_weight=1.0, passes=3, prior="tv"), with_focus=True)
@@ -78,6 +70,7 @@ def test_worker_killed_in_sweep_costs_one_plane(cluster: Any, simulated_scene: P
     assert not list((tmp_path / "spread").glob(f".*{UNFINISHED}"))
 
 
+@pytest.mark.deep
 def test_task_that_fails_is_failure_of_command(cluster: Any, scene: Path, tmp_path: Path, faintfield: Command) -> None:
     words = ("--out", tmp_path / "out", "--depth-mm", 500, "--method", "pmlem-osl", "--penalty-weight", 50)
     ended = faintfield("reconstruct", scene, *words, "--scheduler", cluster.scheduler_address)
@@ -85,7 +78,6 @@ def test_task_that_fails_is_failure_of_command(cluster: Any, scene: Path, tmp_pa
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize(
     "options", [("--prior", "tv", "--occlusion"), pytest.param(("--prior", "patches"), marks=pytest.mark.deep)]
 )

@@ -84,6 +84,7 @@ def test_focus_and_map_are_recorded(swept: Path) -> None:
     assert 'id="depth-map"' in (swept / "report.html").read_text()
 
 
+@pytest.mark.deep
 def test_surfaces_have_no_stairs_and_end_with_sweep(tmp_path: Path, done: Command) -> None:
     grid = ("--size-px", 96, 72, "--rows", 5, "--columns", 5)
     done("simulate", tmp_path / "set", "--objects", "surfaces", "--snr", 2, *grid)

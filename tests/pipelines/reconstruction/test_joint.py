@@ -30,6 +30,7 @@ def test_joint_and_occlusion_lower_the_error(tmp_path: Path, done: Command) -> N
     assert np.mean((opacity > 0.5) == (texture > 0)) > 0.95
 
 
+@pytest.mark.deep
 def test_altered_sigma_makes_its_plane_again(scene: Path, tmp_path: Path, done: Command) -> None:
     out = tmp_path / "out"
     words = ("reconstruct", scene, *BOTH, "--joint", "--passes", 2, "--penalty-weight", 1, "--out", out)

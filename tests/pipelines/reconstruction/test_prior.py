@@ -233,6 +233,7 @@ def test_each_colour_begins_with_sum_of_others(
         assert evidence.others[evidence.coverage > 0].min() > 0
 
 
+@pytest.mark.deep
 def test_joint_planes_begin_with_other_colours(
     colour_set: Path, tmp_path: Path, done: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -259,6 +260,7 @@ def test_joint_planes_begin_with_other_colours(
     assert len(plane_files(tmp_path)) == 2 * 3  # picture, preview and record
 
 
+@pytest.mark.deep
 def test_interrupted_colour_plane_is_completed_alike(
     colour_set: Path, colour_plane: tuple[Path, Readings], tmp_path: Path, faintfield: Command,
     monkeypatch: pytest.MonkeyPatch,

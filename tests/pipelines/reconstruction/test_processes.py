@@ -117,6 +117,7 @@ def test_compiling_is_announced_once_for_all_processes(monkeypatch: pytest.Monke
     assert announced == ["compiling"]
 
 
+@pytest.mark.deep
 def test_processes_end_with_command_that_is_killed(tmp_path: Path) -> None:
     script = (
         "from functools import partial; from pathlib import Path\n"

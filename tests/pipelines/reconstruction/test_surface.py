@@ -119,7 +119,7 @@ def test_interrupted_surface_is_whole_or_absent(
 
 def test_planes_and_surface_are_shown_on_one_page(seen: Searches, scene: Path, done: Command) -> None:
     done("reconstruct", scene, "--surface", *FAST, "--out", scene / "out")
-    done("reconstruct", scene, "--depth-mm", 500, "--passes", 2, "--out", scene / "out")
+    done("reconstruct", scene, "--depth-mm", 500, "--method", "backprojection", "--out", scene / "out")
     done("verify", scene / "out", "--inputs", scene)
     done("reconstruct", scene, "--surface", *FAST, "--out", scene / "out")
     assert len(seen) == 1

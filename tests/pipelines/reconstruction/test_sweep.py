@@ -45,7 +45,8 @@ def _contents(folder: Path) -> dict[str, bytes]:
     return found | {"reconstruction.json": json.dumps(record).encode()}
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.deep)])
+@pytest.mark.deep
+@pytest.mark.parametrize("seed", [1, 2])
 def test_killed_sweep_is_completed_alike(seed: int, colour_set: Path, tmp_path: Path, done: Command) -> None:
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     done("reconstruct", colour_set, "--out", whole, *SWEEP)

@@ -40,6 +40,8 @@ KINDS: dict[str, type[msgspec.Struct]] = {
 PAIR = ("--depth-mm", 500, "--depth-mm", 700)
 SWEEP = ("--sweep-mm", "400:800:5", "--method", "backprojection")
 
+DEEP = ("PMLEM", "one-step-late", "sweep")
+
 # Options that make results from the small scene, and the golden files of the same form.
 FRESH: dict[str, tuple[tuple[object, ...], tuple[str, ...]]] = {
     "PMLEM": ((*PAIR, "--prior", "tv"), ("reconstruction_pmlem", "plane_pmlem")),
@@ -67,7 +69,9 @@ def golden_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("call", FRESH)
+@pytest.mark.parametrize(
+    "call", [pytest.param(call, marks=[pytest.mark.deep] if call in DEEP else []) for call in FRESH]
+)
 def test_fresh_results_have_the_form_of_golden_ones(
     call: str, seen: Searches, golden_scene: Path, tmp_path: Path, done: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
