@@ -106,6 +106,7 @@ def test_range_of_sweep_is_searched_only_once(session: Path, monkeypatch: pytest
     assert "auto_sweep" not in read_record(session / "reconstructions")["options"]
 
 
+@pytest.mark.deep
 def test_depth_map_of_disparities_is_made_once(seen: Searches, session: Path) -> None:
     asked: dict[str, Any] = {"sweep_px": "-60:-50:5", "depth_map": True, "method": ["backprojection"], "pitch_mm": 16.0}
     assert _ran(session, **asked) == ["reconstruct"]
@@ -127,3 +128,5 @@ def test_prior_applies_to_planes_and_surface() -> None:
     assert surface is not None
     assert (surface.settings.prior, surface.filtered) == ("tv", True)
     assert select_planes(by_default).settings.prior == "auto"
+    assert select_planes(Options(depth_mm=[500.0], method=["mlem"])).settings.prior == "tv"
+    assert select_planes(Options(sweep_mm="480:520:2")).settings.prior == "tv"

@@ -127,6 +127,7 @@ class TestRun:
         assert _ran(session) == ["reconstruct"]
         assert verify(session).problems == ()
 
+    @pytest.mark.deep
     def test_altered_results_are_made_again(
         self, calibrated_session: Path, session: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:

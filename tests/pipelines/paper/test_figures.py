@@ -84,6 +84,7 @@ def test_figures_2_and_3_show_sharpness_and_darkness(made: Path) -> None:
     assert [row["depth_mm"] for row in content["planes"]] == [500.0, 700.0]
 
 
+@pytest.mark.deep
 @pytest.mark.usefixtures("undrawn")
 def test_figures_that_are_not_asked_for_stay(made: Path, tmp_path: Path, done: Command) -> None:
     out = Path(shutil.copytree(made, tmp_path / "out"))

@@ -70,6 +70,7 @@ def test_another_order_is_refused_with_its_option(scene: Path, tmp_path: Path, e
         best_focus(load_set(folder), tmp_path)
 
 
+@pytest.mark.deep
 def test_views_that_show_no_depth_are_refused(tmp_path: Path, faintfield: Command) -> None:
     def other_scene(node: Node) -> NDArray[np.floating]:
         return 200 * light_field(CARDS, (1, 1), SIZE_PX, seed=2010 + NODES * node[0] + node[1])[0, 0]
@@ -122,6 +123,7 @@ def test_blind_views_do_not_hide_others(scene: Path, tmp_path: Path, edit: Edit)
     assert best_focus(load_set(folder), tmp_path).p_value == 0.002
 
 
+@pytest.mark.deep
 def test_depth_of_alignment_does_not_matter(tmp_path: Path, done: Command) -> None:
     views = with_noise(light_field(CARDS, (NODES, NODES), SIZE_PX, aligned_px=2.2), 20)
     (tmp_path / "pictures").mkdir()

@@ -42,6 +42,7 @@ def _kill_one_that_works(cluster: Any) -> None:
     os.kill(processes[address], signal.SIGKILL)
 
 
+@pytest.mark.deep
 def test_worker_killed_in_sweep_costs_one_plane(cluster: Any, simulated_scene: Path, tmp_path: Path) -> None:
     elemental_set = load_set(simulated_scene)
     request = Request(DEPTHS_MM, ["pmlem"], Settings(penalty_weight=1.0, passes=3, prior="tv"), with_focus=True)

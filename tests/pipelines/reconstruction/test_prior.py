@@ -1,6 +1,5 @@
 """`reconstruct --prior`: its files and records, errors below those without it, and the light of other colours."""
 
-import json
 import weakref
 from pathlib import Path
 from typing import Any
@@ -107,20 +106,6 @@ def test_prior_lowers_error_and_covers_truth(dark_set: Path, proposed: Path, wit
     assert min(_coverage_and_width(dark_set, folder)[0] for folder in (proposed, without)) > 0.7  # few small views
 
 
-@pytest.mark.parametrize(
-    ("words", "prior"), [(NEAR, "auto"), ((*NEAR, "--method", "mlem"), None), (("--sweep-mm", "480:520:2"), None)]
-)
-def test_prior_is_auto_by_default(
-    words: tuple[object, ...], prior: str | None, scene: Path, tmp_path: Path, done: Command
-) -> None:
-    done("reconstruct", scene, *words, *QUICK, "--out", tmp_path / "out")
-    found = [json.loads(path.read_text()) for path in (tmp_path / "out").glob("**/reconstruction.json")]
-    assert found
-    for record in found:
-        expected = None if record["options"]["method"] == "backprojection" else prior
-        assert record["options"].get("prior") == expected
-
-
 def test_total_variation_stays_where_no_candidate_is_better(
     dark_set: Path, without: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -143,6 +128,7 @@ def test_standard_deviation_of_joint_planes_is_about_proposal(dark_set: Path, tm
     assert answers[0][1] < answers[1][1]
 
 
+@pytest.mark.deep
 def test_planes_found_together_have_proposal_and_certificate_each(scene: Path, tmp_path: Path, done: Command) -> None:
     words = ("--joint", "--occlusion", *PATCHES, "--proposal", "--penalty-weight", 2)
     done("reconstruct", scene, *BOTH, *words, "--out", tmp_path)

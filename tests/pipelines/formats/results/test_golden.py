@@ -40,7 +40,7 @@ KINDS: dict[str, type[msgspec.Struct]] = {
 PAIR = ("--depth-mm", 500, "--depth-mm", 700)
 SWEEP = ("--sweep-mm", "400:800:5", "--method", "backprojection")
 
-DEEP = ("PMLEM", "one-step-late", "sweep")
+DEEP = ("PMLEM", "one-step-late", "sweep", "depth map")
 
 # Options that make results from the small scene, and the golden files of the same form.
 FRESH: dict[str, tuple[tuple[object, ...], tuple[str, ...]]] = {
