@@ -33,9 +33,9 @@ def _run(*words: object) -> None:
 
 @pytest.fixture(scope="module")
 def larger_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """5 x 5 dark views of 128 x 96 px, to be read only."""
+    """5 x 5 dark views of 96 x 72 px, to be read only."""
     folder = tmp_path_factory.mktemp("larger") / "scene"
-    _run("simulate", folder, "--size-px", 128, 96, "--rows", 5, "--columns", 5)
+    _run("simulate", folder, "--size-px", 96, 72, "--rows", 5, "--columns", 5)
     return folder
 
 
@@ -76,7 +76,7 @@ def test_record_of_plane_agrees_with_its_file(method: str, results: Path, larger
         path = results / method / plane["file"]
         pixels = tifffile.imread(path)
         assert pixels.dtype == np.float32
-        assert list(pixels.shape) == plane["shape"] == [96, 128]
+        assert list(pixels.shape) == plane["shape"] == [72, 96]
         assert plane["channel"] == "grey"
         pitch_mm = plane["depth_mm"] / camera.fx_px
         assert plane["pitch_mm"] == pytest.approx(pitch_mm, rel=1e-12)

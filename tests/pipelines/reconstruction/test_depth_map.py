@@ -39,7 +39,7 @@ MAPS = ("depth_mm.tiff", "depth_confidence.tiff", "all_in_focus.tiff")
 @pytest.fixture(scope="module")
 def large_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("depth") / "scene"
-    run_undrawn("simulate", folder, "--snr", 2, "--size-px", 160, 120, "--rows", 5, "--columns", 5)
+    run_undrawn("simulate", folder, "--snr", 2, "--size-px", 128, 96, "--rows", 5, "--columns", 5)
     return folder
 
 
