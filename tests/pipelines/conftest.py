@@ -34,11 +34,18 @@ type Edit = Callable[[Path, Callable[[dict[str, Any]], object]], Path]
 SMALL = ("--size-px", 96, 72, "--rows", 3, "--columns", 3)
 
 
-@pytest.fixture(scope="package", autouse=True)
-def one_thread() -> Iterator[None]:
-    """Leave the second core to the second process of the tests; those of `recon` use threads."""
+@contextmanager
+def in_one_thread() -> Iterator[None]:
+    """Leave the second core to the second process of the tests; the order of sums depends on the threads."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(numba.config, "NUMBA_NUM_THREADS", 1)
+        yield
+
+
+@pytest.fixture(scope="package", autouse=True)
+def one_thread() -> Iterator[None]:
+    """All tests of this folder in one thread for each process; those of `recon` use threads."""
+    with in_one_thread():
         yield
 
 
@@ -79,7 +86,8 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
         if not complete.exists():
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir()
-            make(folder)
+            with in_one_thread():
+                make(folder)
             complete.touch()
     return folder
 

@@ -54,7 +54,8 @@ def test_killed_sweep_is_completed_alike(seed: int, colour_set: Path, tmp_path: 
     moments = (anywhere, in_a_file - 1) if seed > 1 else (in_a_file - 1,)
     for moment in moments:
         words = map(str, ("reconstruct", colour_set, "--out", killed, *SWEEP))
-        ended = subprocess.run([sys.executable, "-c", _KILLED, str(moment), *words], capture_output=True)
+        command = [sys.executable, "-c", _KILLED, str(moment), *words]
+        ended = subprocess.run(command, env={**os.environ, "NUMBA_NUM_THREADS": "1"}, capture_output=True)
         assert ended.returncode == -9
         assert not (killed / "reconstruction.json").exists()
     assert list(killed.rglob(f"*{UNFINISHED}"))
