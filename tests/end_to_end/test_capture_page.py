@@ -86,6 +86,7 @@ def test_clicks_lead_through_capture(running: Running, browser: Tab) -> None:
     assert "The stage moves to its switches" in browser.text()
     browser.click("go")
     browser.wait_until("document.getElementById('title').textContent.includes('Bright set')")
+    browser.evaluate("document.body.style.minHeight = '3000px'")  # with a scroll bar
     blue, green, red = (channel for channel in np.moveaxis(browser.screen(), 2, 0))
     assert max(blue.max(), green.max()) <= 60  # the room is dark
     assert red.max() <= 230
