@@ -10,11 +10,22 @@ from tests.end_to_end.browser import CHROMIUM, Tab, open_browser
 
 
 @pytest.fixture(scope="session")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
+def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
     if CHROMIUM is None:
         pytest.skip("there is no Chromium here: the page is not tried in a browser")
     with open_browser(tmp_path_factory.mktemp("browser")) as tab:
         yield tab
+
+
+@pytest.fixture
+def browser(tab: Tab) -> Tab:
+    """An empty page on a wide screen in the light scheme, and no complaint of pages whose capture has ended."""
+    tab.open("about:blank")
+    tab.wait_until("location.href === 'about:blank' && document.readyState === 'complete'")
+    tab.complaints.clear()
+    tab.call("Emulation.setEmulatedMedia", media="", features=[{"name": "prefers-color-scheme", "value": "light"}])
+    tab.resize(1200)
+    return tab
 
 
 @pytest.fixture(scope="session")
@@ -29,12 +40,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def page(browser: Tab, report: Path) -> Iterator[Tab]:
-    """The report in the light scheme on a wide screen, scrolled to its viewer, with no choice remembered."""
-    browser.call("Emulation.setEmulatedMedia", media="", features=[{"name": "prefers-color-scheme", "value": "light"}])
-    browser.resize(1200)
-    browser.open("about:blank")
-    browser.wait_until("document.readyState === 'complete'")
-    browser.complaints.clear()  # pages of captures complain once these have ended
+    """The report, scrolled to its viewer, with no choice remembered."""
     browser.open(report.as_uri())
     browser.wait_until("document.querySelector('.v-stage').dataset.ready === 'all'")
     browser.wait_until("document.readyState === 'complete' && document.getElementById('strip').children.length === 3")

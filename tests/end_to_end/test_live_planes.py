@@ -177,8 +177,7 @@ def test_planes_sharpen_on_page_during_capture(tmp_path: Path, browser: Tab) -> 
     of_two, of_all = (float(np.corrcoef(picture.ravel(), final.ravel())[0, 1]) for picture in levels.values())
     assert of_two < 0.8  # else two nodes would do, and the rise says little
     assert of_all >= 0.9
-    # Pages of other tests may complain that their capture has ended
-    assert [complaint for complaint in browser.complaints if running.address in complaint] == []
+    assert browser.complaints == []
 
 
 def check_controls(browser: Tab) -> None:

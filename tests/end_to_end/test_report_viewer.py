@@ -299,8 +299,6 @@ def _page_of(numbers: NDArray[np.float32], folder: Path) -> str:
 def test_colours_and_missing_samples_are_read(browser: Tab, tmp_path: Path) -> None:
     numbers = np.random.default_rng(3).normal(1.0, 0.5, (30, 40, 3)).astype(np.float32)
     numbers[5, 6] = np.nan
-    browser.resize(1200)
-    browser.open("about:blank")
     browser.open(_page_of(numbers, tmp_path))
     browser.wait_until("document.querySelector('.v-stage').dataset.ready === 'all'")
     left, top, width, height = browser.box(".v-stage")
