@@ -106,7 +106,6 @@ def open_rig(settings: RigSettings, traffic: TrafficLog | None = None, decode: D
 
 
 def _open_camera(settings: CameraSettings, core: SharedCore | None, decode: Decode) -> Camera:
-    """Return a real camera, not yet connected."""
     match settings:
         case GPhoto2Settings():
             return GPhoto2Camera(settings)
@@ -122,7 +121,6 @@ def _open_camera(settings: CameraSettings, core: SharedCore | None, decode: Deco
 
 
 def _shared_core(settings: RigSettings) -> SharedCore | None:
-    """Return the core that camera and stage share if Micro-Manager drives both."""
     if not isinstance(settings.camera, MicroManagerSettings) or settings.stage.protocol != "micromanager":
         return None
     ours, theirs = settings.camera, _micromanager_stage(settings.stage)
@@ -135,7 +133,6 @@ def _shared_core(settings: RigSettings) -> SharedCore | None:
 
 
 def _micromanager_stage(settings: StageSettings) -> MicroManagerStage:
-    """Return the settings of a Micro-Manager stage."""
     return checked_options(settings.options, MicroManagerStage, "[stage] with protocol = 'micromanager'")
 
 

@@ -102,7 +102,6 @@ class SharedCore:
             self._hanging.clear()
 
     def _loaded(self) -> Any:
-        """Return a core with the configured devices."""
         from pymmcore_plus import CMMCorePlus
 
         core = CMMCorePlus()

@@ -138,7 +138,6 @@ class PluginCamera:
         self._named(self._camera.close)
 
     def _named[T](self, call: Callable[[], T]) -> T:
-        """Call the plug-in; what it raises besides `RigError` becomes a `CameraError` that names it."""
         try:
             return call()
         except RigError:
@@ -167,7 +166,6 @@ def checked_options[T](options: Mapping[str, Any], kind: type[T], place: str) ->
 
 
 def _entry_points(group: str, name: str) -> list[EntryPoint]:
-    """Return the entry points `name` of a group; raises `UnknownPlugin` if there are none."""
     installed = entry_points(group=group)
     found = [plugin for plugin in installed if plugin.name == name]
     if not found:
@@ -183,7 +181,6 @@ def _entry_points(group: str, name: str) -> list[EntryPoint]:
 
 
 def _load[T](group: str, name: str, kind: type[T]) -> T:
-    """Return what the entry point `name` of a group holds, which must be a `kind`."""
     found, key = _entry_points(group, name), _BUILT_IN[group][0]
     packages = sorted({_package(plugin) for plugin in found})
     if len(packages) > 1:
@@ -204,7 +201,6 @@ def _load[T](group: str, name: str, kind: type[T]) -> T:
 
 
 def _forbids_unknown(plugin: object) -> bool:
-    """Return whether the settings of a plug-in are a Struct that takes no mistyped keys."""
     settings = getattr(plugin, "settings", None)
     return (
         isinstance(settings, type) and issubclass(settings, Struct) and settings.__struct_config__.forbid_unknown_fields
@@ -212,12 +208,10 @@ def _forbids_unknown(plugin: object) -> bool:
 
 
 def _package(entry: EntryPoint) -> str:
-    """Return name and version of the package of an entry point."""
     return f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value
 
 
 def _made[T](name: str, make: Callable[[], T]) -> T:
-    """Return what a plug-in makes; raises `PluginFailed` if it raises what no camera or stage may."""
     try:
         return make()
     except Exception as failure:

@@ -65,7 +65,6 @@ class BoardSettings(Struct, frozen=True, forbid_unknown_fields=True):
         )
 
     def _dictionary(self) -> cv2.aruco.Dictionary:
-        """Return the predefined dictionary that `dictionary` names."""
         return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
 
 

@@ -62,13 +62,11 @@ class AravisCamera:
                 call_within(self._settings.answer_s, device.release, "disconnecting")
 
     def _opened(self) -> AravisDevice:
-        """Return the camera; raises `CameraError` before `open`."""
         if self._device is None:
             raise CameraError("the camera is not connected; open it first")
         return self._device
 
     def _bounded[T](self, call: Callable[[], T], what: str, extra_s: float = 0.0) -> T:
-        """Call with a time limit, and raise `CameraError` for what the library reports."""
         try:
             return call_within(self._settings.answer_s + extra_s, call, what)
         except CameraTimeout:

@@ -93,7 +93,6 @@ class AravisDevice:
             return self._take(exposure_s)
 
     def _report(self) -> CameraReport:
-        """Return the report."""
         left, upper, width, height = self._region
         shortest_us, longest_us = self._library.floats("arv_camera_get_exposure_time_bounds", 2, self._camera.pointer)
         settings = {
@@ -114,7 +113,6 @@ class AravisDevice:
         )
 
     def _take(self, exposure_s: float) -> tuple[Pixels, Metadata]:
-        """Expose with a stream of its own."""
         library = self._library
         if self._exposure_s != exposure_s:
             self._set_exposure(exposure_s)
@@ -172,14 +170,12 @@ class AravisDevice:
                 self._call("arv_camera_set_chunks", b"Timestamp")
 
     def _set_gain(self, gain: float) -> None:
-        """Set the gain; raises `CameraError` if the camera keeps another one, more than 1 % off."""
         self._call("arv_camera_set_gain", gain)
         kept = self._library.call("arv_camera_get_gain", self._camera.pointer)
         if abs(kept - gain) > max(0.01, 0.01 * abs(gain)):
             raise CameraError(f"the camera keeps gain {kept:g} instead of camera.gain = {gain:g}; choose {kept:g}")
 
     def _set_format(self) -> int:
-        """Set the pixel format, and return its number."""
         name = self._format.name
         self._call("arv_camera_set_pixel_format_from_string", name.encode())
         found, code = self._text("arv_camera_get_pixel_format_as_string"), self._call("arv_camera_get_pixel_format")
@@ -188,7 +184,6 @@ class AravisDevice:
         return code
 
     def _set_region(self) -> tuple[int, ...]:
-        """Set the region if one is configured, and return left column, upper row, width and height."""
         wanted = self._settings.region_px
         if wanted is not None:
             left, upper, width, height = wanted
@@ -216,7 +211,6 @@ class AravisDevice:
         return region
 
     def _set_exposure(self, exposure_s: float) -> None:
-        """Set the exposure time; raises `CameraError` if the camera keeps another one, more than 1 % off."""
         self._exposure_s = None  # what the camera keeps after a failure is not known
         shortest_us, longest_us = self._library.floats("arv_camera_get_exposure_time_bounds", 2, self._camera.pointer)
         if not 0.99 * shortest_us <= 1e6 * exposure_s <= 1.01 * longest_us:
@@ -234,7 +228,6 @@ class AravisDevice:
 
     @contextmanager
     def _acquiring(self) -> Iterator[None]:
-        """Let the camera wait for its trigger while the block runs."""
         self._call("arv_camera_start_acquisition")
         try:
             yield
@@ -245,7 +238,6 @@ class AravisDevice:
         self._call("arv_camera_stop_acquisition")
 
     def _values(self, frame: int) -> Pixels:
-        """Return the values of a complete frame."""
         library = self._library
         status = library.call("arv_buffer_get_status", frame)
         if status != 0:
@@ -295,9 +287,7 @@ class AravisDevice:
         return float(self._library.call("arv_camera_get_float", self._camera.pointer, b"DeviceTemperature"))
 
     def _text(self, name: str) -> str:
-        """Call a function of the camera that returns a text."""
         return self._library.text(name, self._camera.pointer)
 
     def _call(self, name: str, *arguments: object) -> int:
-        """Call a function of the camera that returns an integer or nothing."""
         return int(self._library.call(name, self._camera.pointer, *arguments) or 0)

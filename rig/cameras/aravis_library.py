@@ -180,7 +180,6 @@ class AravisLibrary:
         return ctypes.string_at(data, size.value) if data else b""
 
     def _declare(self, name: str, result: Any, arguments: tuple[Any, ...]) -> None:
-        """Declare the types of a function."""
         try:
             function = getattr(self._aravis, name)
         except AttributeError as failure:

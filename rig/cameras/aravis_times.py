@@ -101,7 +101,6 @@ class FrameTimes:
             self._last[exposure_s] = (requested.clock_ns + after_ns, stamps.camera_ns)
 
     def _check_own(self, stamps: Stamps, requested: Moment, exposure_s: float) -> None:
-        """Raise `CameraError` if the frame is too old by the camera's own clock."""
         if stamps.camera_ns <= self._newest_ns:
             raise CameraError(
                 "a frame came that is not newer by the camera's clock than the one before; take it again, or open the "

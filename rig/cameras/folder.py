@@ -160,7 +160,6 @@ class FolderCamera:
         self._known = None
 
     def _request(self, exposure_s: float) -> _Request:
-        """Return when a frame is asked for, which is now."""
         now_s = self._clock.now_s()
         deadline_s = now_s + exposure_s + self._settings.arrival_s
         return _Request(now_s, now_s + exposure_s, deadline_s, self._folder_time_s())
@@ -180,7 +179,6 @@ class FolderCamera:
                 probe.unlink()
 
     def _look(self, known: set[Path], before: _Arrival | None) -> _Arrival | None:
-        """List the folder, and return the state of the new file, None if there is none."""
         new = sorted(set(self._files()) - known)
         if len(new) > 1:
             known.update(new)
@@ -232,7 +230,6 @@ class FolderCamera:
             )
 
     def _is_complete(self, arrival: _Arrival) -> bool:
-        """Return whether a file is written to its end, as far as can be known."""
         quiet_s = self._clock.now_s() - arrival.since_s
         long_quiet = quiet_s >= self._settings.quiet_s
         arrival.problem = ""
@@ -245,7 +242,6 @@ class FolderCamera:
             return False
 
     def _late(self, arrival: _Arrival | None, request: _Request) -> CameraTimeout:
-        """Return the failure for a frame that did not come in time."""
         state = "no file came"
         if arrival is not None:
             state = f"{arrival.path.name} never stopped growing"
@@ -257,14 +253,12 @@ class FolderCamera:
         )
 
     def _files(self) -> list[Path]:
-        """Return the files with the configured suffixes."""
         if self._folder.stat().st_dev != self._device:  # where a disk was mounted, an empty folder remains
             raise self._gone()
         return [path for path in self._folder.iterdir() if path.suffix.lower() in self._settings.suffixes]
 
     @contextmanager
     def _translate_errors(self) -> Iterator[None]:
-        """Raise `CameraError` for a folder or file that cannot be read any more."""
         try:
             yield
         except OSError as failure:
@@ -276,11 +270,9 @@ class FolderCamera:
             ) from failure
 
     def _gone(self) -> CameraError:
-        """Return the failure for a folder that was there."""
         return CameraError(f"{self._folder}: the folder is gone; mount it again, and take this frame again")
 
     def _require_open(self) -> set[Path]:
-        """Return the files seen so far; raises `CameraError` before `open`."""
         if self._known is None:
             if not self._folder.is_dir():  # opening it again after a failure has failed, too
                 raise self._gone()
@@ -289,7 +281,6 @@ class FolderCamera:
 
 
 def _ends_in_zeros(arrival: _Arrival) -> bool:
-    """Return whether the last bytes of a file are all zero."""
     with arrival.path.open("rb") as file:
         file.seek(max(arrival.size_bytes - _ZERO_TAIL_BYTES, 0))
         return not any(file.read(_ZERO_TAIL_BYTES))

@@ -71,7 +71,6 @@ class MicroManagerCamera:
             self._release()
 
     def _bounded[T](self, call: Callable[[], T], what: str, extra_s: float = 0.0, *, connecting: bool = False) -> T:
-        """Call with a time limit, and raise `CameraError` for what the library raises."""
         if self._core is None and not connecting:
             raise CameraError("the camera is not connected; open it first")
         try:
@@ -89,12 +88,10 @@ class MicroManagerCamera:
             ) from failure
 
     def _release(self) -> None:
-        """Let the devices go."""
         with suppress(CameraError, RuntimeError):  # any fault was already raised when the camera was used
             call_within(self._settings.answer_s, lambda: self._shared.release("camera"), "disconnecting")
 
     def _load(self) -> Any:
-        """Load the configured devices, set the camera's properties, and return the core."""
         core = self._shared.acquire("camera")
         camera = core.getCameraDevice()
         if not camera:
@@ -103,13 +100,11 @@ class MicroManagerCamera:
         return core
 
     def _snap(self, exposure_s: float) -> tuple[Any, Metadata]:
-        """Expose, and return the pixels, the camera's label and its temperature."""
         self._core.setExposure(1e3 * exposure_s)
         pixels = self._core.snap()
         return pixels, {"camera": self._core.getCameraDevice(), "temperature_c": self._read_temperature()}
 
     def _read_temperature(self) -> float | None:
-        """Return the temperature of the sensor, None if there is no such property, or none that is a number."""
         label = self._core.getCameraDevice()
         present = set(self._core.getDevicePropertyNames(label))
         name = next((name for name in _TEMPERATURES if name in present), None)
@@ -120,7 +115,6 @@ class MicroManagerCamera:
         return found_c if math.isfinite(found_c) else None
 
     def _read_report(self) -> CameraReport:
-        """Return the report."""
         core = self._core
         label = core.getCameraDevice()
         pixels = core.getImageWidth() * core.getImageHeight() * core.getNumberOfComponents()

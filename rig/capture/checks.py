@@ -74,7 +74,6 @@ def check_frame(
 
 
 def _saturated_share(pixels: Pixels, saturation_dn: float | None) -> float:
-    """Return the share of pixels at or above saturation."""
     limit_dn = saturation_dn or (np.iinfo(pixels.dtype).max if pixels.dtype.kind in "iu" else np.inf)
     return float(np.mean(pixels >= limit_dn))
 
@@ -101,7 +100,6 @@ def _leak_dn(grey: Pixels) -> float:
 
 
 def _count_board_corners(grey: Pixels, boards: Sequence[BoardSettings]) -> int:
-    """Return the number of board corners found."""
     white = max(float(np.quantile(grey, 0.99)), 1.0)
     scale = min(1.0, _BOARD_SEARCH_PX / max(grey.shape))
     small = cv2.resize(np.asarray(grey, np.float32), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
@@ -116,7 +114,6 @@ def _count_board_corners(grey: Pixels, boards: Sequence[BoardSettings]) -> int:
 def _warnings(
     kind: StepKind, values: dict[str, float], limits: CheckSettings, earlier_sharpness: Sequence[float]
 ) -> tuple[str, ...]:
-    """Return the warnings about the measured values."""
     warnings = []
     share = values.get("saturated_share", 0.0)
     if share > limits.saturated_share:
@@ -191,7 +188,6 @@ def board_warnings(
 
 
 def _blind_node_warnings(boards: Sequence[PlannedFrame], corners: Mapping[int, int], limit: int) -> list[str]:
-    """Return a warning about the nodes from which no sweep shows enough of a board."""
     best: dict[tuple[int, int], int] = {}
     for frame in boards:
         best[frame.stop.node] = max(best.get(frame.stop.node, 0), corners[frame.number])

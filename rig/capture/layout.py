@@ -78,7 +78,6 @@ class LayoutCheck:
         return taken.get(min(taken.keys() - {frame.number}, default=-1))
 
     def _layout_of(self, taken: CommittedFrame) -> Layout | None:
-        """Return the layout of a frame that is taken, None if it cannot be decoded."""
         if taken.file not in self._known:
             try:
                 pixels = self._decode(self._session.path_of(taken))

@@ -65,7 +65,6 @@ class Capture:
             self._rig.stage.close()
 
     def _connect(self) -> None:
-        """Connect to stage and camera, check the plan, and home."""
         rig, session = self._rig, self._session
         rig.stage.connect()
         rig.camera.open()
@@ -91,7 +90,6 @@ class Capture:
                 return
 
     def _run_step(self, missing: list[PlannedFrame]) -> None:
-        """Prompt for the next step, and take its frames."""
         session, first = self._session, missing[0]
         frames = [frame for frame in missing if frame.step == first.step]
         self._dialogue.show_status(first, "waiting for your answer")
@@ -133,7 +131,6 @@ class Capture:
             return
 
     def _handle_untimed_check(self, failure: DriftUnknown) -> None:
-        """Record frames about which a check says nothing, and ask whether to take them again."""
         doubtful = [frame for frame in failure.suspect if isinstance(frame, CommittedFrame)]
         self._session.journal.event("suspect", message=str(failure), intents=[frame.intent for frame in doubtful])
         self._dialogue.warn(str(failure))
@@ -147,7 +144,6 @@ class Capture:
             self._session.void(doubtful, "taken before a check of the stage that says nothing")
 
     def _take(self, frame: PlannedFrame) -> None:
-        """Take a frame; after a failure, ask what to do until it is taken, skipped, or the capture stops."""
         self._failures = 0
         while True:
             try:
@@ -161,7 +157,6 @@ class Capture:
                 return
 
     def _handle_request(self, frame: PlannedFrame) -> None:
-        """Do what the operator requested since the last frame."""
         request = self._operator.take_request()
         if request is None:
             return
@@ -214,7 +209,6 @@ class Capture:
             self._dialogue.warn(f"{frame.name}: the {device} was not recovered: {failure}")
 
     def _note_homing(self) -> None:
-        """Begin a homing group in the journal if the stage was homed since the last frame."""
         if self._rig.stage.homings != self._homings_in_journal:
             self._homings_in_journal = self._rig.stage.homings
             if self._drift.watch is not None:
@@ -233,11 +227,9 @@ class Capture:
             self._dialogue.warn(message)
 
     def _may_home(self, *question: str) -> bool:
-        """Ask before the stage moves to its switches."""
         return self._dialogue.ask(Prompt("home", "Homing", question, ("go", "stop"), "go")) == "go"
 
     def _ask_about_skipped(self) -> list[PlannedFrame]:
-        """Ask what to do with the skipped frames; return those to be taken after all."""
         skipped = self._session.skipped()
         if not skipped:
             return []

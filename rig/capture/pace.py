@@ -90,6 +90,5 @@ class Pace:
         return total_s
 
     def _motion_s(self, start: Point, target: Point) -> float:
-        """Return how long the motion from `start` to `target` takes."""
         path = (start, *one_sided_path(start, target, self._stage.settings.approach_mm))
         return path_duration_s(path, self._stage.identify().motion, self._stage.feed_mm_per_s())

@@ -79,7 +79,6 @@ def _smooth(pixels: Pixels) -> NDArray[np.float32]:
 
 
 def _shifts_px(frames: list[Pixels], rest: Pixels) -> NDArray[np.float64]:
-    """Return the shift in pixels of each frame from the picture at rest."""
     along_rows, along_columns = np.gradient(np.asarray(rest, float))
     gradients = np.stack([along_columns.ravel(), along_rows.ravel()])
     normal = gradients @ gradients.T + 1e-9 * np.eye(2)

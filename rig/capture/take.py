@@ -85,7 +85,6 @@ class DriftChecks:
             self._session.journal.event("drift_check", away_mm=drift.away_mm)
 
     def _handle_drift(self, failure: PositionDrifted) -> None:
-        """Record which frames are suspect, and ask whether to take them again."""
         suspect = [frame for frame in failure.suspect if isinstance(frame, CommittedFrame)]
         self._session.journal.event("suspect", message=str(failure), intents=[frame.intent for frame in suspect])
         self._dialogue.warn(str(failure))
@@ -169,7 +168,6 @@ class FrameTaker:
             raise
 
     def _go_to(self, frame: PlannedFrame) -> None:
-        """Move the stage to the node of a frame, and wait until it is at rest."""
         target = frame.stop.target
         if self._pace.here == target:
             return
@@ -210,7 +208,6 @@ class FrameTaker:
             self._dialogue.operator.show_frame(frame, pixels, found.values)
 
     def _check(self, frame: PlannedFrame, pixels: Pixels | None) -> Findings:
-        """Return the measured values and the warnings of a frame."""
         if pixels is None:
             return Findings(
                 {}, ("the file cannot be decoded here, so nothing was checked; look at it with the camera's program",)
@@ -223,7 +220,6 @@ class FrameTaker:
         return check_frame(pixels, frame.kind, self._settings.checks, self._settings.board, earlier_sharpness)
 
     def _check_boards(self, frame: PlannedFrame) -> None:
-        """Warn if a sweep, or all of them, show too little of the boards."""
         corners = {
             number: int(taken.record.checks["board_corners"])
             for number, taken in self._session.valid().items()
@@ -251,7 +247,6 @@ class FrameTaker:
         return found.wait_s
 
     def _take_unkept(self, exposure_s: float) -> Pixels:
-        """Return a frame that is not kept."""
         exposure = self._rig.camera.expose(exposure_s, next(self._unkept_numbers))
         if exposure.content is None:
             assert exposure.pixels is not None

@@ -60,7 +60,6 @@ class TemperatureWait:
         self._settled_step = None
 
     def _wait(self, frame: PlannedFrame, settings: CoolingSettings, target_c: float) -> None:
-        """Wait until the temperature has stayed at `target_c` for a while."""
         clock = self._rig.clock
         begun_s, steady_s = clock.now_s(), math.inf
         while True:
@@ -89,7 +88,6 @@ class TemperatureWait:
         )
 
     def _heed_stop(self, frame: PlannedFrame) -> None:
-        """Stop if the operator wishes so; other wishes are for the frames."""
         request = self._dialogue.operator.take_request()
         if request is None:
             return

@@ -125,7 +125,6 @@ def present_settings(folder: Path) -> RigSettings:
 
 
 def _changed(rig: RigSettings, changes: Iterable[SettingChange]) -> RigSettings:
-    """Return settings after changes; raises `ValueError` for one that is not possible."""
     content: dict[str, dict[str, Any]] = msgspec.to_builtins(rig)
     for change in changes:
         table, _, key = change.key.partition(".")
@@ -150,12 +149,10 @@ def _leaves(content: Any, key: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _is_of_tables(content: object) -> bool:
-    """Return whether `content` is a list of tables."""
     return isinstance(content, Sequence) and bool(content) and all(isinstance(item, dict) for item in content)
 
 
 def _in_words(value: object) -> str:
-    """Return a value as TOML has it, shortened."""
     if value is None:
         return "not set"
     text = msgspec.json.encode(value).decode()

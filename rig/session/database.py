@@ -205,13 +205,11 @@ def _companions(path: Path) -> tuple[Path, Path, Path]:
 
 
 def _schema(db: sqlite3.Connection) -> list[tuple[str, ...]]:
-    """Return all that a database declares: tables, indices, triggers and views."""
     return db.execute("SELECT type, name, tbl_name, sql FROM sqlite_schema ORDER BY type, name").fetchmany(100)
 
 
 @cache
 def _schema_of(text: str) -> list[tuple[str, ...]]:
-    """Return what a database declares that was made by `text`."""
     db = sqlite3.connect(":memory:")
     try:
         db.executescript(text)
@@ -221,5 +219,4 @@ def _schema_of(text: str) -> list[tuple[str, ...]]:
 
 
 def _message(failure: sqlite3.Error) -> str:
-    """Return the message of a failure in one line."""
     return " ".join(str(failure).split())

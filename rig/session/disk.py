@@ -146,7 +146,6 @@ def lock_session(folder: Path, *, shared: bool = False) -> Iterator[None]:
 
 
 def _take_lock(descriptor: int, folder: Path, *, shared: bool) -> None:
-    """Lock an open file; write the number of this process into it if the lock is exclusive."""
     try:
         fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError as failure:

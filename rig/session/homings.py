@@ -104,7 +104,6 @@ def read_homing_groups(folder: Path) -> HomingGroups:
 
 
 def _spread_mm(checks: list[tuple[float, ...]]) -> tuple[float, ...] | None:
-    """Return the standard deviation of the measured drifts, per axis."""
     if len(checks) < 2 or len({len(away_mm) for away_mm in checks}) != 1:
         return None
     return tuple(stdev(axis) for axis in zip(*checks, strict=True))

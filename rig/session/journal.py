@@ -261,7 +261,6 @@ class Journal:
                 yield msgspec.convert(row, _TrafficRow)
 
     def _prepare(self) -> None:
-        """Check all that the journal holds; for writing, prefer durability to speed."""
         with self._translate_errors():
             self._db.execute("BEGIN")  # one state of the journal for all checks
             self.format = check_database(self._db, self.path)
@@ -272,7 +271,6 @@ class Journal:
                 self._db.execute("PRAGMA foreign_keys = ON")
 
     def _read(self, layout: Any, query: str, *arguments: object) -> list[Any]:
-        """Return the rows of a query, each checked against `layout`."""
         rows = [msgspec.convert(row, layout) for row in self._db.execute(query, arguments).fetchmany(_MAX_ROWS + 1)]
         if len(rows) > _MAX_ROWS:
             raise SessionCorrupt(
@@ -281,13 +279,11 @@ class Journal:
         return rows
 
     def _plain(self, file: str) -> str:
-        """Return the name of a frame's file, which must not lead out of its folder."""
         if not is_plain_name(file):
             raise SessionCorrupt(f"{self.path}: {file!r:.60} is not the name of a frame; restore it from a copy")
         return file
 
     def _add(self, table: str, *rows: tuple[object, ...]) -> int:
-        """Insert rows into a table, and return the number of the last."""
         insert = f'INSERT INTO "{table}" VALUES ({", ".join("?" * len(rows[0]))})'
         return [self._db.execute(insert, row).lastrowid or 0 for row in rows][-1]
 
@@ -312,15 +308,12 @@ class Journal:
                 raise
 
     def _translate_errors(self) -> AbstractContextManager[None]:
-        """Raise a named failure for an error of SQLite."""
         return translate_sqlite_errors(self.path, read_only=self._read_only)
 
 
 def _now() -> str:
-    """Return the time in UTC as ISO 8601."""
     return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
 def _to_json(detail: object) -> str:
-    """Return a detail as JSON text."""
     return msgspec.json.encode(detail).decode()

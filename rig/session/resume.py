@@ -83,7 +83,6 @@ def open_session(folder: Path, plan: FrozenPlan | None, progress: Progress = ite
 
 
 def _begin(folder: Path, plan: FrozenPlan | None) -> None:
-    """Write the plan, the first file of a session besides the lock."""
     if plan is None:
         raise SessionCorrupt(f"{folder}: holds no session; name another folder, or begin one from a rig.toml")
     others = [name for name in list_names(folder) if name not in ("lock", PLAN + PART)]
@@ -93,7 +92,6 @@ def _begin(folder: Path, plan: FrozenPlan | None) -> None:
 
 
 def _check_plan_hash(folder: Path, journal: Journal, digest: str, *, begun: bool) -> None:
-    """Compare the hash of the plan with the one in the journal, or record it in a new journal."""
     stated = journal.details("begun", Begun)
     if not stated:
         if begun:
@@ -106,7 +104,6 @@ def _check_plan_hash(folder: Path, journal: Journal, digest: str, *, begun: bool
 
 
 def _reconcile(session: Session, names: list[str], progress: Progress) -> None:
-    """Set aside files that are not in the journal; declare frames void whose file is altered or missing."""
     folder, journal = session.folder, session.journal
     committed = {frame.file for frame in journal.committed()}
     present = set(names)
@@ -138,5 +135,4 @@ def _is_intact(path: Path, digest: str) -> bool:
 
 
 def _printable(name: str) -> str:
-    """Return a file name without bytes that are no text."""
     return os.fsencode(name).decode(errors="backslashreplace")

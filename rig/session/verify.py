@@ -87,7 +87,6 @@ def verify(folder: Path, progress: Callable[[Iterable[Path]], Iterable[Path]] = 
 
 
 def _verify(folder: Path, progress: Callable[[Iterable[Path]], Iterable[Path]]) -> Verdict:
-    """Verify a session whose lock is held, or that has none."""
     frozen, plan_sha256 = read_plan_and_hash(folder)
     frames = planned_frames(frozen.plan)
     with open_journal(folder, frozen, read_only=True) as journal:
@@ -132,7 +131,6 @@ class _Unreadable(Struct, frozen=True):
 
 
 def _digest(path: Path) -> str | _Unreadable:
-    """Return the hash of a file, or why there is none."""
     try:
         return sha256(path)
     except OSError as failure:
@@ -150,7 +148,6 @@ def find_interrupted(
 def _compare(
     committed: list[CommittedFrame], digests: dict[str, str | _Unreadable], interrupted: Set[str]
 ) -> Iterator[str]:
-    """Yield the disagreements between journal and files."""
     for frame in committed:
         match digests.get(frame.file):
             case _Unreadable(why=why):

@@ -104,7 +104,6 @@ def _rotation(rodrigues: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _transformed(rt: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Apply a pose to points (point, 3)."""
     return np.asarray(points @ _rotation(np.asarray(rt[:3], np.float64)).T + rt[3:], np.float64)
 
 

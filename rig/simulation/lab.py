@@ -119,7 +119,6 @@ class SimulatedLab:
 
     @cached_property
     def _illumination(self) -> NDArray[np.float32]:
-        """Relative illumination (row, column) of the lens."""
         return self.experiment.optics.relative_illumination()
 
     def arrange(self, kind: StepKind, sweep: int) -> None:
@@ -241,6 +240,5 @@ class SimulatedCamera:
         self._open = False
 
     def _require_open(self) -> None:
-        """Raise `CameraError` before `open` and after `close`."""
         if not self._open:
             raise CameraError("the camera is not connected; open it first")

@@ -34,7 +34,6 @@ def surface_scene() -> tuple[Surface, ...]:
 
 
 def _painted(name: str, shape: Shape, tile: Tile, pitch_mm: float, dark: Colour, bright: Colour) -> Surface:
-    """Return a surface whose colour runs from dark to bright as its tile runs from 0 to 1."""
     low, high = np.array(dark), np.array(bright)
     return Surface(name, shape, (low + tile[:, :, np.newaxis] * (high - low)).astype(np.float32), pitch_mm)
 
@@ -49,7 +48,6 @@ def _noise(seed: int, size: int, slope: float) -> Tile:
 
 
 def _clouds(seed: int, size: int, slope: float) -> Tile:
-    """Return detail of all sizes, 0…1."""
     return np.asarray(np.clip(0.5 + 0.25 * _noise(seed, size, slope), 0, 1), np.float32)
 
 
@@ -61,7 +59,6 @@ def _patches(seed: int, size: int, slope: float) -> Tile:
 
 
 def _print(seed: int, size: int) -> Tile:
-    """Return lines of dark words on white paper, 0…1."""
     generator = np.random.default_rng(seed)
     tile = np.ones((size, size), np.float32)
     for top in range(8, size - 20, 28):

@@ -58,13 +58,11 @@ def check_conformance(stage: Gantry) -> Iterator[Check]:
 
 
 def _settings(stage: Gantry) -> Check:
-    """Check that no setting needs to be changed."""
     warnings = stage.identify().warnings
     return Check("settings", not warnings, "; ".join(warnings) or "nothing to change", "nothing to change")
 
 
 def _homing(stage: Gantry) -> Check:
-    """Check that homing ends well within its bound."""
     bound_s = stage.identify().homing_bound_s
     taken_s = stage.home().duration_s
     return Check("homing", taken_s < bound_s / 1.5, f"{taken_s:.1f} s", f"< {bound_s / 1.5:.0f} s")
@@ -109,7 +107,6 @@ def _arrival(stage: Gantry) -> Check:
 
 
 def _report_rate(stage: Gantry) -> Check:
-    """Check that positions are reported often enough to follow a motion."""
     started_s = stage.clock.now_s()
     for _ in range(_REPORTS):
         stage.position()

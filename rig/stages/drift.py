@@ -121,7 +121,6 @@ class DriftWatch:
                 return
 
     def _measure(self) -> None:
-        """Measure time and speed of homing."""
         for axis in self._homing_axes():
             near_s = self._time_homing_well(axis, 0.5 * _RUN_UP_MM)
             far_s = self._time_homing_well(axis, _RUN_UP_MM)
@@ -175,7 +174,6 @@ class DriftWatch:
         return Drift(tuple(most), self._limit_mm), Drift(tuple(least), self._limit_mm)
 
     def _takes_the_usual_time(self) -> bool:
-        """Return whether homing takes the usual time, now that the count is right again."""
         return all(drift.passed for drift in self._measure_drift())
 
     def _require_switches_within_reach(self) -> None:
@@ -194,16 +192,13 @@ class DriftWatch:
             )
 
     def _homing_axes(self) -> tuple[AxisIndex | None, ...]:
-        """Return the arguments of `home` that have to be timed."""
         return (None,) if self._stage.identify().homes_together else (0, 1)
 
     def _time_homing(self, axis: AxisIndex | None, distance_mm: float) -> AnswerTime:
-        """Return the time of homing from `distance_mm` away from where it ends."""
         self._stage.move_to(*self._inward_point(distance_mm))
         return self._stage.home(axis).time
 
     def _time_homing_well(self, axis: AxisIndex | None, distance_mm: float) -> float:
-        """Return the time of homing whose end was read without delay."""
         for _ in range(_MAX_TIMINGS):
             time = self._time_homing(axis, distance_mm)
             if time.late_s == 0.0:
@@ -232,7 +227,6 @@ class DriftWatch:
             raise self._drift_failure(f"the switch of {axes} is closed more than {self._limit_mm:g} mm early")
 
     def _homing_speed(self, difference_s: float) -> float:
-        """Return the homing speed from the time that half the run-up takes."""
         if difference_s <= 0.0:
             raise PlanRefused(
                 "homing takes no longer from farther away, so its time shows no drift; set check = false in [drift]"
@@ -246,13 +240,11 @@ class DriftWatch:
         return speed
 
     def _mark_doubtful(self) -> tuple[object, ...]:
-        """Mark what is unchecked as doubtful, and return it."""
         doubtful, self._unchecked = self.unchecked, []
         self._doubtful.extend(doubtful)
         return doubtful
 
     def _drift_failure(self, why: str) -> PositionDrifted:
-        """Return the exception with what is suspect, which becomes doubtful."""
         suspect = self._mark_doubtful()
         return PositionDrifted(
             f"the stage has lost its scale: {why}; {len(suspect)} positions since the last passed check are suspect: "

@@ -243,7 +243,6 @@ class Gantry:
             self._controller.close()
 
     def _require_trust(self, target: Point) -> None:
-        """Raise `NotHomed` unless reported positions can be trusted."""
         if not self._trusted:
             raise NotHomed(f"the stage's position is not known, so it is not sent to {target}; home it first")
 
@@ -259,11 +258,9 @@ class Gantry:
         return point
 
     def _report(self, point: Point) -> Position:
-        """Return `point` with its tolerance and whether it can be trusted."""
         return Position(point, self.identify().tolerance_mm, self._trusted)
 
     def _distrust(self) -> None:
-        """Forget the position of the stage."""
         self._trusted, self._here = False, None
 
     @contextmanager

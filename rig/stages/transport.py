@@ -99,7 +99,6 @@ class SerialPort:
 
     @contextmanager
     def _reported_as_lost(self) -> Iterator[None]:
-        """Raise `StageLost` for what pyserial raises on a lost connection."""
         try:
             yield
         except (OSError, TypeError) as failure:  # pyserial's own is an OSError; a closed port raises a TypeError
@@ -204,7 +203,6 @@ class LineTransport:
             yield line
 
     def _log(self, direction: Direction, data: bytes) -> None:
-        """Record `data`, if there is a log."""
         if self._traffic is not None:
             self._traffic.record(self.clock.now_s(), direction, data)
 

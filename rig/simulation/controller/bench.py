@@ -89,7 +89,6 @@ class DirectLink:
         self._plugged = False
 
     def _require_plug(self) -> None:
-        """Raise `StageLost` as a port does when its cable is unplugged."""
         if not self._plugged:
             raise StageLost("simulated: the connection is lost (unplugged); check cable and power")
 

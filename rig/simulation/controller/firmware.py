@@ -98,8 +98,6 @@ class SimulatedFirmware(ABC):
         """React to the end of the last motion."""
 
     def _start_homing(self, duration_s: float, finish: Callable[[], None]) -> None:
-        """Call `finish` when homing ends."""
-
         def end() -> None:
             self._homing = None
             finish()
@@ -107,7 +105,6 @@ class SimulatedFirmware(ABC):
         self._homing = self.clock.after(self.homing_slowdown * duration_s, end)
 
     def _cancel_homing(self) -> None:
-        """Interrupt homing."""
         if self._homing is not None:
             self._homing.cancel()
             self._homing = None

@@ -51,11 +51,9 @@ class SimulatedGrbl(GrblStates):
 
     @staticmethod
     def _stored(changes: dict[int, str]) -> StoredSettings:
-        """Return the settings in the controller's memory."""
         return StoredSettings(changes)
 
     def _take(self, byte: int) -> None:
-        """Take one ordinary byte; bytes beyond the receive buffer are lost."""
         if byte in b"\r\n":
             self._waiting.append(self._line.decode("ascii", errors="replace"))
             self._line.clear()
@@ -63,7 +61,6 @@ class SimulatedGrbl(GrblStates):
             self._line.append(byte)
 
     def _run_lines(self) -> None:
-        """Run waiting lines while the planner has room."""
         while self._waiting and not self._deaf() and self._homing is None:
             if self.mechanics.queued() > _PLANNER_BLOCKS:
                 return
@@ -84,7 +81,6 @@ class SimulatedGrbl(GrblStates):
         return self._gcode(line)
 
     def _system(self, line: str) -> int | None:
-        """Run a `$` command."""
         if line == "$X":
             if self.state == "Alarm":
                 self.say("[MSG:Caution: Unlocked]")
@@ -103,7 +99,6 @@ class SimulatedGrbl(GrblStates):
         return 0
 
     def _jog(self, text: str) -> int:
-        """Run a jog."""
         if self.state not in ("Idle", "Jog"):
             return 9
         if error := jog_error(text):
@@ -116,7 +111,6 @@ class SimulatedGrbl(GrblStates):
         return 0
 
     def _gcode(self, line: str) -> int:
-        """Run G0, G1 or G92, the only G-code that a stage may receive."""
         parsed = words(line)
         if re.search(r"G92(?!\d)", line):
             here = self.mechanics.planned_mm()
@@ -135,7 +129,6 @@ class SimulatedGrbl(GrblStates):
         return 0
 
     def _target(self, axis_words: dict[str, float], *, relative: bool, machine: bool) -> tuple[float, float]:
-        """Return the machine position of axis words; an axis without a word stays."""
         values = []
         for axis, here, offset in zip("XY", self.mechanics.planned_mm(), self.work_offset, strict=False):
             base = here if relative else 0.0 if machine else offset
@@ -143,7 +136,6 @@ class SimulatedGrbl(GrblStates):
         return values[0], values[1]
 
     def _queue(self, target: Vector, feed_mm_per_min: float, state: str) -> None:
-        """Plan a straight motion, which puts GRBL into `state`."""
         start = self.mechanics.planned_mm()
         self.mechanics.queue(target, *self.settings.speed_and_acceleration(start, target, feed_mm_per_min))
         self.state = state if self.mechanics.moving else "Idle"
@@ -162,7 +154,6 @@ class SimulatedGrbl(GrblStates):
         return None
 
     def _homed(self, axes: Sequence[int]) -> None:
-        """End homing: the axes stand pulled off their switches, which are zero."""
         for axis in axes:
             self.mechanics.set_homed(axis, -self.settings.number(27), -self.settings.number(27))
         self.state = "Idle"

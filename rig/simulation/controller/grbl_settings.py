@@ -101,5 +101,4 @@ def status_report(
 
 
 def _vector(values: Sequence[float]) -> str:
-    """Return numbers as GRBL prints them."""
     return ",".join(f"{value:.3f}" for value in values)

@@ -55,7 +55,6 @@ class GrblStates(SimulatedFirmware):
         super().__init__(clock, wire, mechanics, boot_s)
 
     def _reset_state(self) -> None:
-        """Lose the work offset, and ignore the host until the banner."""
         self.work_offset, self._reports_to_offset = (0.0, 0.0, 0.0), 0
         self.state, self.critical, self._accepts_reset = "Boot", False, True
         self._held: list[Vector] = []
@@ -104,23 +103,19 @@ class GrblStates(SimulatedFirmware):
             self._greet()
 
     def _booted(self) -> None:
-        """Finish the restart, locked if homing is enabled."""
         self.state = "Alarm" if self.settings.number(22) else "Idle"
         self._greet()
 
     def _greet(self) -> None:
-        """Send the banner, and the message about the lock if there is one."""
         self.say("Grbl 1.1h ['$' for help]")
         if self.state == "Alarm":
             self.say("[MSG:'$H'|'$X' to unlock]")
 
     def _ask_for_reset(self) -> None:
-        """Accept a reset from now on, as a critical alarm needs."""
         self.say("[MSG:Reset to continue]")
         self._accepts_reset = True
 
     def _reset(self) -> None:
-        """Handle the reset character, which also forgets a motion on hold."""
         if not self._accepts_reset:
             return
         self._held.clear()
@@ -140,14 +135,12 @@ class GrblStates(SimulatedFirmware):
             self.open_door()
 
     def _hold(self) -> None:
-        """Handle the feed-hold character: a jog is cancelled, other motion pauses."""
         if self.state == "Jog":
             self._cancel_jog()
         elif self.state == "Run":
             self.pause()
 
     def _cancel_jog(self) -> None:
-        """Handle the jog-cancel character."""
         if self.state == "Jog":
             self.mechanics.brake()
 
@@ -164,19 +157,16 @@ class GrblStates(SimulatedFirmware):
         self._held = self.mechanics.brake() or self._held
 
     def _motion_ended(self) -> None:
-        """Update the state at the end of the last motion."""
         self.state = {"Hold:1": "Hold:0", "Door:2": "Door:1"}.get(self.state, self.state)
         if self.state in ("Jog", "Run"):
             self.state = "Idle"
         self._run_lines()
 
     def _switch_hit(self) -> None:
-        """Raise the hard-limit alarm, if hard limits are enabled."""
         if self.settings.number(21):
             self.alarm(1)
 
     def _report(self) -> None:
-        """Answer a status request, except while homing and after a critical alarm."""
         if self._deaf() or self.state == "Home":
             return
         tell_offset = self._reports_to_offset == 0
@@ -189,15 +179,12 @@ class GrblStates(SimulatedFirmware):
         self.say(status_report(self._told_state(), here, self.work_offset, self._pins(), is_machine, tell_offset))
 
     def _told_state(self) -> str:
-        """Return the state as reports tell it."""
         return self.state
 
     def _pins(self) -> str:
-        """Return the letters of the active inputs."""
         return "".join(axis for axis, closed in zip("XY", self.mechanics.switches(), strict=True) if closed)
 
     def _resume(self) -> None:
-        """Handle the resume character: what was held goes on."""
         if self.state not in ("Hold:0", "Door:0"):
             return
         self.state = "Idle"

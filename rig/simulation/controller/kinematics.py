@@ -232,14 +232,12 @@ class Mechanics:
         self._commanded = tuple(values)
 
     def _start_next(self) -> None:
-        """Start the next motion of the queue."""
         target, speed, acceleration = self._queue.pop(0)
         length = math.dist(self._commanded, target)
         profile = Profile.rest_to_rest(length, speed, acceleration) if length else Profile(())
         self._begin(Motion(self._commanded, target, profile, acceleration, self.clock.now_s()))
 
     def _begin(self, motion: Motion) -> None:
-        """Start `motion`, and schedule its end and its first contact with a switch."""
         self._end_motion()
         self._motion = motion
         self._events = [] if self.endless else [self.clock.after(motion.profile.duration_s, self._finish)]
@@ -258,7 +256,6 @@ class Mechanics:
         return high
 
     def _contact_at(self, commanded: Vector) -> bool:
-        """Return whether a switch would be closed at a commanded position."""
         sign = 1.0 if self.switch_at_high_end else -1.0
         return any(
             not axis.stuck and sign * (value + axis.slip_mm - switch) >= -1e-9
@@ -266,7 +263,6 @@ class Mechanics:
         )
 
     def _finish(self) -> None:
-        """End the motion, and start the next or become idle."""
         assert self._motion is not None
         self._commanded = self._motion.end
         self._motion, self._events = None, []
@@ -278,7 +274,6 @@ class Mechanics:
             self.on_idle()
 
     def _end_motion(self) -> None:
-        """End the motion at its present position."""
         self._commanded = self.commanded_mm()
         self._motion = None
         for event in self._events:

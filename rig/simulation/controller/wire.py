@@ -134,14 +134,12 @@ class Wire:
         self._free_at_s = 0.0
 
     def _arrive(self, data: bytes) -> None:
-        """Deliver `data` to the host, if the cable is plugged in."""
         del self._under_way[0]
         if self.connected:
             self._arrived += _filtered(data, self.filters_to_host)
 
 
 def _filtered(data: bytes, filters: list[ByteFilter]) -> bytes:
-    """Return `data` after all filters."""
     for apply in tuple(filters):
         data = apply(data)
     return data

@@ -182,7 +182,6 @@ class GrblConnection:
         return message
 
     def _note(self, message: Message) -> None:
-        """Update the attributes from a message."""
         if isinstance(message, Report) and message.offset is not None:
             self.offset = message.offset
         elif isinstance(message, Banner):
@@ -192,7 +191,6 @@ class GrblConnection:
             self.count_lost = self.count_lost or message.code != SOFT_LIMIT_ALARM
 
     def _await_banner(self, within_s: float) -> bool:
-        """Return whether the controller reports a start within `within_s`."""
         for text in self._line.lines_until(self._clock.now_s() + within_s):
             _refuse_other_firmware(text)
             message = parse(text)
@@ -203,6 +201,5 @@ class GrblConnection:
 
 
 def _refuse_other_firmware(text: str) -> None:
-    """Raise `WrongFirmware` for a line that only other firmware sends."""
     if re.search(r"marlin|echo:unknown command|^start$", text, re.IGNORECASE):
         raise WrongFirmware(f"the controller answers as Marlin ({text[:60]!r}); use protocol 'marlin'")

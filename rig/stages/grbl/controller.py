@@ -126,7 +126,6 @@ class GrblController:
         self._grbl.close()
 
     def _unlock_if_kept(self, point: Point) -> bool:
-        """Clear the lock if the alarm kept the position; return whether it did."""
         # A controller that has restarted unseen reports zero.
         if self._grbl.alarm != SOFT_LIMIT_ALARM or self._grbl.count_lost or point == (0.0, 0.0):
             return False
@@ -135,7 +134,6 @@ class GrblController:
         return True
 
     def _jog_command(self, modes: str, point: Point, feed_mm_per_s: float) -> str:
-        """Return the jog command to `point`."""
         x, y = self._axes
         return f"$J={modes} {x}{point.x_mm:.3f} {y}{point.y_mm:.3f} F{60.0 * feed_mm_per_s:.1f}"
 
@@ -164,7 +162,6 @@ class GrblController:
         )
 
     def _machine_point(self, report: Report) -> Point:
-        """Return the machine position of `report`, adding the offset to a work position."""
         values = report.position
         if not report.is_machine:
             offset = self._grbl.offset
@@ -178,13 +175,11 @@ class GrblController:
         return Point(*(values[index] for index in self._index))
 
     def _await_offset(self) -> None:
-        """Poll until a work offset is reported, if positions are work positions."""
         for _ in range(_MAX_REPORTS_TO_OFFSET):
             if self._grbl.poll().is_machine or self._grbl.offset is not None:
                 return
         raise WrongFirmware("work positions are reported without their offset; set $10=1 for machine positions")
 
     def _read_settings(self) -> dict[int, str]:
-        """Return the `$` settings by number."""
         messages = self._grbl.command("$$")
         return {message.number: message.value for message in messages if isinstance(message, GrblSetting)}

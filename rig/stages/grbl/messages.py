@@ -91,7 +91,6 @@ def parse(line: str) -> Message:
 
 
 def _report(match: re.Match[str]) -> Report:
-    """Return the status report of a match."""
     state, substate, frame, position, fields = match.groups()
     offset, pins = _OFFSET.search(fields), _PINS.search(fields)
     return Report(
@@ -105,7 +104,6 @@ def _report(match: re.Match[str]) -> Report:
 
 
 def _vector(text: str) -> tuple[float, ...]:
-    """Return the numbers of a comma-separated list."""
     return tuple(float(number) for number in text.split(","))
 
 

@@ -54,14 +54,12 @@ def bring_to_rest(grbl: GrblConnection, clock: Clock, within_s: float) -> Report
 
 
 def _is_same(report: Report | None, last: Report | None) -> bool:
-    """Return whether two reports show the same state and position."""
     if report is None or last is None:
         return False
     return (report.state, report.position) == (last.state, last.position)
 
 
 def _is_moving(report: Report) -> bool:
-    """Return whether the stage moves or slows down."""
     return report.state in ("Jog", "Run") or (report.state, report.substate) in (("Hold", 1), ("Door", 2), ("Door", 3))
 
 

@@ -71,14 +71,12 @@ class GrblSettings(Struct, frozen=True):
         )
 
     def _refuse_unsafe(self) -> None:
-        """Raise for settings under which positions cannot be known."""
         if not int(self._number(22)) & 1:
             raise WrongFirmware("$22=0: the controller has no homing, so its position cannot be known; set $22=1")
         if self._number(13) != 0:
             raise WrongFirmware("$13=1: positions are reported in inches; set $13=0")
 
     def _warnings(self) -> list[str]:
-        """Return settings that should be changed, each with its remedy."""
         warnings = []
         if self._number(20) == 0:
             warnings.append("$20=0: the controller itself does not keep to its travel; set $20=1")
@@ -116,7 +114,6 @@ class GrblSettings(Struct, frozen=True):
         return self.build.get("FIRMWARE") == "grblHAL" or _HAL_SETTING in self.values
 
     def _options(self) -> str:
-        """Return the letters of the compile-time options."""
         return self.build.get("OPT", "").partition(",")[0]
 
     def _number(self, setting: int) -> float:

@@ -140,7 +140,6 @@ class MarlinController:
         self._line.close()
 
     def _discard_input(self) -> None:
-        """Ignore all lines for a moment."""
         for _ in self._line.lines_until(self._clock.now_s() + _DISCARD_S):
             pass
 
@@ -178,7 +177,6 @@ class MarlinController:
         return answered
 
     def _new_marker(self) -> str:
-        """Return a word that was not used before, for the controller to echo."""
         self._markers += 1
         return f"faintfield-{self._markers}."
 
@@ -195,12 +193,10 @@ class MarlinController:
                 deadline_s = min(self._clock.now_s() + _QUIET_S, last_s)
 
     def _read_settings(self) -> list[marlin.Message]:
-        """Return the messages about settings and limits."""
         messages = [*self._command("M503"), *self._command("M211")]
         return [message for message in messages if isinstance(message, marlin.MarlinSetting | marlin.Limits)]
 
     def _command(self, command: str, bound_s: float = _ANSWER_S) -> list[marlin.Message]:
-        """Send one command, again if it arrives damaged, and return the messages before its `ok`."""
         for text in self._line.lines_until(self._clock.now_s()):
             self._check(marlin.parse(text), command)
         self._line_number += 1
@@ -240,7 +236,6 @@ class MarlinController:
         )
 
     def _check(self, message: marlin.Message, command: str) -> None:
-        """Raise for a message that the controller has restarted or stopped."""
         if isinstance(message, marlin.Start):
             raise restart_failure()
         if isinstance(message, marlin.Resend) and message.number != self._line_number:

@@ -80,7 +80,6 @@ class MarlinSettings:
         return configured
 
     def _warnings(self) -> list[str]:
-        """Return settings that should be changed, each with its remedy."""
         warnings = []
         if not self._limits:
             warnings.append(
@@ -95,7 +94,6 @@ class MarlinSettings:
         return 0.5 / self._number("M92", axis) + _ROUNDING_MM
 
     def _as_text(self) -> dict[str, str]:
-        """Return the parameters as text, by command."""
         return {
             command: " ".join(f"{letter}{value:g}" for letter, value in parameters.items())
             for command, parameters in sorted(self._parameters.items())

@@ -175,12 +175,10 @@ class MicroManagerController:
             self._release()
 
     def _release(self) -> None:
-        """Let the devices go."""
         with suppress(TimeoutError, RuntimeError):  # any fault was already raised when the stage was used
             result_within(self._options.answer_s, lambda: self._shared.release("stage"), "stage")
 
     def _load(self) -> tuple[Any, str]:
-        """Load the configuration, find the stage and set its properties; return the core and the stage's label."""
         core = self._shared.acquire("stage")
         label = self._options.device or core.getXYStageDevice()
         stages = core.getLoadedDevicesOfType(_XY_STAGE)
@@ -194,21 +192,17 @@ class MicroManagerController:
         return core, label
 
     def _describe(self) -> tuple[str, dict[str, str]]:
-        """Return the name of the stage, and those of its properties that can be set."""
         core, label = self._core, self._label
         name = f"Micro-Manager {core.getDeviceLibrary(label)} {core.getDeviceName(label)} ({core.getVersionInfo()})"
         names = [prop for prop in core.getDevicePropertyNames(label) if not core.isPropertyReadOnly(label, prop)]
         return name, {prop: core.getProperty(label, prop) for prop in names}
 
     def _home(self, bound_s: float) -> None:
-        """Home and wait."""
         core = self._core
         core.home(self._label)
         self._wait(core, bound_s)
 
     def _move(self, function: str, point: Point, bound_s: float) -> None:
-        """Call a function of the core that moves the stage, and wait until the adapter says that it has ended."""
-
         def work() -> None:
             core = self._core
             getattr(core, function)(self._label, _UM_PER_MM * point.x_mm, _UM_PER_MM * point.y_mm)
@@ -217,7 +211,6 @@ class MicroManagerController:
         self._run(work, bound_s + self._options.answer_s, f"moving to {point}", waits_s=bound_s)
 
     def _wait(self, core: Any, bound_s: float) -> None:
-        """Wait until the adapter is no longer busy."""
         usual_ms = core.getTimeoutMs()  # the camera's too
         core.setTimeoutMs(math.ceil(1e3 * bound_s))
         try:
@@ -226,7 +219,6 @@ class MicroManagerController:
             core.setTimeoutMs(usual_ms)
 
     def _report(self) -> Point:
-        """Return the reported position."""
         x_um, y_um = self._run(lambda: self._core.getXYPosition(self._label), self._options.answer_s, "its report")
         return Point(x_um / _UM_PER_MM, y_um / _UM_PER_MM)
 
@@ -239,7 +231,6 @@ class MicroManagerController:
         return self._bounded(call, bound_s, what, waits_s)
 
     def _require_connection(self) -> None:
-        """Raise `StageLost` unless the stage is connected."""
         if self._core is None:
             raise StageLost("the stage is not connected; connect it first")
 
