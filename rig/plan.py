@@ -10,9 +10,8 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from faintfield.rig.stages.motion import one_sided_path, path_duration_s
+from faintfield.rig.stages.motion import StageWorkspace, one_sided_path, path_duration_s
 from faintfield.rig.stages.protocol import MotionLimits, Point
-from faintfield.rig.stages.workspace import StageWorkspace
 
 
 def grid_nodes(rows: int, columns: int) -> list[tuple[int, int]]:

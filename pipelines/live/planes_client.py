@@ -29,7 +29,7 @@ from faintfield.pipelines.live.planes_messages import (
     is_picture_name,
     plane_of,
 )
-from faintfield.rig.session.regular_files import read_regular
+from faintfield.rig.files import read_regular
 
 _MODULE = "faintfield.pipelines.live.planes_process"
 

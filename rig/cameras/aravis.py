@@ -5,8 +5,7 @@ from contextlib import suppress
 
 from faintfield.rig.cameras.aravis_device import AravisDevice
 from faintfield.rig.cameras.aravis_library import AravisError, AravisLibrary
-from faintfield.rig.cameras.bounded import call_within
-from faintfield.rig.cameras.protocol import CameraReport, Exposure
+from faintfield.rig.cameras.protocol import CameraReport, Exposure, call_within
 from faintfield.rig.cameras.settings import AravisSettings
 from faintfield.rig.errors import CameraError, CameraTimeout, in_one_line
 

@@ -6,8 +6,7 @@ from functools import partial
 from pathlib import PurePath
 from typing import Any
 
-from faintfield.rig.cameras.bounded import call_within
-from faintfield.rig.cameras.protocol import CameraReport, Exposure
+from faintfield.rig.cameras.protocol import CameraReport, Exposure, call_within
 from faintfield.rig.cameras.settings import GPhoto2Settings
 from faintfield.rig.errors import CameraError, CameraTimeout, MissingExtra
 

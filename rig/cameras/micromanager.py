@@ -5,8 +5,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from faintfield.rig.cameras.bounded import call_within
-from faintfield.rig.cameras.protocol import CameraReport, Exposure, Metadata
+from faintfield.rig.cameras.protocol import CameraReport, Exposure, Metadata, call_within
 from faintfield.rig.cameras.settings import MicroManagerSettings
 from faintfield.rig.errors import CameraError, CameraTimeout, MissingExtra, in_one_line
 from faintfield.rig.micromanager import NotOffered, PackageMissing, SharedCore, set_properties

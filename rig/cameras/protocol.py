@@ -8,6 +8,9 @@ from typing import Any, Protocol, runtime_checkable
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from faintfield.rig.clock import result_within
+from faintfield.rig.errors import CameraTimeout
+
 type Pixels = NDArray[Any]
 type Metadata = Mapping[str, str | int | float | Sequence[float] | None]
 
@@ -109,3 +112,23 @@ class Thermometer(Protocol):
 
     def temperature_c(self) -> float | None:
         """Return the temperature in °C, None if this camera has no sensor for it."""
+
+
+def call_within[T](bound_s: float, call: Callable[[], T], what: str) -> T:
+    """Return the result of `call`, or raise `CameraTimeout` if there is none within `bound_s`; see `result_within`.
+
+    Parameters
+    ----------
+    bound_s : float
+        Time limit in seconds of real time, even if the rig's clock is simulated.
+    call : callable
+        The call that may hang.
+    what : str
+        What the call does, for the message.
+    """
+    try:
+        return result_within(bound_s, call, "camera")
+    except TimeoutError as failure:
+        raise CameraTimeout(
+            f"the camera did not finish {what} within {bound_s:g} s; check its cable and battery, switch it off and on"
+        ) from failure

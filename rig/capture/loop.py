@@ -2,15 +2,16 @@
 
 import msgspec
 
+from faintfield.rig.cameras.protocol import Decode
 from faintfield.rig.capture.guide import MAX_UNATTENDED_TRIES, Answer, Dialogue, OperatorInterface, Prompt, step_prompt
 from faintfield.rig.capture.pace import Pace
 from faintfield.rig.capture.survey import check_plan
-from faintfield.rig.capture.take import Decode, DriftChecks, FrameTaker
+from faintfield.rig.capture.take import DriftChecks, FrameTaker
 from faintfield.rig.devices import Rig
 from faintfield.rig.errors import CameraError, DriftUnknown, NotHomed, PlanRefused, PositionDrifted, StageError
 from faintfield.rig.plan import PlannedFrame
 from faintfield.rig.session.homings import begin_group, unchecked_frames
-from faintfield.rig.session.journal import CommittedFrame, Suspect
+from faintfield.rig.session.journal import Suspect
 from faintfield.rig.session.session import Session
 from faintfield.rig.stages.drift import recover
 
@@ -94,15 +95,12 @@ class Capture:
         frames = [frame for frame in missing if frame.step == first.step]
         self._dialogue.show_status(first, "waiting for your answer")
         duration_s = self._pace.remaining_s(frames, 0)
-        answer = self._dialogue.ask(
-            step_prompt(first, first.step + 1, len(session.plan.steps), len(frames), duration_s)
-        )
+        prompt = step_prompt(first, first.step + 1, len(session.plan.steps), len(frames), duration_s)
+        answer = self._dialogue.ask_or_stop(prompt)
         if answer == "skip":
             for frame in frames:
                 session.skip(frame)
             return
-        if answer == "stop":
-            self._dialogue.stop()
         self._rig.arrange(first.kind, first.sweep)
         for frame, following in zip(frames, [*frames[1:], None], strict=True):
             if frame not in session.skipped():
@@ -121,7 +119,9 @@ class Capture:
             try:
                 self._drift.check_after(nodes)
             except DriftUnknown as failure:
-                self._handle_untimed_check(failure)
+                self._untimed_checks += 1
+                reason = "taken before a check of the stage that says nothing"
+                self._drift.ask_to_retake(failure, "Drift could not be checked", self._untimed_checks, reason)
             except (StageError, NotHomed, PlanRefused) as failure:
                 if self._handle_failure(frame, failure) == "again":
                     continue
@@ -129,19 +129,6 @@ class Capture:
                 if self._drift.watch is not None and not self._drift.watch.unchecked:
                     self._untimed_checks = 0
             return
-
-    def _handle_untimed_check(self, failure: DriftUnknown) -> None:
-        doubtful = [frame for frame in failure.suspect if isinstance(frame, CommittedFrame)]
-        self._session.journal.event("suspect", message=str(failure), intents=[frame.intent for frame in doubtful])
-        self._dialogue.warn(str(failure))
-        self._untimed_checks += 1
-        unattended: Answer = "retake" if self._untimed_checks < MAX_UNATTENDED_TRIES else "stop"
-        answers: tuple[Answer, ...] = ("retake", "keep", "stop")
-        answer = self._dialogue.ask(Prompt("drift", "Drift could not be checked", (str(failure),), answers, unattended))
-        if answer == "stop":
-            self._dialogue.stop()
-        if answer == "retake":
-            self._session.void(doubtful, "taken before a check of the stage that says nothing")
 
     def _take(self, frame: PlannedFrame) -> None:
         self._failures = 0
@@ -162,12 +149,13 @@ class Capture:
             return
         self._session.journal.event("wish", frame=frame.number, wish=request)
         choice: str = request
+        if request == "stop":
+            self._dialogue.stop()
         if request == "pause":
             self._dialogue.show_status(frame, "paused")
             lines = (f"The next frame is {frame.name}.",)
-            choice = self._dialogue.ask(Prompt("paused", "Paused", lines, ("go", "retake", "skip", "stop"), "go"))
-        if choice == "stop":
-            self._dialogue.stop()
+            prompt = Prompt("paused", "Paused", lines, ("go", "retake", "skip", "stop"), "go")
+            choice = self._dialogue.ask_or_stop(prompt)
         if choice == "skip":
             self._session.skip(frame)
         if choice == "retake" and self._taker.last is not None:
@@ -234,9 +222,7 @@ class Capture:
         if not skipped:
             return []
         lines = (f"{len(skipped)} frames were skipped, the first is {skipped[0].name}.",)
-        answer = self._dialogue.ask(Prompt("skipped", "Skipped frames", lines, ("again", "keep", "stop"), "stop"))
-        if answer == "stop":
-            self._dialogue.stop()
-        if answer == "again":
+        prompt = Prompt("skipped", "Skipped frames", lines, ("again", "keep", "stop"), "stop")
+        if self._dialogue.ask_or_stop(prompt) == "again":
             self._session.unskip()
         return self._session.missing()

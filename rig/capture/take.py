@@ -1,21 +1,20 @@
 """Take one frame, and check for drift: move, rest, verify the position, expose, write, check and commit."""
 
 import itertools
+from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import msgspec
 
-from faintfield.rig.cameras.protocol import Decode as Decode  # the loop takes it from here
-from faintfield.rig.cameras.protocol import Pixels
+from faintfield.rig.cameras.protocol import Decode, Exposure, Pixels
 from faintfield.rig.capture.checks import LIT_KINDS, Findings, board_warnings, check_frame
 from faintfield.rig.capture.guide import MAX_UNATTENDED_TRIES, Answer, Dialogue, Prompt
-from faintfield.rig.capture.layout import LayoutCheck
 from faintfield.rig.capture.pace import Pace
 from faintfield.rig.capture.settling import Settling, measure_settling
 from faintfield.rig.capture.temperature import TemperatureWait
 from faintfield.rig.devices import Rig
-from faintfield.rig.errors import CameraError, PositionDrifted
+from faintfield.rig.errors import CameraError, DriftUnknown, PositionDrifted
 from faintfield.rig.plan import PlannedFrame
 from faintfield.rig.session.journal import CommittedFrame, FrameRecord
 from faintfield.rig.session.session import Session
@@ -40,6 +39,8 @@ class DriftChecks:
     ----------
     watch : DriftWatch or None
         Measures the drift; None if `drift.check` is off.
+    nodes : int
+        Number of nodes that the stage moved to since the last check.
     """
 
     def __init__(self, session: Session, rig: Rig, dialogue: Dialogue, pace: Pace) -> None:
@@ -48,7 +49,7 @@ class DriftChecks:
         self._rig = rig
         self._dialogue = dialogue
         self._pace = pace
-        self._nodes = 0
+        self.nodes = 0
         self._failures = 0
         self.watch = DriftWatch(rig.stage, limit_mm=settings.limit_mm) if settings.check else None
 
@@ -62,10 +63,6 @@ class DriftChecks:
         self.watch.check()
         self._pace.check_s = self._rig.clock.now_s() - begun_s
 
-    def count_node(self) -> None:
-        """Note that the stage moved to a node."""
-        self._nodes += 1
-
     def add(self, frame: CommittedFrame) -> None:
         """Note that a frame relies on the position of the stage."""
         if self.watch is not None:
@@ -73,32 +70,35 @@ class DriftChecks:
 
     def check_after(self, nodes: int) -> None:
         """Check for drift if at least `nodes` nodes were visited since the last check; 0 means no check."""
-        if self.watch is None or nodes == 0 or self._nodes < nodes or not self.watch.unchecked:
+        if self.watch is None or nodes == 0 or self.nodes < nodes or not self.watch.unchecked:
             return
-        self._nodes = 0
+        self.nodes = 0
         self._pace.here = None
         try:
             drift = self.watch.check()
         except PositionDrifted as failure:
-            self._handle_drift(failure)
+            self._failures += 1
+            self.ask_to_retake(failure, "The stage lost its scale", self._failures, "taken from a doubtful position")
+            self._rig.stage.recover()
+            self.begin()
         else:
             self._session.journal.event("drift_check", away_mm=drift.away_mm)
 
-    def _handle_drift(self, failure: PositionDrifted) -> None:
+    def ask_to_retake(self, failure: PositionDrifted | DriftUnknown, title: str, failures: int, reason: str) -> None:
+        """Record which frames are suspect, and ask whether to take them again; stop unattended captures at last.
+
+        Raises
+        ------
+        CaptureStopped
+            The operator asked for it.
+        """
         suspect = [frame for frame in failure.suspect if isinstance(frame, CommittedFrame)]
         self._session.journal.event("suspect", message=str(failure), intents=[frame.intent for frame in suspect])
         self._dialogue.warn(str(failure))
-        self._failures += 1
-        unattended: Answer = "retake" if self._failures < MAX_UNATTENDED_TRIES else "stop"
-        answer = self._dialogue.ask(
-            Prompt("drift", "The stage lost its scale", (str(failure),), ("retake", "keep", "stop"), unattended)
-        )
-        if answer == "stop":
-            self._dialogue.stop()
-        if answer == "retake":
-            self._session.void(suspect, "taken from a doubtful position")
-        self._rig.stage.recover()
-        self.begin()
+        unattended: Answer = "retake" if failures < MAX_UNATTENDED_TRIES else "stop"
+        prompt = Prompt("drift", title, (str(failure),), ("retake", "keep", "stop"), unattended)
+        if self._dialogue.ask_or_stop(prompt) == "retake":
+            self._session.void(suspect, reason)
 
 
 # Exposures that are not kept are numbered from here, beyond the number of any frame.
@@ -139,9 +139,9 @@ class FrameTaker:
         self._drift = drift
         self._pace = pace
         self._decode = decode
-        self._layouts = LayoutCheck(session, decode)
         self._temperature = TemperatureWait(session, rig, dialogue)
         self._settle_s: float | None = None
+        self._layouts: dict[str, str | None] = {}
         self._unkept_numbers = itertools.count(_FIRST_UNKEPT_NUMBER)
         self.last: PlannedFrame | None = None
 
@@ -173,7 +173,7 @@ class FrameTaker:
             return
         self._pace.depart()
         self._rig.stage.move_to(*target)
-        self._drift.count_node()
+        self._drift.nodes += 1
         measures = self._settle_s is None and frame.kind in LIT_KINDS
         if measures:
             self._settle_s = self._find_settling(frame)
@@ -191,21 +191,43 @@ class FrameTaker:
         rig.stage.verify_at(*frame.stop.target)
         written = session.write(frame, intent, exposure)
         try:
-            pixels = self._layouts.pixels_of(frame, written.path, exposure)
+            pixels = self._decoded(frame, written.path, exposure)
         except CameraError as failure:
             session.reject(frame, written, str(failure))
             raise
-        found = self._check(frame, pixels)
-        record = FrameRecord(position.point, frame.exposure_s, dict(exposure.metadata), found.values, found.warnings)
+        findings = self._check(frame, pixels)
+        record = FrameRecord(
+            position.point, frame.exposure_s, dict(exposure.metadata), findings.values, findings.warnings
+        )
         self._drift.add(session.commit(frame, written, record))
         self.last = frame
-        if found.warnings:
-            self._dialogue.warnings = tuple(f"{frame.name}: {warning}" for warning in found.warnings)
+        if findings.warnings:
+            self._dialogue.warnings = tuple(f"{frame.name}: {warning}" for warning in findings.warnings)
         if frame.kind == "charuco":
             self._check_boards(frame)
         self._pace.finish_frame(begun_s, frame.exposure_s)
         if pixels is not None:
-            self._dialogue.operator.show_frame(frame, pixels, found.values)
+            self._dialogue.operator.show_frame(frame, pixels, findings.values)
+
+    def _decoded(self, frame: PlannedFrame, path: Path, exposure: Exposure) -> Pixels | None:
+        """Return the pixels of a frame, None if it cannot be decoded here; its layout must be that of the session."""
+        pixels = exposure.pixels if exposure.pixels is not None else self._decode(path)
+        layout = self._layouts[path.name] = _layout(pixels)
+        others = self._session.valid().keys() - {frame.number}  # a frame is not compared with an earlier take of it
+        first = self._session.valid()[min(others)] if others else None
+        expected = None if first is None else self._layout_of(first)
+        if first is not None and expected is not None and layout != expected:
+            raise CameraError(
+                f"{path.name}: {f'has {layout}' if layout else 'cannot be decoded'}, but {first.file} has {expected}; "
+                "set the camera as it was when the session was begun, and take this frame again"
+            )
+        return pixels
+
+    def _layout_of(self, committed: CommittedFrame) -> str | None:
+        if committed.file not in self._layouts:
+            with suppress(CameraError):  # a session of an earlier version may hold such a frame
+                self._layouts[committed.file] = _layout(self._decode(self._session.path_of(committed)))
+        return self._layouts.setdefault(committed.file, None)
 
     def _check(self, frame: PlannedFrame, pixels: Pixels | None) -> Findings:
         if pixels is None:
@@ -237,14 +259,14 @@ class FrameTaker:
         if not (settings.measure and self._rig.camera_sees_stage):
             return self._session.plan.settle_s
         self._dialogue.show_status(frame, "measuring how long the rig swings")
-        found = measure_settling(self._take_unkept, self._rig.clock, settings)
-        self._session.journal.event("settling", frame=frame.number, **msgspec.to_builtins(found))
-        if not found.settled:
+        settling = measure_settling(self._take_unkept, self._rig.clock, settings)
+        self._session.journal.event("settling", frame=frame.number, **msgspec.to_builtins(settling))
+        if not settling.settled:
             self._dialogue.warn(
                 f"the rig was not seen at rest within {settings.longest_s:g} s, which is the rest from now on; "
                 "light the scene, stiffen the rig or lower its acceleration, or set settle.measure = false"
             )
-        return found.wait_s
+        return settling.wait_s
 
     def _take_unkept(self, exposure_s: float) -> Pixels:
         exposure = self._rig.camera.expose(exposure_s, next(self._unkept_numbers))
@@ -260,3 +282,11 @@ class FrameTaker:
                 "frames cannot be decoded here, so settling cannot be measured; set settle.measure = false"
             )
         return pixels
+
+
+def _layout(pixels: Pixels | None) -> str | None:
+    """Return size and type of the pixels of a frame, such as `640 x 480 pixels of uint16`."""
+    if pixels is None:
+        return None
+    colours = f" x {pixels.shape[2]} colours" if pixels.ndim == 3 else ""
+    return f"{pixels.shape[1]} x {pixels.shape[0]} pixels{colours} of {pixels.dtype.name}"

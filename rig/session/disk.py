@@ -14,8 +14,7 @@ import tifffile
 
 from faintfield.rig.cameras.protocol import Exposure
 from faintfield.rig.errors import SessionBusy, SessionCorrupt, SessionUnreadable, SessionUnwritable
-from faintfield.rig.session.durable import make_folder, sync_folder
-from faintfield.rig.session.names import is_plain_name
+from faintfield.rig.files import is_plain_name, make_folder, sync_folder
 
 PART = ".part"
 

@@ -15,9 +15,9 @@ from msgspec import Meta, Struct
 
 from faintfield.rig.cameras.protocol import Metadata
 from faintfield.rig.errors import SessionCorrupt
+from faintfield.rig.files import is_plain_name
 from faintfield.rig.plan import MAX_FRAMES
 from faintfield.rig.session.database import check_database, connect, create_database, translate_sqlite_errors
-from faintfield.rig.session.names import is_plain_name
 from faintfield.rig.stages.protocol import Point
 from faintfield.rig.stages.transport import Direction
 

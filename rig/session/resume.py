@@ -9,6 +9,7 @@ from pathlib import Path
 import msgspec
 
 from faintfield.rig.errors import SessionCorrupt
+from faintfield.rig.files import make_folder, sha256
 from faintfield.rig.session.changes import settings_of
 from faintfield.rig.session.disk import (
     PART,
@@ -19,9 +20,7 @@ from faintfield.rig.session.disk import (
     translate_read_errors,
     write_new,
 )
-from faintfield.rig.session.durable import make_folder
 from faintfield.rig.session.journal import Begun, CommittedFrame, Journal
-from faintfield.rig.session.regular_files import sha256
 from faintfield.rig.session.session import (
     ASIDE,
     FRAMES,

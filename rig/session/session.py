@@ -12,12 +12,11 @@ from msgspec import Struct
 
 from faintfield.rig.cameras.protocol import Exposure
 from faintfield.rig.errors import SessionCorrupt, SessionUnreadable, SessionUnwritable
+from faintfield.rig.files import is_plain_name, read_regular, sha256
 from faintfield.rig.plan import MAX_NUMBER, CapturePlan, PlannedFrame, planned_frames
 from faintfield.rig.session.database import FORMAT
 from faintfield.rig.session.disk import encode_exposure, list_names, set_aside, translate_errors, write_new
 from faintfield.rig.session.journal import CommittedFrame, FrameRecord, Journal
-from faintfield.rig.session.names import is_plain_name
-from faintfield.rig.session.regular_files import read_regular, sha256
 from faintfield.rig.settings import RigSettings
 
 PLAN, JOURNAL, FRAMES, SUMS, ASIDE = "plan.json", "journal.sqlite", "frames", "SHA256SUMS", "set_aside"

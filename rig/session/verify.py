@@ -6,10 +6,10 @@ from pathlib import Path
 
 from msgspec import Struct
 
+from faintfield.rig.files import read_regular, sha256
 from faintfield.rig.plan import PlannedFrame, planned_frames
 from faintfield.rig.session.disk import list_names, lock_session, translate_read_errors
 from faintfield.rig.session.journal import Begun, CommittedFrame, Sealed, Suspect
-from faintfield.rig.session.regular_files import read_regular, sha256
 from faintfield.rig.session.session import (
     FRAMES,
     JOURNAL,

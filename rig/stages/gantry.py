@@ -7,14 +7,16 @@ axes restores trust.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from faintfield.rig.clock import Clock
 from faintfield.rig.errors import NotHomed, OutsideTravel, PositionLost, StageError, StageLost
-from faintfield.rig.stages.motion import duration_s, one_sided_path, path_duration_s
+from faintfield.rig.stages.grbl.controller import GrblController
+from faintfield.rig.stages.marlin.controller import MarlinController
+from faintfield.rig.stages.motion import StageWorkspace, duration_s, one_sided_path, path_duration_s
 from faintfield.rig.stages.protocol import AxisIndex, Box, Controller, Homing, Identity, Point, Position, StageSettings
-from faintfield.rig.stages.workspace import StageWorkspace
+from faintfield.rig.stages.transport import LineTransport, Port, TrafficLog
 
 # Longest jog without homing, in mm: enough to see which way an axis moves, too short to do damage.
 _MAX_UNHOMED_JOG_MM = 10.0
@@ -286,3 +288,25 @@ class Gantry:
         except BaseException:
             self._trusted &= self._controller.abort()
             raise
+
+
+def make_stage(
+    settings: StageSettings, clock: Clock, traffic: TrafficLog | None, open_port: Callable[[], Port]
+) -> Gantry:
+    """Return the stage that `settings` describe, not yet connected.
+
+    Parameters
+    ----------
+    settings : StageSettings
+        Protocol, axes and limits.
+    clock : Clock
+        Clock of the rig.
+    traffic : TrafficLog, optional
+        Log of every byte sent and received.
+    open_port : callable
+        Opens the connection; for real hardware, a `SerialPort` on `settings.port`.
+    """
+    line = LineTransport(open_port, clock, traffic)
+    if settings.protocol == "grbl":
+        return Gantry(GrblController(line, settings.axes), settings, clock)
+    return Gantry(MarlinController(line, settings.axes, settings.travel_mm), settings, clock)

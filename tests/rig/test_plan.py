@@ -15,8 +15,8 @@ from faintfield.rig.plan import MAX_FRAMES, CapturePlan, CaptureStep, Grid, cent
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
+from faintfield.rig.stages.motion import StageWorkspace
 from faintfield.rig.stages.protocol import Box, MotionLimits, Point
-from faintfield.rig.stages.workspace import StageWorkspace
 
 GRID = Grid(7, 7, 50.0, Point(10.0, 10.0))
 STEPS = (

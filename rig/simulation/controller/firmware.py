@@ -19,7 +19,7 @@ from faintfield.rig.stages.protocol import ProtocolName
 WORD = re.compile(r"([A-Z])(-?\d+(?:\.\d+)?)")
 
 
-def words(text: str) -> dict[str, float]:
+def parse_parameters(text: str) -> dict[str, float]:
     """Return the numbers of a line by letter; the last word of a letter counts."""
     return {letter: float(value) for letter, value in WORD.findall(text)}
 

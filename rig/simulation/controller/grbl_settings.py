@@ -3,7 +3,7 @@
 import re
 from collections.abc import Sequence
 
-from faintfield.rig.simulation.controller.firmware import WORD, words
+from faintfield.rig.simulation.controller.firmware import WORD, parse_parameters
 from faintfield.rig.simulation.controller.kinematics import along
 
 _DEFAULTS = {
@@ -74,7 +74,7 @@ class StoredSettings(dict[int, str]):
 
 def jog_error(text: str) -> int:
     """Return the number of GRBL's error for what follows `$J=`, 0 if it is a jog."""
-    parsed, modes = words(text), set(re.findall(r"G\d+", text))
+    parsed, modes = parse_parameters(text), set(re.findall(r"G\d+", text))
     if not parsed.keys() <= set("GXYZF") or not modes <= {"G20", "G21", "G90", "G91", "G53"} or WORD.sub("", text):
         return 16
     if "F" not in parsed:

@@ -43,10 +43,7 @@ class SimulatedGrblHal(SimulatedGrbl):
     """Firmware, settings and mechanics of a grblHAL stage; the parameters are those of `SimulatedGrbl`."""
 
     _critical_alarms: ClassVar[tuple[int, ...]] = (1, 2, 10, 17)
-
-    @staticmethod
-    def _stored(changes: dict[int, str]) -> StoredSettings:
-        return HalSettings(changes)
+    _settings_type = HalSettings
 
     def _reset_state(self) -> None:
         super()._reset_state()
@@ -91,7 +88,7 @@ class SimulatedGrblHal(SimulatedGrbl):
     def _deaf(self) -> bool:
         return False
 
-    def _told_state(self) -> str:
+    def _reported_state(self) -> str:
         return f"Alarm:{self._alarm}" if self.state == "Alarm" and self._alarm else self.state
 
     def _pins(self) -> str:

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from functools import reduce
 from operator import xor
 
-from faintfield.rig.simulation.controller.firmware import SimulatedFirmware, words
+from faintfield.rig.simulation.controller.firmware import SimulatedFirmware, parse_parameters
 from faintfield.rig.simulation.controller.kinematics import Axis, Mechanics, along
 from faintfield.rig.simulation.controller.wire import ScheduledEvent, SimulatedClock, Wire
 
@@ -134,7 +134,7 @@ class SimulatedMarlin(SimulatedFirmware):
             return None
         number, command = int(found[1]), found[2]
         if command.startswith("M110"):
-            self._last_line = int(words(command).get("N", number))
+            self._last_line = int(parse_parameters(command).get("N", number))
             return command
         if number != self._last_line + 1:
             self._ask_again("Line Number is not Last Line Number+1")
@@ -148,7 +148,7 @@ class SimulatedMarlin(SimulatedFirmware):
 
     def _run(self, command: str) -> None:
         name = command.split(" ", 1)[0]
-        parameters = words(command[len(name) :])
+        parameters = parse_parameters(command[len(name) :])
         actions: dict[str, Callable[[], None]] = {
             "G28": lambda: self._home([i for i in (0, 1) if "XY"[i] in command[3:]] or [0, 1]),
             "M400": lambda: self._await(lambda: not self.mechanics.moving and not self._waits_for_button),

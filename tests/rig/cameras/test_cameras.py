@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 from faintfield.rig.cameras.aravis import AravisCamera
-from faintfield.rig.cameras.bounded import call_within
 from faintfield.rig.cameras.gphoto2 import GPhoto2Camera, shutter_s
 from faintfield.rig.cameras.micromanager import MicroManagerCamera
-from faintfield.rig.cameras.protocol import CameraReport, Exposure, Thermometer
+from faintfield.rig.cameras.protocol import CameraReport, Exposure, Thermometer, call_within
 from faintfield.rig.cameras.settings import (
     AravisSettings,
     CoolingSettings,

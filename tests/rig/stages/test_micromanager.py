@@ -17,8 +17,7 @@ from faintfield.rig.plan import Grid
 from faintfield.rig.settings import DriftSettings, RigSettings, StepSettings
 from faintfield.rig.simulation.controller.wire import SimulatedClock
 from faintfield.rig.stages.gantry import Gantry
-from faintfield.rig.stages.micromanager.controller import MicroManagerController
-from faintfield.rig.stages.micromanager.settings import MicroManagerStage
+from faintfield.rig.stages.micromanager import MicroManagerController, MicroManagerStage
 from faintfield.rig.stages.protocol import Box, Point, StageSettings
 from faintfield.testing import stage_contract
 

@@ -1,4 +1,4 @@
-"""Read and hash regular files of a bounded size; for sessions and for results.
+"""Files of sessions and results: regular ones of a bounded size, read and hashed; names; folders that last.
 
 A name in a file may lead to a pipe, which never answers, or to a device, which never ends. Both are refused here.
 """
@@ -9,6 +9,9 @@ import os
 import stat
 from io import BufferedReader
 from pathlib import Path
+
+# Leaves room for what is appended to a name: file systems allow 255 bytes.
+MAX_NAME_LENGTH = 200
 
 
 def open_regular(path: Path) -> BufferedReader:
@@ -67,3 +70,35 @@ def sha256(path: Path) -> str:
 def _require_regular(path: Path, state: os.stat_result) -> None:
     if not stat.S_ISREG(state.st_mode):
         raise OSError(errno.EINVAL, "is not a regular file", str(path))
+
+
+def is_plain_name(name: str) -> bool:
+    """Return whether `name` is that of a file in the very folder it is joined to.
+
+    It has no separator, is not `.` or `..`, not empty, not longer than `MAX_NAME_LENGTH`, and contains printable ASCII
+    characters only, as all names that faintfield makes do.
+    """
+    return (
+        0 < len(name) <= MAX_NAME_LENGTH
+        and name.isascii()
+        and name.isprintable()
+        and not {"/", "\\"} & set(name)
+        and name.strip(".") != ""
+    )
+
+
+def sync_folder(folder: Path) -> None:
+    """Flush the entries of a folder, so that a rename survives a power cut."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def make_folder(folder: Path) -> None:
+    """Create a folder, and those above it, if they are missing, so that they survive a power cut."""
+    if not folder.is_dir():
+        make_folder(folder.parent)
+        folder.mkdir(exist_ok=True)
+    sync_folder(folder.parent)
