@@ -30,19 +30,10 @@ class WallClock:
 
 
 def result_within[T](bound_s: float, call: Callable[[], T], thread: str) -> T:
-    """Return the result of `call`, or raise `TimeoutError` if there is none within `bound_s`.
+    """Return the result of `call`, or raise `TimeoutError` if there is none within `bound_s` seconds of real time.
 
-    A library that hangs in a driver cannot be stopped from outside. It stays in a thread of its own, which does not
-    keep the program from ending; the device must be opened again before it is used.
-
-    Parameters
-    ----------
-    bound_s : float
-        Time limit in seconds of real time, even if the rig's clock is simulated.
-    call : callable
-        The call that may hang.
-    thread : str
-        Name of its thread.
+    A library that hangs in a driver cannot be stopped from outside. It stays in a thread of its own, called `thread`,
+    which does not keep the program from ending; the device must be opened again before it is used.
     """
     outcome: Future[T] = Future()
 

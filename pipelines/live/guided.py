@@ -22,7 +22,7 @@ from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.capture.guide import format_duration
 from faintfield.rig.capture.loop import Capture
 from faintfield.rig.capture.survey import Survey, survey
-from faintfield.rig.devices import is_simulated, open_rig
+from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import CameraError, CaptureStopped
 from faintfield.rig.plan import CapturePlan
 from faintfield.rig.session.changes import adopt_settings, check_same_rig
@@ -161,7 +161,7 @@ def needed_bytes(plan: CapturePlan) -> int:
 def duration_words(duration_s: float, stage: StageSettings) -> str:
     """Return the duration of a capture in words, and by which clock if the stage is simulated."""
     words = f"{format_duration(duration_s)} without prompts"
-    return f"{words} by the simulated stage's clock, far less by yours" if is_simulated(stage) else words
+    return f"{words} by the simulated stage's clock, far less by yours" if stage.simulated else words
 
 
 def survey_lines(found: Survey, stage: StageSettings, rig: Path) -> list[str]:

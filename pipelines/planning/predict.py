@@ -348,7 +348,7 @@ class Predictor:
 def _why_not(plan: CapturePlan, pace: KnownPace) -> str | None:
     """Return why the stage cannot go along a plan's path."""
     try:
-        plan.check(pace.workspace)
+        pace.workspace.check_path(plan.path())
     except (OutsideTravel, KeepOutCrossed) as failure:
         return str(failure)
     return None

@@ -72,14 +72,7 @@ class FrameTimes:
     def check(self, stamps: Stamps, requested: Moment, now: Moment, exposure_s: float) -> None:
         """Raise `CameraError` if the frame's exposure began before it was requested, or that cannot be told.
 
-        Parameters
-        ----------
-        stamps : Stamps
-            Time stamps of the frame.
-        requested, now : Moment
-            When the frame was triggered, and a moment after it came.
-        exposure_s : float
-            Exposure time; 0 if the camera only pretends to expose.
+        `now` is a moment after the frame came. `exposure_s` is 0 if the camera only pretends to expose.
         """
         passed_s = 1e-9 * (now.clock_ns - requested.clock_ns)
         by_date_s = 1e-9 * (now.date_ns - requested.date_ns)

@@ -17,13 +17,7 @@ _RECORDED = ("iso", "f-number", "aperture", "imageformat", "imagequality", "focu
 
 
 class GPhoto2Camera:
-    """A `Camera` that libgphoto2 supports.
-
-    Parameters
-    ----------
-    settings : GPhoto2Settings
-        The `[camera]` table.
-    """
+    """A `Camera` that libgphoto2 supports."""
 
     def __init__(self, settings: GPhoto2Settings) -> None:
         self._settings = settings
@@ -36,9 +30,7 @@ class GPhoto2Camera:
         try:
             import gphoto2
         except ImportError as failure:
-            raise MissingExtra(
-                "backend 'gphoto2' needs a package that is not installed; run: pip install 'faintfield[gphoto2]'"
-            ) from failure
+            raise MissingExtra("backend 'gphoto2' needs a package; run: pip install 'faintfield[gphoto2]'") from failure
         self._gphoto2 = gphoto2
         self.close()
         self._camera = self._bounded(self._connect, "connecting")

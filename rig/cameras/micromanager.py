@@ -15,15 +15,7 @@ _TEMPERATURES = ("CCDTemperature", "SensorTemperature", "Temperature")
 
 
 class MicroManagerCamera:
-    """A `Camera` that Micro-Manager supports, through pymmcore-plus.
-
-    Parameters
-    ----------
-    settings : MicroManagerSettings
-        The `[camera]` table.
-    shared : SharedCore, optional
-        The core, if the stage uses it as well.
-    """
+    """A `Camera` that Micro-Manager supports, through pymmcore-plus; the stage may share its core."""
 
     def __init__(self, settings: MicroManagerSettings, shared: SharedCore | None = None) -> None:
         self._settings = settings
@@ -54,9 +46,7 @@ class MicroManagerCamera:
             lambda: self._snap(exposure_s), f"an exposure of {exposure_s:g} s", extra_s=2.0 * exposure_s
         )
         if pixels.dtype.kind != "u" or pixels.dtype.itemsize > 2:
-            raise CameraError(
-                f"the camera gives pixels of type {pixels.dtype}; set its PixelType to 16bit, or 8bit if it has no more"
-            )
+            raise CameraError(f"the camera gives pixels of type {pixels.dtype}; set its PixelType to 16bit or 8bit")
         return Exposure(".tiff", pixels=pixels, metadata=metadata)
 
     def temperature_c(self) -> float | None:
@@ -108,10 +98,10 @@ class MicroManagerCamera:
         present = set(self._core.getDevicePropertyNames(label))
         name = next((name for name in _TEMPERATURES if name in present), None)
         try:
-            found_c = math.nan if name is None else float(self._core.getProperty(label, name))
+            temperature_c = math.nan if name is None else float(self._core.getProperty(label, name))
         except ValueError:
             return None
-        return found_c if math.isfinite(found_c) else None
+        return temperature_c if math.isfinite(temperature_c) else None
 
     def _read_report(self) -> CameraReport:
         core = self._core

@@ -92,15 +92,7 @@ class Camera(Protocol):
         """Return the camera's name, limits and settings."""
 
     def expose(self, exposure_s: float, number: int) -> Exposure:
-        """Take one frame.
-
-        Parameters
-        ----------
-        exposure_s : float
-            Exposure time.
-        number : int
-            Number of the exposure in the session, counting those that were not kept.
-        """
+        """Take one frame; `number` counts the exposures of a session, also those that were not kept."""
 
     def close(self) -> None:
         """Disconnect; closing twice does no harm."""
@@ -117,18 +109,11 @@ class Thermometer(Protocol):
 def call_within[T](bound_s: float, call: Callable[[], T], what: str) -> T:
     """Return the result of `call`, or raise `CameraTimeout` if there is none within `bound_s`; see `result_within`.
 
-    Parameters
-    ----------
-    bound_s : float
-        Time limit in seconds of real time, even if the rig's clock is simulated.
-    call : callable
-        The call that may hang.
-    what : str
-        What the call does, for the message.
+    The message says `what` the call does.
     """
     try:
         return result_within(bound_s, call, "camera")
     except TimeoutError as failure:
         raise CameraTimeout(
-            f"the camera did not finish {what} within {bound_s:g} s; check its cable and battery, switch it off and on"
+            f"the camera did not finish {what} in {bound_s:g} s; check cable and battery, switch it off and on"
         ) from failure

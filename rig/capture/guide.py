@@ -135,32 +135,22 @@ class OperatorInterface(Protocol):
         """Show the frame just taken."""
 
 
-def step_prompt(frame: PlannedFrame, step: int, steps: int, frames: int, duration_s: float) -> Prompt:
-    """Return the prompt before a step.
-
-    Parameters
-    ----------
-    frame : PlannedFrame
-        First frame of the step.
-    step, steps : int
-        Number of the step, from 1, and number of steps.
-    frames, duration_s : int, float
-        Number of frames to be taken, and the time for them in s.
-    """
+def step_prompt(frame: PlannedFrame, steps: int, frames: int, duration_s: float) -> Prompt:
+    """Return the prompt before a step, whose first of `frames` frames is `frame`; they take `duration_s`."""
     to_do = _TO_DO_AGAIN.get(frame.kind, _TO_DO[frame.kind]) if frame.sweep else _TO_DO[frame.kind]
     motion = f"Then {frames} frames follow, {format_duration(duration_s)}. The stage moves by itself: keep clear of it."
     return Prompt(
         key="step",
-        title=_step_title(frame, step, steps),
+        title=_step_title(frame, steps),
         lines=(*to_do, motion, _CHECK[frame.kind]),
         answers=("go", "skip", "stop"),
         unattended="go",
     )
 
 
-def _step_title(frame: PlannedFrame, step: int, steps: int) -> str:
+def _step_title(frame: PlannedFrame, steps: int) -> str:
     sweep = f" {frame.sweep + 1}" if frame.kind in ("charuco", "flat") else ""
-    return f"Step {step} of {steps}: {TITLES[frame.kind]}{sweep}"
+    return f"Step {frame.step + 1} of {steps}: {TITLES[frame.kind]}{sweep}"
 
 
 def format_duration(duration_s: float) -> str:
@@ -180,12 +170,10 @@ class Dialogue:
 
     Parameters
     ----------
-    session : Session
-        Open session whose state is shown, and whose journal keeps what is said.
+    session, pace : Session, Pace
+        Open session, whose state is shown and whose journal keeps what is said; and the remaining time.
     operator : OperatorInterface
         Answers prompts and shows the state of the capture.
-    pace : Pace
-        Estimates the remaining time.
 
     Attributes
     ----------
@@ -232,7 +220,7 @@ class Dialogue:
             doing=doing,
             step=frame.step + 1,
             steps=len(steps),
-            title=_step_title(frame, frame.step + 1, len(steps)),
+            title=_step_title(frame, len(steps)),
             done=len(session.valid()),
             total=len(session.frames),
             to_go_s=self._pace.remaining_s(missing, len(to_check) if session.frozen.rig.drift.check else 0),

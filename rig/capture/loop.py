@@ -21,10 +21,8 @@ class Capture:
 
     Parameters
     ----------
-    session : Session
-        Open session, where the frames are stored.
-    rig : Rig
-        Stage and camera, not yet connected.
+    session, rig : Session, Rig
+        Open session, where the frames are stored; stage and camera, not yet connected.
     operator : OperatorInterface
         Answers prompts and shows the state of the capture.
     decode : callable
@@ -95,7 +93,7 @@ class Capture:
         frames = [frame for frame in missing if frame.step == first.step]
         self._dialogue.show_status(first, "waiting for your answer")
         duration_s = self._pace.remaining_s(frames, 0)
-        prompt = step_prompt(first, first.step + 1, len(session.plan.steps), len(frames), duration_s)
+        prompt = step_prompt(first, len(session.plan.steps), len(frames), duration_s)
         answer = self._dialogue.ask_or_stop(prompt)
         if answer == "skip":
             for frame in frames:
@@ -134,7 +132,11 @@ class Capture:
         self._failures = 0
         while True:
             try:
-                self._note_homing()
+                if self._rig.stage.homings != self._homings_in_journal:
+                    self._homings_in_journal = self._rig.stage.homings
+                    if self._drift.watch is not None:
+                        self._mark_unchecked("the stage was homed")
+                    begin_group(self._session.journal)
                 self._taker.take(frame)
             except (StageError, NotHomed, CameraError) as failure:
                 if self._handle_failure(frame, failure) == "skip":
@@ -195,13 +197,6 @@ class Capture:
             event = {"error": type(failure).__name__, "message": str(failure)}
             self._session.journal.event("recovery_failed", frame=frame.number, device=device, **event)
             self._dialogue.warn(f"{frame.name}: the {device} was not recovered: {failure}")
-
-    def _note_homing(self) -> None:
-        if self._rig.stage.homings != self._homings_in_journal:
-            self._homings_in_journal = self._rig.stage.homings
-            if self._drift.watch is not None:
-                self._mark_unchecked("the stage was homed")
-            begin_group(self._session.journal)
 
     def _mark_unchecked(self, event: str) -> None:
         """Mark the frames at nodes that no drift check will confirm, since `event` came before it."""

@@ -26,14 +26,8 @@ class DriftChecks:
 
     Parameters
     ----------
-    session : Session
-        Open session, whose frames become void if they are taken again.
-    rig : Rig
-        Stage and clock.
-    dialogue : Dialogue
-        Asks what to do after lost steps.
-    pace : Pace
-        Learns how long a check takes.
+    session, rig, dialogue, pace : Session, Rig, Dialogue, Pace
+        Frames become void if they are taken again; stage and clock; asks what to do; learns how long a check takes.
 
     Attributes
     ----------
@@ -66,7 +60,7 @@ class DriftChecks:
     def add(self, frame: CommittedFrame) -> None:
         """Note that a frame relies on the position of the stage."""
         if self.watch is not None:
-            self.watch.note(frame)
+            self.watch.unchecked.append(frame)
 
     def check_after(self, nodes: int) -> None:
         """Check for drift if at least `nodes` nodes were visited since the last check; 0 means no check."""
@@ -110,16 +104,10 @@ class FrameTaker:
 
     Parameters
     ----------
-    session : Session
-        Open session, where the frames are stored.
-    rig : Rig
-        Stage, camera and clock; connected and homed before `take`.
-    dialogue : Dialogue
-        Informs the operator.
-    drift : DriftChecks
-        Counts the nodes and frames that the next drift check covers.
-    pace : Pace
-        Knows the position of the stage, and learns how long a frame takes.
+    session, rig : Session, Rig
+        Open session, where the frames are stored; stage, camera and clock, connected and homed before `take`.
+    dialogue, drift, pace : Dialogue, DriftChecks, Pace
+        Informs the operator; counts nodes and frames for the next drift check; knows the position of the stage.
     decode : callable
         Reads the pixels of a frame's file; returns None if it cannot, and raises `CameraError` for a damaged file.
 
@@ -191,30 +179,35 @@ class FrameTaker:
         rig.stage.verify_at(*frame.stop.target)
         written = session.write(frame, intent, exposure)
         try:
-            pixels = self._decoded(frame, written.path, exposure)
+            pixels = self._decode_frame(frame, written.path, exposure)
         except CameraError as failure:
             session.reject(frame, written, str(failure))
             raise
         findings = self._check(frame, pixels)
-        record = FrameRecord(
-            position.point, frame.exposure_s, dict(exposure.metadata), findings.values, findings.warnings
-        )
+        checked = (findings.values, findings.warnings)
+        record = FrameRecord(position.point, frame.exposure_s, dict(exposure.metadata), *checked)
         self._drift.add(session.commit(frame, written, record))
         self.last = frame
         if findings.warnings:
             self._dialogue.warnings = tuple(f"{frame.name}: {warning}" for warning in findings.warnings)
         if frame.kind == "charuco":
-            self._check_boards(frame)
+            corners = {
+                number: int(committed.record.checks["board_corners"])
+                for number, committed in session.valid().items()
+                if "board_corners" in committed.record.checks
+            }
+            for warning in board_warnings(frame, session.frames, corners, self._settings.checks.board_corners):
+                self._dialogue.warn(warning)
         self._pace.finish_frame(begun_s, frame.exposure_s)
         if pixels is not None:
             self._dialogue.operator.show_frame(frame, pixels, findings.values)
 
-    def _decoded(self, frame: PlannedFrame, path: Path, exposure: Exposure) -> Pixels | None:
+    def _decode_frame(self, frame: PlannedFrame, path: Path, exposure: Exposure) -> Pixels | None:
         """Return the pixels of a frame, None if it cannot be decoded here; its layout must be that of the session."""
         pixels = exposure.pixels if exposure.pixels is not None else self._decode(path)
         layout = self._layouts[path.name] = _layout(pixels)
-        others = self._session.valid().keys() - {frame.number}  # a frame is not compared with an earlier take of it
-        first = self._session.valid()[min(others)] if others else None
+        numbers = self._session.valid().keys() - {frame.number}  # a frame is not compared with an earlier take of it
+        first = self._session.valid()[min(numbers)] if numbers else None
         expected = None if first is None else self._layout_of(first)
         if first is not None and expected is not None and layout != expected:
             raise CameraError(
@@ -240,15 +233,6 @@ class FrameTaker:
             if self._session.frames[committed.frame].step == frame.step and "sharpness" in committed.record.checks
         ]
         return check_frame(pixels, frame.kind, self._settings.checks, self._settings.board, earlier_sharpness)
-
-    def _check_boards(self, frame: PlannedFrame) -> None:
-        corners = {
-            number: int(taken.record.checks["board_corners"])
-            for number, taken in self._session.valid().items()
-            if "board_corners" in taken.record.checks
-        }
-        for warning in board_warnings(frame, self._session.frames, corners, self._settings.checks.board_corners):
-            self._dialogue.warn(warning)
 
     def _find_settling(self, frame: PlannedFrame) -> float:
         """Return the rest in s after a move: measured earlier in this session, measured now, or planned."""
@@ -278,9 +262,7 @@ class FrameTaker:
             path.write_bytes(exposure.content)
             pixels = self._decode(path)
         if pixels is None:
-            raise CameraError(
-                "frames cannot be decoded here, so settling cannot be measured; set settle.measure = false"
-            )
+            raise CameraError("frames cannot be decoded, so settling is not measured; set settle.measure = false")
         return pixels
 
 

@@ -138,22 +138,18 @@ def lock_session(folder: Path, *, shared: bool = False) -> Iterator[None]:
         descriptor = os.open(path, access | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
     try:
         with translated(path):
-            _take_lock(descriptor, folder, shared=shared)
+            try:
+                fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+            except BlockingIOError as failure:
+                process = re.fullmatch(rb"process \d+", os.pread(descriptor, 100, 0))
+                holder = process[0].decode() if process else "another process"
+                raise SessionBusy(f"{folder}: a capture is under way ({holder}); wait for it or stop it") from failure
+            if not shared:
+                os.ftruncate(descriptor, 0)
+                os.pwrite(descriptor, f"process {os.getpid()}".encode(), 0)
         yield
     finally:
         os.close(descriptor)
-
-
-def _take_lock(descriptor: int, folder: Path, *, shared: bool) -> None:
-    try:
-        fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
-    except BlockingIOError as failure:
-        named = re.fullmatch(rb"process \d+", os.pread(descriptor, 100, 0))
-        holder = named[0].decode() if named else "another process"
-        raise SessionBusy(f"{folder}: a capture is under way ({holder}); wait for it or stop it first") from failure
-    if not shared:
-        os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, f"process {os.getpid()}".encode(), 0)
 
 
 @contextmanager

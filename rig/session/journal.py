@@ -137,10 +137,8 @@ class Journal:
 
     Parameters
     ----------
-    path : Path
-        The SQLite file.
-    create : bool
-        Create the file if it is missing.
+    path, create : Path, bool
+        The SQLite file, which is created if it is missing and `create` is set.
     read_only : bool
         Open without a lock and without writing, so that a write-protected medium can be read.
 
@@ -166,7 +164,14 @@ class Journal:
         with self._translate_errors():
             self._db = connect(path, read_only=read_only)
         try:
-            self._prepare()
+            with self._translate_errors():
+                self._db.execute("BEGIN")  # one state of the journal for all checks
+                self.format = check_database(self._db, self.path)
+                self._db.execute("COMMIT")
+                if not read_only:  # prefer durability to speed
+                    self._db.execute("PRAGMA journal_mode = WAL")
+                    self._db.execute("PRAGMA synchronous = FULL")
+                    self._db.execute("PRAGMA foreign_keys = ON")
         except BaseException:
             self._db.close()
             raise
@@ -225,10 +230,14 @@ class Journal:
     def committed(self) -> list[CommittedFrame]:
         """Return all committed frames in the order of their exposures."""
         with self._translate_errors():
-            return [
-                CommittedFrame(a, b, self._plain(c), d, e, msgspec.json.decode(record, type=FrameRecord), void)
-                for a, b, c, d, e, record, void in self._read(_CommittedRow, _COMMITTED)
+            frames = [
+                CommittedFrame(intent, frame, file, sha256, size, msgspec.json.decode(record, type=FrameRecord), void)
+                for intent, frame, file, sha256, size, record, void in self._read(_CommittedRow, _COMMITTED)
             ]
+        for frame in frames:
+            if not is_plain_name(frame.file):
+                raise SessionCorrupt(f"{self.path}: {frame.file!r:.60} is no name of a frame; restore it from a copy")
+        return frames
 
     def uncommitted(self) -> list[tuple[int, int]]:
         """Return the number and the frame of every exposure that was not committed."""
@@ -245,8 +254,8 @@ class Journal:
         """Return the events in order, all or those of one kind."""
         with self._translate_errors():
             return [
-                JournalEvent(a, b, c, d, msgspec.json.decode(detail, type=dict[str, object]))
-                for a, b, c, d, detail in self._read(_EventRow, _EVENTS, kind)
+                JournalEvent(number, at, kind, frame, msgspec.json.decode(detail, type=dict[str, object]))
+                for number, at, kind, frame, detail in self._read(_EventRow, _EVENTS, kind)
             ]
 
     def details[T](self, kind: str, layout: type[T]) -> list[T]:
@@ -260,28 +269,11 @@ class Journal:
             for row in self._db.execute("SELECT at_s, direction, data FROM traffic ORDER BY id"):
                 yield msgspec.convert(row, _TrafficRow)
 
-    def _prepare(self) -> None:
-        with self._translate_errors():
-            self._db.execute("BEGIN")  # one state of the journal for all checks
-            self.format = check_database(self._db, self.path)
-            self._db.execute("COMMIT")
-            if not self._read_only:
-                self._db.execute("PRAGMA journal_mode = WAL")
-                self._db.execute("PRAGMA synchronous = FULL")
-                self._db.execute("PRAGMA foreign_keys = ON")
-
     def _read(self, layout: Any, query: str, *arguments: object) -> list[Any]:
         rows = [msgspec.convert(row, layout) for row in self._db.execute(query, arguments).fetchmany(_MAX_ROWS + 1)]
         if len(rows) > _MAX_ROWS:
-            raise SessionCorrupt(
-                f"{self.path}: holds more than {_MAX_ROWS} entries of a kind; restore the journal from a copy"
-            )
+            raise SessionCorrupt(f"{self.path}: holds more than {_MAX_ROWS} rows of a kind; restore it from a copy")
         return rows
-
-    def _plain(self, file: str) -> str:
-        if not is_plain_name(file):
-            raise SessionCorrupt(f"{self.path}: {file!r:.60} is not the name of a frame; restore it from a copy")
-        return file
 
     def _add(self, table: str, *rows: tuple[object, ...]) -> int:
         insert = f'INSERT INTO "{table}" VALUES ({", ".join("?" * len(rows[0]))})'

@@ -24,16 +24,8 @@ from faintfield.rig.stages.protocol import Point
 _WAVES, _WAVE_LENGTHS_MM = 8, (80.0, 400.0)
 
 
-class Carriage:
-    """Maps motor positions to camera poses, repeatably and without error at the centre.
-
-    Parameters
-    ----------
-    centre : Point
-        Motor position of the reference pose.
-    settings : SimulatedSettings
-        Standard deviation of the pose over the travel, scale and squareness of the axes, and the seed of the rails.
-    """
+class _Carriage:
+    """Maps motor positions to camera poses, repeatably and without error at the centre."""
 
     def __init__(self, centre: Point, settings: SimulatedSettings) -> None:
         self._centre = centre
@@ -77,21 +69,12 @@ class SimulatedLab:
 
     Parameters
     ----------
-    centre : Point
-        Stage position of the reference pose.
-    true_position : callable
-        Returns the true position of the carriages.
-    still_s : callable
-        Returns the time since they stopped.
+    centre, true_position, still_s : Point, callable, callable
+        Stage position of the reference pose; the true position of the carriages, and the time since they stopped.
     boards : tuple of BoardSettings
         Boards of the charuco sweeps.
     settings : SimulatedSettings
         The camera, the light and the errors of the rails.
-
-    Attributes
-    ----------
-    experiment : SimulatedExperiment
-        The paper's objects and the camera, made on first use.
     """
 
     def __init__(
@@ -106,7 +89,7 @@ class SimulatedLab:
         self._still_s = still_s
         self._boards = boards
         self._settings = settings
-        self._carriage = Carriage(centre, settings)
+        self._carriage = _Carriage(centre, settings)
         self._planes: tuple[TexturedPlane, ...] = ()
         self._photons_per_s = 0.0
         self._flat = False
@@ -182,17 +165,8 @@ _RIPPLE_K, _WAVES, _PERIODS_S = 0.03, 3, (40.0, 200.0)
 class Cooling:
     """The temperature of a sensor over time.
 
-    It falls, or rises, exponentially from the temperature at which the camera was switched on, and then swings a
-    little about the set point.
-
-    Parameters
-    ----------
-    start_c : float or None
-        Temperature at time 0; None keeps the sensor at the set point, without any ripple.
-    set_point_c, time_s : float
-        Set point, and the time in which the distance from it falls to 1/e.
-    seed : int
-        Seed of the ripple.
+    It falls, or rises, exponentially from `start_c` at time 0, and then swings a little about the set point; the
+    distance from it falls to 1/e in `time_s`. Without a start it stays at the set point, without any ripple.
     """
 
     def __init__(self, start_c: float | None, set_point_c: float, time_s: float, seed: int) -> None:
@@ -222,17 +196,7 @@ _TIFF_HEADER_BYTES = 512
 
 
 class SimulatedCamera:
-    """A `Camera` that renders its frames; exposures take simulated time.
-
-    Parameters
-    ----------
-    settings : SimulatedSettings
-        The `[camera]` table.
-    clock : Clock
-        The simulated clock.
-    lab : SimulatedLab
-        Renders the frames.
-    """
+    """A `Camera` that renders the frames of a lab; exposures take simulated time."""
 
     def __init__(self, settings: SimulatedSettings, clock: Clock, lab: SimulatedLab) -> None:
         self._settings = settings

@@ -43,12 +43,12 @@ class _Canvas:
         angle = np.linspace(0, 2 * np.pi, 240)
         self.polygon([(x_mm + radius_x_mm * np.cos(a), y_mm + radius_y_mm * np.sin(a)) for a in angle], colour)
 
-    def text(self, words: str, x_mm: float, y_mm: float, height_mm: float, colour: Colour) -> None:
+    def text(self, caption: str, x_mm: float, y_mm: float, height_mm: float, colour: Colour) -> None:
         """Write text with its lower left corner at x, y, on what is already drawn."""
         scale = height_mm * self._scale / 21  # the font's capitals are 21 px high at scale 1
         at = tuple(int(value) for value in self._pixels([(x_mm, y_mm)])[0])
         thickness = round(3 * scale)
-        cv2.putText(self._colour, words, at, cv2.FONT_HERSHEY_DUPLEX, scale, _levels(colour), thickness, cv2.LINE_AA)
+        cv2.putText(self._colour, caption, at, cv2.FONT_HERSHEY_DUPLEX, scale, _levels(colour), thickness, cv2.LINE_AA)
 
     def plane(self, name: str, x_mm: float, y_mm: float, depth_mm: float, shading: float) -> TexturedPlane:
         """Return the drawing as an object at x, y and a depth; shading darkens it towards its lower right."""
@@ -186,15 +186,15 @@ def surface_scene() -> tuple[Surface, ...]:
     page = Rectangle((-0.2, 0.5, 0.0, 125.0, 60.0, 600.0), (85.0, 105.0))
     rod = Cylinder((45.0, 500.0, 520.0), (5.0, -500.0, 520.0), 3.0)
     return (
-        _painted("wall", wall, _clouds(1, 1024, 1.1), 1.0, (0.10, 0.12, 0.20), (0.95, 0.90, 0.80)),
-        _painted("floor", floor, _patches(2, 1024, 1.4), 1.0, (0.30, 0.16, 0.08), (0.90, 0.75, 0.55)),
-        _painted("ball", ball, _clouds(3, 512, 1.1), 0.5, (0.45, 0.05, 0.05), (1.00, 0.85, 0.75)),
-        _painted("page", page, _print(4, 512), 0.5, (0.06, 0.06, 0.10), (0.95, 0.95, 0.90)),
-        _painted("rod", rod, _clouds(5, 128, 1.1), 0.5, (0.70, 0.60, 0.20), (1.00, 0.95, 0.60)),
+        _paint("wall", wall, _clouds(1, 1024, 1.1), 1.0, (0.10, 0.12, 0.20), (0.95, 0.90, 0.80)),
+        _paint("floor", floor, _patches(2, 1024, 1.4), 1.0, (0.30, 0.16, 0.08), (0.90, 0.75, 0.55)),
+        _paint("ball", ball, _clouds(3, 512, 1.1), 0.5, (0.45, 0.05, 0.05), (1.00, 0.85, 0.75)),
+        _paint("page", page, _print(4, 512), 0.5, (0.06, 0.06, 0.10), (0.95, 0.95, 0.90)),
+        _paint("rod", rod, _clouds(5, 128, 1.1), 0.5, (0.70, 0.60, 0.20), (1.00, 0.95, 0.60)),
     )
 
 
-def _painted(name: str, shape: Shape, tile: Tile, pitch_mm: float, dark: Colour, bright: Colour) -> Surface:
+def _paint(name: str, shape: Shape, tile: Tile, pitch_mm: float, dark: Colour, bright: Colour) -> Surface:
     low, high = np.array(dark), np.array(bright)
     return Surface(name, shape, (low + tile[:, :, np.newaxis] * (high - low)).astype(np.float32), pitch_mm)
 

@@ -76,8 +76,8 @@ class MicroManagerStage(Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         for name in ("rate_mm_per_s", "acceleration_mm_per_s2", "tolerance_mm", "homing_bound_s", "answer_s"):
-            if not 0.0 < (given := getattr(self, name)) <= 3600.0:
-                raise ValueError(f"{name} = {given:g}; give more than 0 and at most 3600")
+            if not 0.0 < (value := getattr(self, name)) <= 3600.0:
+                raise ValueError(f"{name} = {value:g}; give more than 0 and at most 3600")
 
 
 class MicroManagerController:
@@ -85,14 +85,10 @@ class MicroManagerController:
 
     Parameters
     ----------
-    shared : SharedCore
-        The core, which the camera may use as well.
-    options : MicroManagerStage
-        Which stage, its limits and its origin.
-    travel_mm : Box or None
-        The configured travel; adapters report none.
-    clock : Clock
-        Clock of the waits between reports.
+    shared, clock : SharedCore, Clock
+        The core, which the camera may use as well; the clock of the waits between reports.
+    options, travel_mm : MicroManagerStage, Box or None
+        The stage, its limits and its origin; the configured travel, as adapters report none.
     """
 
     def __init__(self, shared: SharedCore, options: MicroManagerStage, travel_mm: Box | None, clock: Clock) -> None:
@@ -112,11 +108,11 @@ class MicroManagerController:
             raise StageLost(f"stage.protocol = {failure}") from failure
         self.close()
         try:
-            loaded = self._bounded(self._load, self._options.answer_s, "loading the configuration")
+            loading = "loading the configuration"
+            self._core, self._label = self._run(self._load, self._options.answer_s, loading, connected=False)
         except (StageLost, PlanRefused):
             self._release()
             raise
-        self._core, self._label = loaded
         self._origin_confirmed = self._options.origin == "confirmed"
 
     def identify(self) -> Identity:
@@ -154,7 +150,7 @@ class MicroManagerController:
                 )
             self._origin_confirmed = False
         else:
-            self._run(lambda: self._home(bound_s), bound_s + self._options.answer_s, "homing", waits_s=bound_s)
+            self._move("home", (), bound_s, "homing")
         self.read_position()
         return AnswerTime(self._clock.now_s() - begun_s, 0.0)
 
@@ -162,12 +158,12 @@ class MicroManagerController:
         """Move through the points of `path` at the stage's own speed, and return the position at rest."""
         bound_s = timeout_s(predicted_s)
         for point in path:
-            self._move("setXYPosition", point, bound_s)
+            self._move("setXYPosition", _in_um(point), bound_s, f"moving to {point}")
         return self.read_position()
 
     def jog(self, by: Point, feed_mm_per_s: float, predicted_s: float, *, unlock: bool) -> Point:
         """Move relative to the present position; there is no lock to clear."""
-        self._move("setRelativeXYPosition", by, timeout_s(predicted_s))
+        self._move("setRelativeXYPosition", _in_um(by), timeout_s(predicted_s), f"moving to {by}")
         return self.read_position()
 
     def read_position(self) -> Point:
@@ -183,13 +179,12 @@ class MicroManagerController:
                 if not busy:
                     return point
             earlier = point
-        raise StageTimeout(
-            f"the stage does not come to rest at {earlier}; look whether something moves it, then home it"
-        )
+        raise StageTimeout(f"the stage does not come to rest at {earlier}; look what moves it, then home it")
 
     def switches(self) -> frozenset[AxisIndex]:
         """Return no axis: adapters do not report switches."""
-        self._require_connection()
+        if self._core is None:
+            raise StageLost("the stage is not connected; connect it first")
         return frozenset()
 
     def stop(self) -> bool:
@@ -242,45 +237,35 @@ class MicroManagerController:
         names = [prop for prop in core.getDevicePropertyNames(label) if not core.isPropertyReadOnly(label, prop)]
         return name, {prop: core.getProperty(label, prop) for prop in names}
 
-    def _home(self, bound_s: float) -> None:
-        core = self._core
-        core.home(self._label)
-        self._wait(core, bound_s)
+    def _move(self, function: str, target_um: tuple[float, ...], bound_s: float, what: str) -> None:
+        """Call a function of the core that moves the stage, and wait until the adapter says that it has ended."""
 
-    def _move(self, function: str, point: Point, bound_s: float) -> None:
         def work() -> None:
             core = self._core
-            getattr(core, function)(self._label, _UM_PER_MM * point.x_mm, _UM_PER_MM * point.y_mm)
-            self._wait(core, bound_s)
+            getattr(core, function)(self._label, *target_um)
+            usual_ms = core.getTimeoutMs()  # the camera's too
+            core.setTimeoutMs(math.ceil(1e3 * bound_s))
+            try:
+                core.waitForDevice(self._label)
+            finally:
+                core.setTimeoutMs(usual_ms)
 
-        self._run(work, bound_s + self._options.answer_s, f"moving to {point}", waits_s=bound_s)
-
-    def _wait(self, core: Any, bound_s: float) -> None:
-        usual_ms = core.getTimeoutMs()  # the camera's too
-        core.setTimeoutMs(math.ceil(1e3 * bound_s))
-        try:
-            core.waitForDevice(self._label)
-        finally:
-            core.setTimeoutMs(usual_ms)
+        self._run(work, bound_s + self._options.answer_s, what, waits_s=bound_s)
 
     def _report(self) -> Point:
         x_um, y_um = self._run(lambda: self._core.getXYPosition(self._label), self._options.answer_s, "its report")
         return Point(x_um / _UM_PER_MM, y_um / _UM_PER_MM)
 
-    def _run[T](self, call: Callable[[], T], bound_s: float, what: str, *, waits_s: float | None = None) -> T:
+    def _run[T](
+        self, call: Callable[[], T], bound_s: float, what: str, *, waits_s: float | None = None, connected: bool = True
+    ) -> T:
         """Call with a time limit, and raise a `StageError` for what the core raises.
 
-        A call that `waits_s` until the adapter is at rest, and fails then, has timed out.
+        A call that `waits_s` until the adapter is at rest, and fails then, has timed out. A stage that hangs is
+        stopped, now and when the call returns.
         """
-        self._require_connection()
-        return self._bounded(call, bound_s, what, waits_s)
-
-    def _require_connection(self) -> None:
-        if self._core is None:
+        if connected and self._core is None:
             raise StageLost("the stage is not connected; connect it first")
-
-    def _bounded[T](self, call: Callable[[], T], bound_s: float, what: str, waits_s: float | None = None) -> T:
-        """Call as `_run` does, connected or not; a stage that hangs is stopped, now and when the call returns."""
         begun_s = self._clock.now_s()
         core, label, given_up = self._core, self._label, threading.Event()
 
@@ -315,6 +300,10 @@ class MicroManagerController:
             raise StageLost(
                 f"the stage failed at {what}: {reason}; check its cable, its power and the configuration, then home it"
             ) from failure
+
+
+def _in_um(point: Point) -> tuple[float, float]:
+    return _UM_PER_MM * point.x_mm, _UM_PER_MM * point.y_mm
 
 
 def _stop(core: Any, label: str) -> None:

@@ -71,15 +71,7 @@ _ROUNDING_MM = 1e-6
 
 
 class StageWorkspace(Struct, frozen=True):
-    """The travel of the stage and its keep-out boxes.
-
-    Parameters
-    ----------
-    travel_mm : Box
-        Positions that the stage can reach.
-    keep_out : tuple of Box
-        Boxes that the stage must neither enter nor cross.
-    """
+    """The travel of the stage, and boxes that it must neither enter nor cross."""
 
     travel_mm: Box
     keep_out: tuple[Box, ...] = ()
@@ -94,17 +86,11 @@ class StageWorkspace(Struct, frozen=True):
         """
         for point in path:
             if not self.travel_mm.holds(point, _ROUNDING_MM):
-                raise OutsideTravel(
-                    f"position {point} is outside the travel {self.travel_mm}; "
-                    "choose one inside, or move the grid's origin"
-                )
+                raise OutsideTravel(f"position {point} is outside the travel {self.travel_mm}; move the grid's origin")
         for start, end in pairwise(path):
             for box in self.keep_out:
                 if segment_meets(box, start, end):
-                    raise KeepOutCrossed(
-                        f"the way from {start} to {end} meets the keep-out box {box}; "
-                        "go around it by way of another position, or change the box"
-                    )
+                    raise KeepOutCrossed(f"the way from {start} to {end} meets the keep-out box {box}; go around it")
 
 
 def segment_meets(box: Box, start: Point, end: Point) -> bool:

@@ -29,12 +29,8 @@ class SimulatedFirmware(ABC):
 
     Parameters
     ----------
-    clock : SimulatedClock
-        The simulated time.
-    wire : Wire
-        The serial line to the host.
-    mechanics : Mechanics
-        The motors that it drives.
+    clock, wire, mechanics : SimulatedClock, Wire, Mechanics
+        The simulated time, the serial line to the host, and the motors.
     boot_s : float
         Time from a restart to the first line that it sends.
 
@@ -116,13 +112,7 @@ _MAX_WAIT_S = 0.05
 
 @dataclass
 class Server:
-    """A simulated controller and its port.
-
-    Parameters
-    ----------
-    port : str
-        Device that other programs open.
-    """
+    """A simulated controller, and the device `port` that other programs open."""
 
     port: str
     _clock: SimulatedClock
@@ -131,13 +121,7 @@ class Server:
     _far: int
 
     def run(self, speed: float = 1.0) -> None:
-        """Serve until interrupted.
-
-        Parameters
-        ----------
-        speed : float
-            Simulated seconds per real second.
-        """
+        """Serve until interrupted, `speed` simulated seconds per real second."""
         begun_s = time.monotonic()
         while True:
             self.turn(speed * (time.monotonic() - begun_s))
@@ -156,13 +140,7 @@ class Server:
 
 @contextmanager
 def serving(firmware: Callable[[SimulatedClock, Wire], SimulatedFirmware]) -> Iterator[Server]:
-    """Open a pseudo-terminal with a simulated controller behind it, and close it at the end.
-
-    Parameters
-    ----------
-    firmware : callable
-        Makes the controller from a clock and a wire.
-    """
+    """Open a pseudo-terminal with the controller behind it that `firmware` makes, and close it at the end."""
     clock = SimulatedClock()
     wire = Wire(clock)
     far, near = os.openpty()

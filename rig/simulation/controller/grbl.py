@@ -7,10 +7,11 @@ before GRBL has asked for it; a failed homing still answers `ok`; and only some 
 
 import re
 from collections.abc import Callable, Sequence
+from operator import sub
 from typing import ClassVar
 
 from faintfield.rig.simulation.controller.firmware import SimulatedFirmware, parse_parameters
-from faintfield.rig.simulation.controller.grbl_settings import StoredSettings, jog_error, status_report
+from faintfield.rig.simulation.controller.grbl_settings import StoredSettings, jog_error
 from faintfield.rig.simulation.controller.kinematics import Axis, Mechanics, Vector
 from faintfield.rig.simulation.controller.wire import SimulatedClock, Wire
 
@@ -30,16 +31,12 @@ class SimulatedGrbl(SimulatedFirmware):
 
     Parameters
     ----------
-    clock : SimulatedClock
-        The simulated time.
-    wire : Wire
-        The serial line to the host.
+    clock, wire : SimulatedClock, Wire
+        The simulated time, and the serial line to the host.
     settings : dict
         Values that differ from the defaults, by `$` number; settings survive restarts.
-    boot_s : float
-        Time from a restart to the banner.
-    play_mm : float
-        Play in both drives.
+    boot_s, play_mm : float
+        Time from a restart to the banner, and play in both drives.
 
     Attributes
     ----------
@@ -187,7 +184,13 @@ class SimulatedGrbl(SimulatedFirmware):
         self._reports_to_offset -= 1
         here = (*self.mechanics.commanded_mm(), 0.0)
         is_machine = int(self.settings.number(10)) & 1 == 1
-        self.say(status_report(self._reported_state(), here, self.work_offset, self._pins(), is_machine, tell_offset))
+        values = here if is_machine else tuple(map(sub, here, self.work_offset))
+        fields = [self._reported_state(), f"{'MPos' if is_machine else 'WPos'}:{_vector(values)}", "FS:0,0"]
+        if pins := self._pins():
+            fields.append(f"Pn:{pins}")
+        if tell_offset:
+            fields.append(f"WCO:{_vector(self.work_offset)}")
+        self.say(f"<{'|'.join(fields)}>")
 
     def _reported_state(self) -> str:
         return self.state
@@ -238,10 +241,10 @@ class SimulatedGrbl(SimulatedFirmware):
             return 0
         if self.state not in ("Idle", "Alarm"):
             return 8
-        if found := re.fullmatch(r"\$H([XY]?)", line):
-            if found[1] and not self.settings.homes_singly():
+        if match := re.fullmatch(r"\$H([XY]?)", line):
+            if match[1] and not self.settings.homes_singly():
                 return 3
-            return self._home(["XY".index(found[1])] if found[1] else [0, 1])
+            return self._home(["XY".index(match[1])] if match[1] else [0, 1])
         answer = self.settings.answer(line)
         if answer is None:
             return 3
@@ -309,3 +312,7 @@ class SimulatedGrbl(SimulatedFirmware):
         self.state = "Idle"
         self.say("ok")
         self._run_lines()
+
+
+def _vector(values: Sequence[float]) -> str:
+    return ",".join(f"{value:.3f}" for value in values)

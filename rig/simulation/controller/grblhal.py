@@ -17,22 +17,19 @@ _HOMING_REQUIRED = 11
 _HARMLESS = ("", "$I", "$$")
 
 
-class HalSettings(StoredSettings):
+class _HalSettings(StoredSettings):
     """The `$` settings of grblHAL."""
 
     def __init__(self, changes: dict[int, str]) -> None:
         super().__init__({22: "7", 40: "0", **changes})
 
     def margin_mm(self) -> float:
-        """Return how far from the ends of the travel the soft limits lie."""
         return self.number(27) if int(self.number(21)) & 1 else 0.0
 
     def homes_singly(self) -> bool:
-        """Return whether an axis can be homed by itself."""
         return bool(int(self.number(22)) & 2)
 
     def answer(self, command: str) -> list[str] | None:
-        """Return the lines that answer `$I`, `$$` or `$N=value`, which is stored; None for other commands."""
         if command != "$I":
             return super().answer(command)
         single = "H" if self.homes_singly() else ""
@@ -43,7 +40,7 @@ class SimulatedGrblHal(SimulatedGrbl):
     """Firmware, settings and mechanics of a grblHAL stage; the parameters are those of `SimulatedGrbl`."""
 
     _critical_alarms: ClassVar[tuple[int, ...]] = (1, 2, 10, 17)
-    _settings_type = HalSettings
+    _settings_type = _HalSettings
 
     def _reset_state(self) -> None:
         super()._reset_state()

@@ -17,10 +17,7 @@ type Vector = tuple[float, ...]
 class Profile:
     """Speed along a straight line over time, in pieces of constant acceleration.
 
-    Parameters
-    ----------
-    pieces : tuple of (float, float, float)
-        Duration (s), initial speed (mm/s) and acceleration (mm/s²) of each piece, in order.
+    Each piece has a duration (s), an initial speed (mm/s) and an acceleration (mm/s²).
     """
 
     pieces: tuple[tuple[float, float, float], ...]
@@ -75,10 +72,8 @@ class Axis:
 
     Parameters
     ----------
-    low_mm, high_mm : float
-        Ends of the mechanical travel.
-    carriage_mm : float
-        Position of the carriage.
+    low_mm, high_mm, carriage_mm : float
+        Ends of the mechanical travel, and position of the carriage.
     play_mm : float
         Distance that the motor turns after a reversal before the carriage follows.
 
@@ -120,16 +115,12 @@ class Mechanics:
 
     Parameters
     ----------
-    clock : SimulatedClock
-        The simulated time.
-    axes : (Axis, Axis)
-        x and y.
+    clock, axes : SimulatedClock, (Axis, Axis)
+        The simulated time; x and y.
     step_mm : float
         Distance of one motor step.
-    switch_mm : (float, float)
-        Positions at which the homing switches close.
-    switch_at_high_end : bool
-        Whether the switches are at the upper ends of the travel.
+    switch_mm, switch_at_high_end : (float, float), bool
+        Positions at which the homing switches close, and whether these are the upper ends of the travel.
     on_idle, on_switch : callable
         Called when the last motion ends, and when a motion closes a switch.
     endless : bool

@@ -33,16 +33,12 @@ class SimulatedMarlin(SimulatedFirmware):
 
     Parameters
     ----------
-    clock : SimulatedClock
-        The simulated time.
-    wire : Wire
-        The serial line to the host.
+    clock, wire : SimulatedClock, Wire
+        The simulated time, and the serial line to the host.
     travel_mm : (float, float)
         Lengths of the axes; coordinates run upwards from zero, where the switches are.
-    boot_s : float
-        Time from a restart to the first line.
-    play_mm : float
-        Play in both drives.
+    boot_s, play_mm : float
+        Time from a restart to the first line, and play in both drives.
     realtime_position : bool
         Whether M114 R reports the real position.
     """
@@ -123,16 +119,16 @@ class SimulatedMarlin(SimulatedFirmware):
 
     def _checked(self, line: str) -> str | None:
         """Return the command in a line, or None after asking for the line again."""
-        found = re.fullmatch(r"N(\d+) (.*)\*(\d+)", line)
-        if not found:
+        match = re.fullmatch(r"N(\d+) (.*)\*(\d+)", line)
+        if not match:
             if not line.startswith("N"):
                 return line
             self._ask_again("No Checksum with line number")
             return None
-        if reduce(xor, line.rpartition("*")[0].encode("ascii", errors="replace")) != int(found[3]):
+        if reduce(xor, line.rpartition("*")[0].encode("ascii", errors="replace")) != int(match[3]):
             self._ask_again("checksum mismatch")
             return None
-        number, command = int(found[1]), found[2]
+        number, command = int(match[1]), match[2]
         if command.startswith("M110"):
             self._last_line = int(parse_parameters(command).get("N", number))
             return command

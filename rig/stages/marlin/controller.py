@@ -9,7 +9,7 @@ from contextlib import suppress
 
 from faintfield.rig.errors import StageAlarm, StageLost, StageRejected, StageTimeout, WrongFirmware
 from faintfield.rig.stages.marlin import messages as marlin
-from faintfield.rig.stages.marlin.settings import MarlinSettings
+from faintfield.rig.stages.marlin.settings import marlin_identity
 from faintfield.rig.stages.motion import timeout_s
 from faintfield.rig.stages.protocol import AnswerTime, AxisIndex, Box, Identity, Point
 from faintfield.rig.stages.transport import LineTransport, Ok, restart_failure
@@ -37,16 +37,9 @@ _MAX_STARTS = 3
 
 
 class MarlinController:
-    """A `Controller` that speaks Marlin.
+    """A `Controller` that speaks Marlin over `line`; `axes` are its letters for the two axes.
 
-    Parameters
-    ----------
-    line : LineTransport
-        The connection.
-    axes : (str, str)
-        The controller's letters for the two axes.
-    travel_mm : Box, optional
-        The travel, for firmware that does not report it.
+    `travel_mm` is the travel, for firmware that does not report it.
     """
 
     def __init__(self, line: LineTransport, axes: tuple[str, str], travel_mm: Box | None) -> None:
@@ -69,7 +62,7 @@ class MarlinController:
         first, second = self._read_settings(), self._read_settings()
         if first != second:
             raise StageLost("the settings read differently twice in a row: the line is disturbed; try a shorter cable")
-        return MarlinSettings((*about, *first)).identity(self._axes, self._travel_mm)
+        return marlin_identity((*about, *first), self._axes, self._travel_mm)
 
     def home(self, axis: AxisIndex | None, bound_s: float) -> AnswerTime:
         """Home the named axis or both, and no others, such as a focus drive."""
@@ -160,9 +153,7 @@ class MarlinController:
                         self._command(command)
                     return
                 echoed = echoed or marker in text
-        raise StageTimeout(
-            f"no answer as from Marlin to {_MAX_STARTS} attempts; check power, baud rate and protocol of the controller"
-        )
+        raise StageTimeout(f"no answer as from Marlin to {_MAX_STARTS} attempts; check power, baud rate and protocol")
 
     def _keeps_count(self) -> bool | None:
         """Return whether the controller accepts the next line number, as none does after a restart; None if mute."""
@@ -205,9 +196,7 @@ class MarlinController:
             messages = self._await_ok(command, bound_s)
             if messages is not None:
                 return messages
-        raise StageLost(
-            f"line {self._line_number} arrived damaged {_MAX_SENDINGS} times in a row; use a shorter or shielded cable"
-        )
+        raise StageLost(f"line {self._line_number} arrived damaged {_MAX_SENDINGS} times in a row; use a shorter cable")
 
     def _await_ok(self, command: str, bound_s: float) -> list[marlin.Message] | None:
         """Return the messages up to the `ok`, or None if the controller asks for the line again."""
@@ -245,5 +234,5 @@ class MarlinController:
             )
         if isinstance(message, marlin.ErrorText) and not message.in_transmission:
             raise StageAlarm(
-                f"the controller says {message.text!r} to {command!r}; look for the cause, then recover and home it"
+                f"the controller says {message.text!r} to {command!r}; find the cause, recover and home it"
             )

@@ -17,8 +17,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from faintfield.rig.cameras.aravis import AravisCamera
-from faintfield.rig.cameras.aravis_device import AravisDevice
+from faintfield.rig.cameras.aravis import AravisCamera, AravisDevice
 from faintfield.rig.cameras.aravis_library import AravisLibrary, Reference
 from faintfield.rig.cameras.aravis_times import Moment
 from faintfield.rig.cameras.settings import AravisSettings
@@ -225,7 +224,7 @@ def test_frame_exposed_before_the_request_is_refused(fake: AravisCamera) -> None
     fake.expose(0.01, 1)
     late = mock.Mock(side_effect=lambda: Moment(time.monotonic_ns() + 10**9, time.time_ns() + 10**9))
     with (
-        mock.patch("faintfield.rig.cameras.aravis_device.Moment.now", late),
+        mock.patch("faintfield.rig.cameras.aravis.Moment.now", late),
         pytest.raises(CameraError, match="began before the request"),
     ):
         fake.expose(0.01, 2)

@@ -61,7 +61,7 @@ def test_exposure_is_either_file_or_array() -> None:
 
 def test_hanging_call_is_left_behind() -> None:
     never = threading.Event()
-    with pytest.raises(CameraTimeout, match=r"did not finish an exposure within 0\.01 s; "):
+    with pytest.raises(CameraTimeout, match=r"did not finish an exposure in 0\.01 s; "):
         call_within(0.01, never.wait, "an exposure")
     never.set()
     assert call_within(60.0, lambda: 7, "counting") == 7
@@ -245,7 +245,7 @@ def test_region_of_mosaic_begins_at_even_pixels() -> None:
 def test_missing_aravis_names_its_package() -> None:
     with (
         mock.patch("faintfield.rig.cameras.aravis_library.LIBRARY", "libaravis-0.0.so"),
-        pytest.raises(MissingExtra, match=r"needs libaravis-0\.0\.so, .*; run: apt-get install libaravis-0\.8-0"),
+        pytest.raises(MissingExtra, match=r"needs libaravis-0\.0\.so; run: apt-get install libaravis-0\.8-0"),
     ):
         AravisCamera(AravisSettings("Mono16")).open()
 
@@ -261,11 +261,11 @@ def test_failure_of_a_plugin_names_it() -> None:
     broken.open.side_effect = ValueError("no port")
     broken.expose.side_effect = [CameraTimeout("no frame"), ZeroDivisionError, frame]
     camera = PluginCamera("sky", broken)
-    with pytest.raises(CameraError, match="the plug-in 'sky' failed with ValueError: no port"):
+    with pytest.raises(CameraError, match="the plug-in 'sky' failed: ValueError: no port"):
         camera.open()
     with pytest.raises(CameraTimeout, match="no frame"):
         camera.expose(1.0, 1)
-    with pytest.raises(CameraError, match="'sky' failed with ZeroDivisionError"):
+    with pytest.raises(CameraError, match="'sky' failed: ZeroDivisionError"):
         camera.expose(1.0, 2)
     assert camera.expose(1.0, 3) is frame
     assert camera.report() is broken.report.return_value

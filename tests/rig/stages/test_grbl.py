@@ -65,7 +65,7 @@ def with_version(version: bytes, data: bytes) -> bytes:
 def test_wrong_firmware_is_refused(bench: Bench) -> None:
     for version in (b"[VER:0.9j.20160316:]", b"[VER:3.7 FluidNC v3.7.8:]"):
         bench.wire.filters_to_host[:] = [partial(with_version, version)]
-        with pytest.raises(WrongFirmware, match=r"1\.1 or grblHAL is needed"):
+        with pytest.raises(WrongFirmware, match=r"flash 1\.1 or grblHAL"):
             bench.stage().connect()
     bench.wire.filters_to_host.clear()
     with pytest.raises(WrongFirmware, match="use protocol 'grbl'"):

@@ -119,7 +119,7 @@ class RehearsedCore(SharedCore):
     def import_package(self) -> None:
         pass
 
-    def _loaded(self) -> Core:
+    def _load_core(self) -> Core:
         self.cores.append(Core(self.clock))
         return self.cores[-1]
 
