@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from faintfield.pipelines.commands.exports.colmap import export_colmap
-from faintfield.pipelines.commands.exports.mrcal import export_mrcal
+from faintfield.pipelines.commands.exports import export_colmap, export_mrcal
 from faintfield.pipelines.commands.reconstruct import reconstruct
 from faintfield.pipelines.commands.run import run
 from faintfield.pipelines.commands.verify import verify as verify_all
