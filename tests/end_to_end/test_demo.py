@@ -1,6 +1,5 @@
 """`faintfield demo`: small from capture to report; in deep the accuracy of `--quick` and of full size."""
 
-import importlib
 import json
 import os
 import re
@@ -18,7 +17,7 @@ from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import encoded
 from faintfield.pipelines.formats.results.records import JOINT_METHODS, Method
 from faintfield.pipelines.paper import demo as paper
-from faintfield.pipelines.reconstruction import request
+from faintfield.pipelines.workflows import demo as workflow
 
 METHODS = [method for method in get_args(Method.__value__) if method not in JOINT_METHODS]
 DEPTHS_MM = (500.0, 700.0)
@@ -64,9 +63,9 @@ def test_small_demo_from_capture_to_report(
 ) -> None:
     """Nine nodes, and two methods that are fast."""
     methods = ["backprojection", "pmlem-osl"]
-    monkeypatch.setattr(paper, "QUICK", paper.DemoSize(3, 100.0, (288, 216), 3))
-    monkeypatch.setattr(importlib.import_module("faintfield.pipelines.commands.demo"), "_METHODS", methods)
-    monkeypatch.setattr(request, "DEFAULT_METHOD", "pmlem-osl")
+    monkeypatch.setattr(workflow, "QUICK", paper.DemoSize(3, 100.0, (288, 216), 3))
+    monkeypatch.setattr(workflow, "_METHODS", methods)
+    monkeypatch.setattr(workflow, "DEFAULT_METHOD", "pmlem-osl")
     monkeypatch.setattr(Figure, "savefig", _save_nothing)  # text takes most of the time of a page
     out = tmp_path / "demo"
     assert run(["demo", str(out), "--quick", "--json"]) == 0
