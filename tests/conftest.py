@@ -1,6 +1,9 @@
 """Hypothesis draws the same examples in every run; `--hypothesis-profile=search` looks for new ones."""
 
+import pytest
 from hypothesis import settings
+
+pytest.register_assert_rewrite("tests")  # so that failures in helpers show values, too
 
 settings.register_profile("repeatable", deadline=None, derandomize=True, max_examples=50)
 settings.register_profile("search", deadline=None, max_examples=500)

@@ -170,6 +170,8 @@ def main(kind: str, seeds: str) -> int:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 3 or sys.argv[1] not in KINDS:
+        sys.exit(f"usage: python -m tests.faults.mutations KIND SEED|FIRST:LAST; the kinds are {', '.join(KINDS)}")
     if not os.environ.items() >= ONE_THREAD.items():
         words = [sys.executable, "-m", "tests.faults.mutations", *sys.argv[1:]]
         os.execve(sys.executable, words, os.environ | ONE_THREAD)
