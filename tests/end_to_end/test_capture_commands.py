@@ -14,6 +14,7 @@ from faintfield.rig.session.journal import Journal
 from faintfield.rig.session.session import taken_frames
 from faintfield.rig.simulation.lab import SimulatedLab
 from tests.end_to_end.rigs import write_small_rig
+from tests.faults.capturing import events
 
 # Kind and frames of each step of the rig.toml that `init` writes, on a grid of 2 x 2, with a frame for each exposure.
 STEPS = [*[("charuco", 4)] * 6, ("bright", 4), ("dark_scene", 4), ("noise_reference", 4), ("dark", 4), ("flat", 2)]
@@ -218,8 +219,7 @@ def test_check_compares_rig_with_session(small: Shell) -> None:
     assert "PlanRefused: the rig.toml differs" in small.words
     assert small.run("capture", small.rig, small.session, "--yes") == 1
     assert "PlanRefused: the rig.toml differs from the plan.json of the session: grid.pitch_mm was 50.0" in small.words
-    with Journal(small.session / "journal.sqlite", read_only=True) as journal:
-        assert journal.events("setting_changed") == []
+    assert events(small.session, "setting_changed") == []
     small.edit("pitch_mm = 40.0", "pitch_mm = 50.0")
     assert small.run("capture", small.rig, small.session, "--yes") == 0
     assert f"{changed[0]}, from now on" in small.words
