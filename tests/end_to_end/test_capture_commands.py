@@ -82,7 +82,7 @@ def test_whole_experiment_unattended(whole: Path, shell: Shell) -> None:
     assert [frame.stop.node for frame in frames[:4]] == [(0, 0), (0, 1), (1, 1), (1, 0)]
     assert {frame.exposure_s for frame in frames if frame.kind == "dark"} == {0.05, 0.1, 0.5, 1.0}
     with Journal(whole / "journal.sqlite", read_only=True) as journal:
-        assert [it.frame for it in journal.committed()] == list(range(FRAMES))
+        assert [committed.frame for committed in journal.committed()] == list(range(FRAMES))
         assert not journal.uncommitted()
         assert len(journal.events("drift_check")) == 9
         assert len(journal.events("settling")) == 1
@@ -104,12 +104,12 @@ def test_check_moves_nothing_and_counts_frames(shell: Shell) -> None:
         mock.patch("faintfield.rig.stages.gantry.Gantry.move_to") as move,
         mock.patch("faintfield.rig.stages.gantry.Gantry.home") as home,
     ):
-        found = shell.result("check", shell.rig)
+        result = shell.result("check", shell.rig)
         assert not move.called
         assert not home.called
-    assert found["frames"] == 501
-    assert found["disk_bytes"] == 501 * (2 * 64 * 48 + 512)
-    assert 300.0 < found["duration_s"] < 1000.0
+    assert result["frames"] == 501
+    assert result["disk_bytes"] == 501 * (2 * 64 * 48 + 512)
+    assert 300.0 < result["duration_s"] < 1000.0
     assert "501 frames in 11 steps" in shell.words
 
 

@@ -1,14 +1,13 @@
 """The page of a capture, in a real headless browser: what the terminal can do it can do, and the two agree."""
 
 import errno
-import http.client
 import re
 import socket
 import threading
 import time
 import urllib.parse
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from unittest import mock
 
@@ -28,7 +27,7 @@ from faintfield.rig.errors import CameraError, CaptureStopped, RigError
 from faintfield.rig.plan import planned_frames
 from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.verify import verify
-from tests.end_to_end.browser import Tab
+from tests.end_to_end.browser import Tab, answer_to
 from tests.end_to_end.rigs import write_small_rig
 from tests.faults.capturing import FRAMES, SMALL_RIG, events, frozen_plan
 from tests.patience import HANG_S
@@ -140,14 +139,6 @@ def test_no_name_becomes_part_of_page(browser: Tab) -> None:
         assert browser.evaluate("document.querySelectorAll('script').length") == 1
 
 
-def answer_to(address: str, method: str = "GET", body: bytes | None = None, **headers: str) -> http.client.HTTPResponse:
-    """Return the answer to a request with these headers."""
-    parts = urllib.parse.urlsplit(address)
-    with closing(http.client.HTTPConnection(parts.netloc)) as connection:
-        connection.request(method, parts.path, body, headers)
-        return connection.getresponse()
-
-
 def test_strangers_learn_nothing_and_press_nothing() -> None:
     panel = CapturePanel(unattended=True)
     with serve_page(panel) as address, serve_page(CapturePanel(unattended=True)) as other:
@@ -168,7 +159,7 @@ def test_strangers_learn_nothing_and_press_nothing() -> None:
         ]
         assert answer_to(address).status == answer_to(address + "state").status == 200
     assert [answer.status for answer in answers] == [404] * len(answers)
-    (headers,) = {tuple((name, value) for name, value in it.getheaders() if name != "date") for it in answers}
+    (headers,) = {tuple((name, value) for name, value in answer.getheaders() if name != "date") for answer in answers}
     names = {name for name, _ in headers}
     assert "server" not in names
     assert {"referrer-policy", "cache-control", "connection"} <= names

@@ -18,7 +18,7 @@ type Nature = Literal["wire", "controller", "mechanics"]
 
 @dataclass(frozen=True)
 class Fault:
-    """What can go wrong: the part affected, and what makes it happen on a bench.
+    """Fault of a stage: the part affected, and the function that causes it on a bench.
 
     Faults of the mechanics show in no report; only a drift check finds them. `kind` is that of the controllers that can
     have it.

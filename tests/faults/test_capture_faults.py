@@ -71,6 +71,11 @@ def test_always_busy_computer_ends_resumable_capture(tmp_path: Path) -> None:
     assert len(verify(lab.folder).suspect) == 6
 
 
+def groups_of_frames(folder: Path) -> list[int | None]:
+    groups = read_homing_groups(folder).groups
+    return [groups[committed.intent] for _, committed, _ in taken_frames(folder)]
+
+
 def test_homing_begins_a_group(tmp_path: Path) -> None:
     lab = Lab(tmp_path / "session", GRBL)
 
@@ -79,8 +84,7 @@ def test_homing_begins_a_group(tmp_path: Path) -> None:
     # The fifth exposure failed; the stage was homed before the sixth
     assert groups.groups == {intent: 1 if intent < 5 else 2 for intent in range(1, FRAMES + 2) if intent != 5}
     assert groups.spread_mm is None
-    by_frame = [groups.groups[committed.intent] for _, committed, _ in taken_frames(lab.folder)]
-    assert by_frame == [1] * 4 + [2] * (FRAMES - 4)
+    assert groups_of_frames(lab.folder) == [1] * 4 + [2] * (FRAMES - 4)
 
 
 def test_resumed_session_begins_a_homing_group(tmp_path: Path) -> None:
@@ -103,7 +107,7 @@ def test_spread_of_the_switches_is_that_of_checks(tmp_path: Path) -> None:
     assert groups.spread_mm == pytest.approx(np.std(away_mm, axis=0, ddof=1))
     assert groups.spread_mm[0] == pytest.approx(0.2 / 2**0.5, rel=0.01)
     # Each check homes, so that each step of the plan is a group of its own
-    assert [groups.groups[it.intent] for _, it, _ in taken_frames(lab.folder)] == [1] * 6 + [2] * 6 + [3] * 4
+    assert groups_of_frames(lab.folder) == [1] * 6 + [2] * 6 + [3] * 4
 
 
 def test_frames_without_a_confirming_check_are_suspect(tmp_path: Path) -> None:
@@ -116,10 +120,10 @@ def test_frames_without_a_confirming_check_are_suspect(tmp_path: Path) -> None:
     assert lab.run(at_exposures([8], slip_and_stop)) is None
     verdict = verify(lab.folder)
     # The check after the first step confirms its frames; the next homing was not preceded by a check
-    taken = taken_frames(lab.folder)
-    wrong = {it.file for frame, it, path in taken if error_mm(path, frame.stop.target) > ON_TARGET_MM}
+    frames = taken_frames(lab.folder)
+    wrong = {committed.file for frame, committed, path in frames if error_mm(path, frame.stop.target) > ON_TARGET_MM}
     assert wrong
-    assert wrong <= set(verdict.suspect) < {it.file for _, it, _ in taken[6:12]}
+    assert wrong <= set(verdict.suspect) < {committed.file for _, committed, _ in frames[6:12]}
 
 
 def test_frames_before_an_interrupted_check_are_suspect(tmp_path: Path) -> None:
@@ -142,8 +146,7 @@ def test_check_waits_for_last_frame_of_node(tmp_path: Path) -> None:
     )
     lab = Lab(tmp_path / "session", GRBL, every_two)
     assert lab.run() is None
-    groups = read_homing_groups(lab.folder).groups
-    assert [groups[it.intent] for _, it, _ in taken_frames(lab.folder)] == [1] * 6 + [2] * 6 + [3] * 6
+    assert groups_of_frames(lab.folder) == [1] * 6 + [2] * 6 + [3] * 6
     assert verify(lab.folder).suspect == ()
 
 
@@ -154,12 +157,12 @@ def test_lost_steps_repeat_their_frames(tmp_path: Path) -> None:
     lab = Lab(tmp_path / "session", GRBL, DRIFTING)
     assert lab.run(SLIP) is None
     lab.assert_true_positions()
+    (suspect,) = events(lab.folder, "suspect")
+    assert "lost its scale" in str(suspect.detail["message"])
     with Journal(lab.folder / "journal.sqlite", read_only=True) as journal:
-        suspects = journal.events("suspect")
-        assert len(suspects) == 1
-        assert "lost its scale" in str(suspects[0].detail["message"])
-        # Everything since the last good check, which was at the end of the first step
-        assert [it.frame for it in journal.committed() if it.void is not None] == list(range(6, 12))
+        void = [committed.frame for committed in journal.committed() if committed.void is not None]
+    # Everything since the last good check, which was at the end of the first step
+    assert void == list(range(6, 12))
     assert verify(lab.folder).superseded == 6
 
 

@@ -1,4 +1,4 @@
-"""Which settings a session keeps, which may change before it is resumed, and what is recorded of it."""
+"""Settings that a session keeps, settings that may change before it is resumed, and their records."""
 
 from pathlib import Path
 from unittest import mock

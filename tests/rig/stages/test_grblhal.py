@@ -1,4 +1,4 @@
-"""What grblHAL does otherwise than GRBL, and how the driver copes with it."""
+"""Differences of grblHAL from GRBL, and the driver's handling of them."""
 
 import contextlib
 from collections.abc import Callable
