@@ -21,15 +21,12 @@ from faintfield.pipelines.live.capture_page import serve_page
 from faintfield.pipelines.live.panel import CapturePanel, OpenPrompt, ShownFrame
 from faintfield.pipelines.live.terminal import TerminalView
 from faintfield.rig.capture.guide import Prompt, Status
-from faintfield.rig.capture.loop import Capture
-from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import CameraError, CaptureStopped, RigError
 from faintfield.rig.plan import planned_frames
-from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.verify import verify
 from tests.end_to_end.browser import Tab, answer_to
 from tests.end_to_end.rigs import write_small_rig
-from tests.faults.capturing import FRAMES, SMALL_RIG, events, frozen_plan
+from tests.faults.capturing import FRAMES, SMALL_RIG, capture, events, frozen_plan
 from tests.patience import HANG_S
 
 STOP = b'{"word": "stop"}'
@@ -62,11 +59,8 @@ class Running:
         return self.failure
 
     def _capture(self) -> None:
-        try:
-            with open_session(self.folder, frozen_plan(SMALL_RIG)) as session, TerminalView(self.panel).show():
-                Capture(session, open_rig(SMALL_RIG, session.journal), self.panel, lambda path: None).run()
-        except RigError as failure:
-            self.failure = failure
+        with TerminalView(self.panel).show():
+            self.failure = capture(self.folder, self.panel)
 
 
 @pytest.fixture

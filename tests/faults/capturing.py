@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from faintfield.rig.cameras.protocol import Decode, Pixels
 from faintfield.rig.cameras.settings import SimulatedSettings
-from faintfield.rig.capture.guide import Answer, OperatorRequest, Prompt, Status
+from faintfield.rig.capture.guide import Answer, OperatorInterface, OperatorRequest, Prompt, Status
 from faintfield.rig.capture.loop import Capture
 from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import open_rig
@@ -81,7 +81,7 @@ def frozen_plan(settings: RigSettings) -> FrozenPlan:
 def capture_small(
     folder: Path,
     settings: RigSettings = SMALL_RIG,
-    operator: Operator | None = None,
+    operator: OperatorInterface | None = None,
     decode: Decode = lambda path: None,
 ) -> None:
     """Begin or resume a session, and complete it."""
@@ -91,7 +91,7 @@ def capture_small(
 
 def capture(
     folder: Path,
-    operator: Operator | None = None,
+    operator: OperatorInterface | None = None,
     settings: RigSettings = SMALL_RIG,
     decode: Decode = lambda path: None,
 ) -> RigError | None:
