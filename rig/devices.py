@@ -64,16 +64,8 @@ class Rig:
 def open_rig(settings: RigSettings, traffic: TrafficLog | None = None, decode: Decode = lambda path: None) -> Rig:
     """Construct the stage and the camera of a rig.toml; neither is connected yet.
 
-    A real camera may look on while a simulated stage moves: a rehearsal without motors.
-
-    Parameters
-    ----------
-    settings : RigSettings
-        Content of the rig.toml.
-    traffic : TrafficLog, optional
-        Log of every byte to and from the stage.
-    decode : callable, optional
-        Reads the pixels of a frame's file; a watched folder then knows when a file is complete.
+    A real camera may look on while a simulated stage moves: a rehearsal without motors. `traffic` gets every byte to
+    and from the stage; `decode` reads the pixels of a file, so that a watched folder knows when a file is complete.
 
     Raises
     ------

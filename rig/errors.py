@@ -105,7 +105,10 @@ class PositionDrifted(_SuspectFrames, PositionLost):
 
 
 class DriftUnknown(_SuspectFrames):
-    """Homing could not be timed, as answers came late: nothing is known about lost steps; `suspect` as for drift."""
+    """Homing could not be timed, as answers were delayed: nothing is known about lost steps.
+
+    It has the frames since the last passed check in `suspect`, as `PositionDrifted` has.
+    """
 
     position_kept = True
 

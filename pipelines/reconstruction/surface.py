@@ -107,7 +107,7 @@ def reconstruct_surface(
     grid = plane_grid(elemental_set, 1.0)
     needed_bytes = _needed_bytes(grid.shape, len(layouts), proposal=request.settings.proposal)
     require_room(out, int(needed_bytes / (1 - SHARE_OF_DISK)))  # decoded frames take the rest
-    range_mm = limits_mm(elemental_set, request)
+    range_mm = limits_mm(elemental_set, request.depth_range_mm)
     find_range = request.depth_range_mm is None and imported_range_px(elemental_set) is None
     remove_leftovers(out)
     bins = default_bins(elemental_set)

@@ -19,7 +19,6 @@ from faintfield.pipelines.reconstruction.autofocus import overlap, searched_rang
 from faintfield.pipelines.reconstruction.comparison import BETWEEN_PIXELS
 from faintfield.pipelines.reconstruction.luminance import luminance
 from faintfield.pipelines.reconstruction.significance import check_places
-from faintfield.pipelines.reconstruction.surface_request import SurfaceRequest
 from faintfield.recon.errors import GeometryMismatch, NothingInFocus
 from faintfield.recon.surface.estimate import SurfaceEstimate, estimate_surface
 from faintfield.recon.surface.pinhole_views import PinholeViews
@@ -74,8 +73,8 @@ def check_views(elemental_set: ElementalSet, wanted: str) -> None:
         )
 
 
-def limits_mm(elemental_set: ElementalSet, request: SurfaceRequest) -> tuple[float, float]:
-    """Return the nearest and farthest depth to consider: those given, or where the views overlap.
+def limits_mm(elemental_set: ElementalSet, range_mm: tuple[float, float] | None) -> tuple[float, float]:
+    """Return the nearest and farthest depth to consider: those of a range, or where the views overlap.
 
     Raises
     ------
@@ -84,10 +83,10 @@ def limits_mm(elemental_set: ElementalSet, request: SurfaceRequest) -> tuple[flo
     NothingInFocus
         The views overlap nowhere.
     """
-    if request.depth_range_mm is None:
+    if range_mm is None:
         return searched_range_mm(elemental_set)
-    check_overlap(elemental_set, request.depth_range_mm)
-    return request.depth_range_mm
+    check_overlap(elemental_set, range_mm)
+    return range_mm
 
 
 def check_agreement(elemental_set: ElementalSet, range_mm: tuple[float, float], out: Path) -> None:

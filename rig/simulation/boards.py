@@ -80,10 +80,8 @@ def printed_board(
 
     Parameters
     ----------
-    name : str
-        Name of the plane.
-    picture : array (row, column)
-        Reflectance, 0…1.
+    name, picture : str, array (row, column)
+        Name of the plane, and its reflectance, 0…1.
     pitch_mm : float
         Distance of neighbouring samples of the picture.
     board : SimulatedBoard

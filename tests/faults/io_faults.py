@@ -55,7 +55,7 @@ class Fault:
 
 
 class Outcome(NamedTuple):
-    """How a command ended, how often the fault struck, and a file changed outside the folder."""
+    """End of a command, number of times that the fault struck, and a file changed outside the folder."""
 
     ended: Ended
     injected: int

@@ -13,8 +13,8 @@ import pytest
 from faintfield.calib.board import Board
 from faintfield.calib.geometry import BoardObservation, GeometrySettings, Node, Target, calibrate_geometry
 from faintfield.pipelines.commands.board import board
-from faintfield.pipelines.commands.geometry import GeometrySummary, geometry
-from faintfield.pipelines.commands.imports.mrcal import import_mrcal
+from faintfield.pipelines.commands.geometry import geometry
+from faintfield.pipelines.commands.imports import import_mrcal
 from faintfield.pipelines.commands.simulate import simulate
 from faintfield.pipelines.errors import BadValue, InputError, MissingFile
 from faintfield.pipelines.formats.exchange.colmap import read_model
@@ -28,6 +28,7 @@ from faintfield.pipelines.formats.results.geometry import (
 from faintfield.pipelines.formats.sets.board_set import load_board_set
 from faintfield.pipelines.formats.sets.elemental_set import load_set, with_measured_geometry
 from faintfield.pipelines.formats.sets.ground_truth import read_truth
+from faintfield.pipelines.workflows.geometry import GeometrySummary
 from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
 from tests.pipelines.conftest import Command
 from tests.pipelines.forms import check_layout

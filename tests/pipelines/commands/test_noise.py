@@ -30,7 +30,7 @@ def json_result(folder: Path) -> dict[str, Any]:
 def test_numbers_maps_and_page_are_written(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("faintfield.pipelines.pages.emva_page.emva_page", lambda *_, **__: "page")
+    monkeypatch.setattr("faintfield.pipelines.workflows.noise.emva_page", lambda *_, **__: "page")
     chip, rng = specimen(1, hot_fraction=0.005, prnu=0.01)
     folder = write_frames(tmp_path / "set", take_set(chip, rng, photons=(4000.0, 20000.0)), saturation_dn=65535.0)
     assert run(["noise", str(folder), "--json"]) == 0

@@ -11,8 +11,9 @@ import pytest
 import tifffile
 from scipy.spatial.transform import Rotation
 
-from faintfield.pipelines.commands.exports.colmap import export_colmap
-from faintfield.pipelines.commands.imports.colmap import import_colmap
+from faintfield.pipelines.arguments import ImportOptions
+from faintfield.pipelines.commands.exports import export_colmap
+from faintfield.pipelines.commands.imports import import_colmap
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.exchange.colmap import ColmapImage, ColmapModel, read_model, write_model
 from faintfield.pipelines.formats.exchange.imported_set import relative
@@ -171,9 +172,8 @@ def test_model_becomes_an_elemental_set(tmp_path: Path) -> None:
     for image in chosen:
         (tmp_path / image.name).parent.mkdir(exist_ok=True)
         cv2.imwrite(str(tmp_path / image.name), np.zeros((480, 640), np.uint16))
-    import_colmap(
-        tmp_path / "model", tmp_path / "set", images=tmp_path, mm_per_unit=1000, reference="radial r4.png", exposure_s=1
-    )
+    options = ImportOptions(images=tmp_path, mm_per_unit=1000, reference="radial r4.png", exposure_s=1)
+    import_colmap(tmp_path / "model", tmp_path / "set", options=options)
     elemental_set = load_set(tmp_path / "set")
     assert (elemental_set.lens.fx_px, elemental_set.lens.cx_px, elemental_set.lens.cy_px) == (800.0, 322.0, 237.75)
     expected = relative(*(image.rt_cam_world * [1, 1, 1, 1000, 1000, 1000] for image in reversed(chosen)))
@@ -206,4 +206,4 @@ def test_equal_names_of_images_are_refused(tmp_path: Path) -> None:
         (tmp_path / image.name).parent.mkdir()
         cv2.imwrite(str(tmp_path / image.name), np.zeros((480, 640), np.uint16))
     with pytest.raises(BadValue, match=r"right/0\.png: would become 0\.png"):
-        import_colmap(tmp_path / "model", tmp_path / "set", images=tmp_path, exposure_s=1)
+        import_colmap(tmp_path / "model", tmp_path / "set", options=ImportOptions(images=tmp_path))

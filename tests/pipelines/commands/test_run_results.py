@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from faintfield.pipelines.commands.exports.colmap import export_colmap
-from faintfield.pipelines.commands.exports.mrcal import export_mrcal
+from faintfield.pipelines.commands.exports import export_colmap, export_mrcal
 from faintfield.pipelines.commands.reconstruct import reconstruct
 from faintfield.pipelines.commands.run import run
 from faintfield.pipelines.commands.verify import verify as verify_all
@@ -95,7 +94,7 @@ class TestRun:
     def test_exactly_dependent_steps_run_again(self, session: Path) -> None:
         assert _ran(session) == []
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("faintfield.pipelines.pages.report.write_report", _refuse)
+            patch.setattr("faintfield.pipelines.workflows.reconstruct.write_report", _refuse)
             with pytest.raises(BadValue, match="begun"):
                 _ran(session, 500.0)
         assert _ran(session, 500.0) == ["report"], "that of the earlier planes is outdated"
@@ -113,7 +112,7 @@ class TestRun:
             if kind == "dark_scene":
                 assert _ran(session) == ["reconstruct"]
                 assert f"warning: frames/{frame.name} and 0 other frames are not what was" in capsys.readouterr().err
-        monkeypatch.setattr("faintfield.pipelines.commands.run.noise", _refuse)
+        monkeypatch.setattr("faintfield.pipelines.workflows.session.measure_sensor", _refuse)
         with pytest.raises(BadValue, match="still to be done: noise, reconstruct, report"):
             _ran(session)
 
@@ -149,11 +148,11 @@ class TestRun:
 
     def test_other_lens_or_maps_begin_their_step(self, session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         with monkeypatch.context() as patch:
-            patch.setattr("faintfield.pipelines.commands.run.geometry", _refuse)
+            patch.setattr("faintfield.pipelines.workflows.session.measure_stage", _refuse)
             with pytest.raises(BadValue, match="begun"):
                 run(session, options=_options(), lens="opencv4")
         _flip_last_bit(session / "noise_maps.npz")
-        monkeypatch.setattr("faintfield.pipelines.commands.run.noise", _refuse)
+        monkeypatch.setattr("faintfield.pipelines.workflows.session.measure_sensor", _refuse)
         with pytest.raises(BadValue, match="begun"):
             _ran(session)
 

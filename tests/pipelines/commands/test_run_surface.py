@@ -64,7 +64,8 @@ def test_interrupt_leaves_no_page_of_earlier_surface(
     _ran(session)
 
     with monkeypatch.context() as patch:
-        patch.setattr("faintfield.pipelines.pages.report.write_report", mock.Mock(side_effect=KeyboardInterrupt))
+        interrupt = mock.Mock(side_effect=KeyboardInterrupt)
+        patch.setattr("faintfield.pipelines.workflows.reconstruct.write_report", interrupt)
         with pytest.raises(KeyboardInterrupt):
             _ran(session, depth_range_mm="400:1000")
     assert not (session / "reconstructions" / "report.html").exists()

@@ -10,8 +10,8 @@ import pytest
 import tifffile
 
 from faintfield.pipelines.cli import run
-from faintfield.pipelines.commands.exports.emva1288 import export_emva1288
-from faintfield.pipelines.commands.imports.emva1288 import import_emva1288
+from faintfield.pipelines.commands.exports import export_emva1288
+from faintfield.pipelines.commands.imports import import_emva1288
 from faintfield.pipelines.errors import BadValue, MissingFile, OutputExists
 from faintfield.pipelines.formats.exchange.emva1288 import read_descriptor
 from faintfield.pipelines.formats.files import sha256
@@ -56,7 +56,7 @@ def test_reference_data_become_a_noise_set(tmp_path: Path) -> None:
     descriptor = write_data(tmp_path / "data")
     (tmp_path / "data" / "images" / "d_0.png").rename(tmp_path / "data" / "d_1.png")
     descriptor.write_text(DESCRIPTOR.replace("images\\d_0.png", "d_1.png"))
-    assert import_emva1288(descriptor, tmp_path / "set")["frames"] == 8
+    assert import_emva1288(descriptor, tmp_path / "set").frames == 8
     folder, settings = load_noise_set(tmp_path / "set")
     assert folder == tmp_path / "set"
     assert settings.saturation_dn == 4095
