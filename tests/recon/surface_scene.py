@@ -31,6 +31,13 @@ FAR, NEAR, UNMOVED = 1 / 600, 1 / 500, 1 / 560
 EDGES_PX = (17.5, 57.5, 12.5, 46.5)
 READ_VARIANCE_E2 = 2.0
 
+# Light in electrons per pixel: its detail, 40 % of it, has about 1.4 times the noise's deviation
+LEVEL_E = 20.0
+
+# 1/depth of the search, fewer than `equal_steps` would take, for speed
+FARTHEST, NEAREST = 1 / 650, 1 / 465
+DEPTHS = np.linspace(FARTHEST, NEAREST, 24)
+
 
 def matrices() -> NDArray[np.float64]:
     """Return matrices from (x, y, 1, 1/depth) to the ray of each view (view, 3, 4)."""

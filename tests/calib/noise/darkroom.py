@@ -20,8 +20,8 @@ class Sensor:
 
     shape: tuple[int, int] = (64, 64)
     offset_dn: float = 100.0
-    gain_dn_per_e: float = 2.0
-    read_noise_e: float = 12.0**0.5
+    gain_dn_per_e: float | NDArray[np.float64] = 2.0
+    read_noise_e: float | NDArray[np.float64] = 12.0**0.5
     dark_current_e_per_s: float = 0.2
     dsnu_e: float = 1.5
     dcnu: float = 0.0
@@ -33,6 +33,7 @@ class Sensor:
     quantum_efficiency: float = 0.5
     well_e: float = np.inf  # mean over the pixels, which differ by 3 %
     ceiling_dn: float = 65535.0
+    jump_e: float | NDArray[np.float64] = 0.0  # of pixels that are up in half of the frames
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,8 @@ def expose(chip: Chip, exposure_s: float, rng: np.random.Generator, photons: flo
     sensor = chip.sensor
     mean_e = chip.dark_current_e_per_s * exposure_s + sensor.quantum_efficiency * photons * chip.response
     signal_e = np.minimum(rng.poisson(mean_e), chip.well_e) + rng.normal(0, sensor.read_noise_e, sensor.shape)
+    if np.any(sensor.jump_e):
+        signal_e += sensor.jump_e * (rng.random(sensor.shape) < 0.5)
     signal_dn = sensor.gain_dn_per_e * signal_e
     if sensor.bend_per_dn:
         # The charge e makes the signal s with e·g = s (1 + κ s).
@@ -113,7 +116,7 @@ def with_flats(
     return [*series, *(flat_series(chip, light, frames, rng, level=level) for level, light in enumerate(photons))]
 
 
-def specimen(seed: int, **changes: object) -> tuple[Chip, np.random.Generator]:
+def specimen(seed: int | np.random.Generator, **changes: object) -> tuple[Chip, np.random.Generator]:
     """Make a chip of the paper's camera with some fields changed, and the generator to expose it with."""
     rng = np.random.default_rng(seed)
     return make_chip(replace(Sensor(), **changes), rng), rng  # type: ignore[arg-type] # fields are named by the test

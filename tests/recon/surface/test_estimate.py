@@ -14,12 +14,20 @@ from faintfield.recon.surface.estimate import SurfaceEstimate, estimate_surface
 from faintfield.recon.surface.evidence import DepthEvidence, Halves
 from faintfield.recon.surface.pinhole_views import UNKNOWN, PinholeViews
 from tests.recon import surface_scene
-from tests.recon.surface_scene import AXIS, FAR, FOCAL_PX, GRID, NEAR, NODE_MM, NODES, READ_VARIANCE_E2, SHAPE, UNMOVED
-
-# Light in electrons per pixel: its detail, 40 % of it, has about 1.4 times the noise's deviation
-LEVEL_E = 20.0
-FARTHEST, NEAREST = 1 / 650, 1 / 465
-DEPTHS = np.linspace(FARTHEST, NEAREST, 24)  # fewer than `equal_steps` would take, for speed
+from tests.recon.surface_scene import (
+    AXIS,
+    DEPTHS,
+    FAR,
+    FOCAL_PX,
+    GRID,
+    LEVEL_E,
+    NEAR,
+    NODE_MM,
+    NODES,
+    READ_VARIANCE_E2,
+    SHAPE,
+    UNMOVED,
+)
 
 # Cameras that are equal steps apart, up to 2 mm
 ALMOST_REGULAR_MM = NODE_MM * (NODES[:, ::-1] - 2) + np.random.default_rng(4).uniform(-2, 2, (25, 2))
@@ -118,18 +126,16 @@ def _estimate_of(
 ) -> SurfaceEstimate:
     """Return the surface of the given light (view, row, column), with noise."""
     generator = np.random.default_rng(seed)
-    known = generator.poisson(np.maximum(light, 0)) + generator.normal(0, READ_VARIANCE_E2**0.5, light.shape)
-    counted = np.where(light == UNKNOWN, UNKNOWN, known).astype(np.float32)
+    counted = generator.poisson(light) + generator.normal(0, READ_VARIANCE_E2**0.5, light.shape)
     rays = surface_scene.matrices() if matrices is None else matrices
-    views = PinholeViews(counted, READ_VARIANCE_E2, rays, (FOCAL_PX, FOCAL_PX), AXIS, GRID)
+    views = PinholeViews(counted.astype(np.float32), READ_VARIANCE_E2, rays, (FOCAL_PX, FOCAL_PX), AXIS, GRID)
     return estimate_surface(views, DEPTHS, NODES)
 
 
 def _sure(result: SurfaceEstimate, truth: NDArray[np.float64] | float | None = None) -> tuple[float, float]:
     """Return the shares of all samples that are sure and right, and sure and wrong."""
-    right = (
-        np.abs(result.inverse_depth / (surface_scene.inverse_depth() if truth is None else truth) - 1) < RIGHT_WITHIN
-    )
+    expected = surface_scene.inverse_depth() if truth is None else truth
+    right = np.abs(result.inverse_depth / expected - 1) < RIGHT_WITHIN
     sure = result.confidence >= SURE
     return float((sure & right).mean()), float((sure & ~right).mean())
 

@@ -15,13 +15,9 @@ from faintfield.recon.surface.held_out import predicted, seen_of, squared_errors
 from faintfield.recon.surface.pinhole_views import UNKNOWN, PinholeViews
 from faintfield.recon.surface.sweep import equal_steps, found_range
 from tests.recon import surface_scene
-from tests.recon.surface_scene import FAR, NEAR, NODES, SHAPE
+from tests.recon.surface_scene import DEPTHS, FAR, FARTHEST, LEVEL_E, NEAR, NEAREST, NODES, SHAPE
 
-# Light in electrons per pixel: its detail, 40 % of it, has about 1.4 times the noise's deviation
-LEVEL_E = 20.0
 LEFT_OUT = np.array([1, 8, 12, 15, 23])
-FARTHEST, NEAREST = 1 / 650, 1 / 465
-DEPTHS = np.linspace(FARTHEST, NEAREST, 24)
 
 
 @pytest.mark.parametrize(
