@@ -64,12 +64,14 @@ def expected_light(level_e: float) -> NDArray[np.float64]:
     return level_e * np.array(views)
 
 
-def drawn_views(level_e: float, seed: int = 5) -> PinholeViews:
-    """Return the views with Poisson light and read noise."""
+def drawn_views(level_e: float) -> PinholeViews:
+    return noisy_views_of(expected_light(level_e), 5)
+
+
+def noisy_views_of(light: NDArray[np.floating], seed: int) -> PinholeViews:
+    """Return views with Poisson light and read noise."""
     generator = np.random.default_rng(seed)
-    light = expected_light(level_e)
-    counted = generator.poisson(light) + generator.normal(0, READ_VARIANCE_E2**0.5, light.shape)
-    return views_of(counted)
+    return views_of(generator.poisson(light) + generator.normal(0, READ_VARIANCE_E2**0.5, light.shape))
 
 
 def views_of(light: NDArray[np.floating]) -> PinholeViews:

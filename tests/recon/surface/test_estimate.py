@@ -1,5 +1,6 @@
 """Surfaces from simulated views against the truth; misleading scenes, where nothing may be sure and wrong."""
 
+from dataclasses import replace
 from functools import cache
 from unittest.mock import patch
 
@@ -14,20 +15,7 @@ from faintfield.recon.surface.estimate import SurfaceEstimate, estimate_surface
 from faintfield.recon.surface.evidence import DepthEvidence, Halves
 from faintfield.recon.surface.pinhole_views import UNKNOWN, PinholeViews
 from tests.recon import surface_scene
-from tests.recon.surface_scene import (
-    AXIS,
-    DEPTHS,
-    FAR,
-    FOCAL_PX,
-    GRID,
-    LEVEL_E,
-    NEAR,
-    NODE_MM,
-    NODES,
-    READ_VARIANCE_E2,
-    SHAPE,
-    UNMOVED,
-)
+from tests.recon.surface_scene import DEPTHS, FAR, FOCAL_PX, LEVEL_E, NEAR, NODE_MM, NODES, SHAPE, UNMOVED
 
 # Cameras that are equal steps apart, up to 2 mm
 ALMOST_REGULAR_MM = NODE_MM * (NODES[:, ::-1] - 2) + np.random.default_rng(4).uniform(-2, 2, (25, 2))
@@ -125,11 +113,8 @@ def _estimate_of(
     light: NDArray[np.float64], matrices: NDArray[np.float64] | None = None, seed: int = 7
 ) -> SurfaceEstimate:
     """Return the surface of the given light (view, row, column), with noise."""
-    generator = np.random.default_rng(seed)
-    counted = generator.poisson(light) + generator.normal(0, READ_VARIANCE_E2**0.5, light.shape)
-    rays = surface_scene.matrices() if matrices is None else matrices
-    views = PinholeViews(counted.astype(np.float32), READ_VARIANCE_E2, rays, (FOCAL_PX, FOCAL_PX), AXIS, GRID)
-    return estimate_surface(views, DEPTHS, NODES)
+    views = surface_scene.noisy_views_of(light, seed)
+    return estimate_surface(views if matrices is None else replace(views, ray_from_surface=matrices), DEPTHS, NODES)
 
 
 def _sure(result: SurfaceEstimate, truth: NDArray[np.float64] | float | None = None) -> tuple[float, float]:

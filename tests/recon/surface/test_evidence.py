@@ -66,11 +66,9 @@ def test_range_contains_the_scene_and_little_more(farthest: float, nearest: floa
 
 
 def test_noise_alone_has_no_range() -> None:
-    level_e = 5.0
-    noise = np.random.default_rng(1)
-    light = noise.poisson(level_e, (25, *SHAPE)) + noise.normal(0, surface_scene.READ_VARIANCE_E2**0.5, (25, *SHAPE))
+    views = surface_scene.noisy_views_of(np.full((25, *SHAPE), 5.0), 1)
     with pytest.raises(NothingInFocus, match=r"^the views tell the depth of [0-9.]+% of the picture; give"):
-        found_range(surface_scene.views_of(light), NODES, 1 / 1000, 1 / 380)
+        found_range(views, NODES, 1 / 1000, 1 / 380)
 
 
 def _evidence(views: PinholeViews) -> DepthEvidence:
