@@ -43,8 +43,8 @@ def matrix_by_ray_casting(case: Case) -> Image:
                 column, row = (hits_mm[i, j] - case.grid.origin_mm) / case.grid.pitch_mm
                 at = min(max(row, 0.0), rows - 1.0), min(max(column, 0.0), columns - 1.0)
                 weights = np.outer(tent(at[0], rows), tent(at[1], columns)).ravel()
-                beside = max(abs(at[0] - row), abs(at[1] - column)) > EDGE_TOLERANCE
-                counts = in_front[i, j] and case.valid[view, i, j] and not beside
+                outside = max(abs(at[0] - row), abs(at[1] - column)) > EDGE_TOLERANCE
+                counts = in_front[i, j] and case.valid[view, i, j] and not outside
                 matrix.append(weights * case.flat[lattice, i, j] if counts else 0 * weights)
     return np.stack(matrix)
 

@@ -94,8 +94,8 @@ def cast_views() -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.bool
     sights = [step_scene.cast(rt) for rt in poses()]
     what = np.stack([sight.what for sight in sights])
     away = [(x, y) for x in (-2.0, -1.0, 0.0, 1.0, 2.0) for y in (-2.0, -1.0, 0.0, 1.0, 2.0)]
-    beside = [np.stack([step_scene.cast(rt, shift).what for rt in poses()]) == what for shift in away]
-    return what, np.stack([sight.light for sight in sights]), np.all(beside, axis=0)
+    same = [np.stack([step_scene.cast(rt, shift).what for rt in poses()]) == what for shift in away]
+    return what, np.stack([sight.light for sight in sights]), np.all(same, axis=0)
 
 
 @pytest.mark.parametrize(("dtype", "atol"), [(np.float64, 1e-9), (np.float32, 1e-4)])

@@ -83,9 +83,9 @@ def _index_of(inverse_depth: NDArray[np.float64]) -> NDArray[np.float64]:
 def test_right_surface_predicts_better_than_rivals() -> None:
     evidence = _evidence(surface_scene.drawn_views(LEVEL_E))
     kept = np.concatenate(evidence.halves)
-    beside = [kept[np.abs(NODES[kept] - NODES[view]).sum(axis=1) == 1] for view in LEFT_OUT]
-    right = predicted(evidence, _index_of(surface_scene.inverse_depth()), LEFT_OUT, beside)
-    wrong = predicted(evidence, _index_of(np.full(SHAPE, FAR)), LEFT_OUT, beside)
+    neighbours = [kept[np.abs(NODES[kept] - NODES[view]).sum(axis=1) == 1] for view in LEFT_OUT]
+    right = predicted(evidence, _index_of(surface_scene.inverse_depth()), LEFT_OUT, neighbours)
+    wrong = predicted(evidence, _index_of(np.full(SHAPE, FAR)), LEFT_OUT, neighbours)
     assert right.neighbours is not None
     assert 0.95 < right.surface < 1.4  # noise, and the cost of smoothing the light
     assert right.surface < 0.8 * wrong.surface
@@ -102,9 +102,9 @@ def test_neighbours_predict_faint_light_without_bias() -> None:
     generator = np.random.default_rng(4)
     light = 2.0 + generator.normal(0, 2.0, (25, *SHAPE))
     light[generator.random(light.shape) < 1 / 3] = UNKNOWN
-    beside = [np.setdiff1d(np.arange(25), LEFT_OUT)[:4]] * len(LEFT_OUT)
+    neighbours = [np.setdiff1d(np.arange(25), LEFT_OUT)[:4]] * len(LEFT_OUT)
     far = _index_of(np.full(SHAPE, FAR))
-    prediction = predicted(_evidence(surface_scene.views_of(light)), far, LEFT_OUT, beside)
+    prediction = predicted(_evidence(surface_scene.views_of(light)), far, LEFT_OUT, neighbours)
     assert prediction.neighbours == pytest.approx(1, abs=0.03)
     light[LEFT_OUT] = UNKNOWN
     prediction = predicted(_evidence(surface_scene.views_of(light)), far, LEFT_OUT, [])
