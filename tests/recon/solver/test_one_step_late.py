@@ -1,6 +1,5 @@
 """One-step-late PMLEM against dense algebra and its limits; total variation against its derivative."""
 
-from collections.abc import Sequence
 from itertools import islice
 from typing import Any
 
@@ -25,19 +24,16 @@ from tests.recon.operator_contract import dense_matrix
 from tests.recon.small_problems import SHAPE, box, shifted_views
 
 
-def shifted_data(images: ElementalImages) -> Image:
-    return np.asarray(np.maximum(images.electrons + images.read_variance_e2, 0)).ravel()
-
-
 @pytest.mark.parametrize(("penalty_weight", "variance_e2"), [(0.0, 0.0), (0.4, 12.0)])
 def test_each_pass_agrees_with_dense_algebra(penalty_weight: float, variance_e2: float) -> None:
     operator = shifted_views(4)
     images = noisy_images(operator, box(2, 6), 0.3, variance_e2, 2)
     f = np.random.default_rng(4).uniform(1, 5, SHAPE)
     matrix, s = dense_matrix(operator), operator.sensitivity()
+    shifted = np.maximum(images.electrons + variance_e2, 0).ravel()
     for iterate in islice(pmlem_one_step_late(operator, images, f, penalty_weight=penalty_weight, epsilon=0.5), 3):
         expected = matrix @ f.ravel() + images.background_e + variance_e2
-        back = (matrix.T @ (shifted_data(images) / expected)).reshape(SHAPE)
+        back = (matrix.T @ (shifted / expected)).reshape(SHAPE)
         next_f = f / (s + penalty_weight * total_variation_gradient(f, 0.5)) * back
         fixed = ~updated_samples(s, penalty_weight)
         next_f[fixed] = f[fixed]
@@ -77,10 +73,6 @@ def test_large_weight_oscillates_and_small_weight_settles() -> None:
     assert (sensitivity[updated] > 2 * weight).all()
 
 
-def history(changes: Sequence[float], alternation: float) -> list[IterationStep]:
-    return [IterationStep(k + 1, change, alternation) for k, change in enumerate(changes)]
-
-
 @pytest.mark.parametrize(
     ("changes", "alternation", "verdict"),
     [
@@ -94,7 +86,8 @@ def history(changes: Sequence[float], alternation: float) -> list[IterationStep]
 def test_oscillation_is_opposing_steps_that_do_not_shrink(
     changes: list[float], alternation: float, verdict: bool
 ) -> None:
-    assert oscillates(history(changes, alternation), tolerance=1e-3) is verdict
+    steps = [IterationStep(k + 1, change, alternation) for k, change in enumerate(changes)]
+    assert oscillates(steps, tolerance=1e-3) is verdict
 
 
 def test_weight_beyond_its_limit_is_refused() -> None:
