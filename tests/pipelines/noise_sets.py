@@ -56,6 +56,17 @@ def measure_sensor(folder: Path, out: Path | None = None) -> NoiseRecord:
         return noise(folder, out=out)
 
 
+def check_noise_of_eq_6(electrons: NDArray[Any], expected: NDArray[np.float64], read_e2: float) -> NDArray[np.float64]:
+    """Assert that electrons scatter as Poisson counts and read noise do; return the normalised residuals."""
+    variance = expected + read_e2
+    normalised = np.asarray((electrons - expected) / np.sqrt(variance))
+    assert abs(normalised.mean()) < 4 / np.sqrt(normalised.size)
+    # A nearly normal number's square has the variance 2, and a Poisson count of mean μ adds μ / variance² to it
+    deviation = np.sqrt(np.mean(2 + expected / variance**2) / normalised.size)
+    assert abs(np.mean(normalised**2) - 1) < 4 * deviation
+    return normalised
+
+
 def deviation_of_snr(snr: float, mean_e: NDArray[np.float64], read_e2: float, region: NDArray[np.bool_]) -> float:
     """Return the deviation of a measured SNR, <g²> / <n²> - 1, whose g are the pixels of a region.
 
