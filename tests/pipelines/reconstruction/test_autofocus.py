@@ -71,18 +71,6 @@ def test_another_order_is_refused_with_its_option(scene: Path, tmp_path: Path, e
 
 
 @pytest.mark.deep
-def test_views_that_show_no_depth_are_refused(tmp_path: Path, faintfield: Command) -> None:
-    def other_scene(node: Node) -> NDArray[np.floating]:
-        return 200 * light_field(CARDS, (1, 1), SIZE_PX, seed=2010 + NODES * node[0] + node[1])[0, 0]
-
-    folder = _write_grid(tmp_path / "set", other_scene)
-    ended = faintfield("reconstruct", folder, "--depth-mm", "auto", "--out", tmp_path / "out")
-    assert ended.returncode == 1
-    assert re.search(r"NothingInFocus: .* no better than shuffled ones \(p = [0-9.]+ of 499 shuffles", ended.stderr)
-    assert not (tmp_path / "out" / "reconstruction.json").exists()
-
-
-@pytest.mark.deep
 @pytest.mark.parametrize("kind", ["noise", "other scenes", "shuffled views"])
 def test_meaningless_sets_are_accepted_as_rarely_as_stated(kind: str, scene: Path, tmp_path: Path) -> None:
     elemental_set = load_set(scene)

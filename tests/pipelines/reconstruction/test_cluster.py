@@ -1,6 +1,7 @@
 """A sweep on dask.distributed: the same planes, and what is lost when a worker dies or a task fails."""
 
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Generator, Iterator, Sequence
@@ -10,6 +11,7 @@ from typing import Any
 import pytest
 
 from faintfield.pipelines.formats.files import UNFINISHED
+from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.plane_poses import Place
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
 from faintfield.pipelines.reconstruction.cluster import make_runner
@@ -17,9 +19,8 @@ from faintfield.pipelines.reconstruction.request import Request
 from faintfield.pipelines.reconstruction.run import reconstruct_set
 from faintfield.pipelines.reconstruction.solutions import Settings
 from faintfield.pipelines.reconstruction.tasks import PlaneTask
-from tests.pipelines.conftest import Command
+from tests.pipelines.conftest import Command, Edit, assert_refused
 from tests.pipelines.forms import plane_files
-from tests.pipelines.refusals import assert_refused
 
 distributed = pytest.importorskip("distributed")
 
@@ -83,15 +84,13 @@ def test_task_that_fails_is_failure_of_command(cluster: Any, scene: Path, tmp_pa
     "options", [("--prior", "tv", "--occlusion"), pytest.param(("--prior", "patches"), marks=pytest.mark.deep)]
 )
 def test_workers_give_same_colour_planes_with_saturated_pixels(
-    options: tuple[str, ...], tmp_path: Path, done: Command, small_options: tuple[object, ...]
+    options: tuple[str, ...], colour_set: Path, tmp_path: Path, edit: Edit, done: Command
 ) -> None:
-    done("simulate", tmp_path / "set", *small_options, "--colour", "bayer", "--snr", 60)
-    settings = tmp_path / "set" / "elemental.toml"
-    text = settings.read_text()
-    settings.write_text(text.replace("saturation_dn = 65535", "saturation_dn = 8000"))
-    assert settings.read_text() != text
+    folder = Path(shutil.copytree(colour_set, tmp_path / "set"))
+    edit(folder, lambda settings: settings["noise"].update(saturation_dn=150.0))
+    assert max(read_frame(path).pixels_dn.max() for path in load_set(folder).image_paths) >= 150
     quick = ("--depth-mm", 500, "--depth-mm", 700, "--passes", 1, "--penalty-weight", 1)
-    words = ("reconstruct", tmp_path / "set", *quick, *options)
+    words = ("reconstruct", folder, *quick, *options)
     done(*words, "--out", tmp_path / "local")
     done(*words, "--out", tmp_path / "spread", "--workers", 1)
     assert plane_files(tmp_path / "spread") == plane_files(tmp_path / "local")

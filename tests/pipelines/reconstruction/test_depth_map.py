@@ -27,9 +27,8 @@ from faintfield.pipelines.reconstruction.comparison import binned_views
 from faintfield.pipelines.reconstruction.depth_accuracy import write_depth_errors
 from faintfield.recon.depth.focus import SURE
 from faintfield.recon.surface import confidence
-from tests.pipelines.conftest import Command, Edit, SetMaker, run_undrawn
+from tests.pipelines.conftest import Command, Edit, SetMaker, assert_refused, run_undrawn
 from tests.pipelines.forms import read_record
-from tests.pipelines.refusals import assert_refused
 from tests.pipelines.surfaces import FOUND_CONFIDENCE, FOUND_MM, Searches
 
 SWEEP = ("--sweep-mm", "400:900:11", "--method", "backprojection", "--depth-map")
@@ -99,27 +98,33 @@ def test_surfaces_have_no_stairs_and_end_with_sweep(tmp_path: Path, done: Comman
 
 
 def test_only_damaged_maps_are_made_again(seen: Searches, simulated_scene: Path, tmp_path: Path, done: Command) -> None:
-    call = ("reconstruct", simulated_scene, "--out", tmp_path, "--sweep-mm", "400:900:5", *SWEEP[2:])
-    done(*call)
-    before = {name: (tmp_path / name).stat().st_mtime_ns for name in MAPS}
-    assert "5 of 5 planes are there" in done(*call).stderr
-    assert {name: (tmp_path / name).stat().st_mtime_ns for name in MAPS} == before
-    kept = (tmp_path / MAPS[0]).read_bytes()
-    (tmp_path / MAPS[0]).write_bytes(b"not a map")
-    done(*call)
-    assert (tmp_path / MAPS[0]).read_bytes() == kept
+    """Planes of one pitch make one picture, too."""
+    out, own = tmp_path / "out", tmp_path / "own"
+    call = ("reconstruct", simulated_scene, "--sweep-mm", "400:900:5", *SWEEP[2:], "--out")
+    done(*call, out)
+    before = {name: (out / name).stat().st_mtime_ns for name in MAPS}
+    assert "5 of 5 planes are there" in done(*call, out).stderr
+    assert {name: (out / name).stat().st_mtime_ns for name in MAPS} == before
+    kept = (out / MAPS[0]).read_bytes()
+    (out / MAPS[0]).write_bytes(b"not a map")
+    done(*call, out)
+    assert (out / MAPS[0]).read_bytes() == kept
+    done(*call, own, "--pitch-mm", 3)
+    usual, picture = (read_frame(folder / "all_in_focus.tiff").pixels_dn for folder in (out, own))
+    assert picture.shape == read_frame(own / "plane_00900.0.tiff").pixels_dn.shape != usual.shape
+    same = cv2.resize(picture, usual.shape[::-1], interpolation=cv2.INTER_AREA)
+    assert np.corrcoef(same.ravel(), usual.ravel())[0, 1] > 0.9
 
 
 def test_disparities_and_colours_are_kept(
-    seen: Searches, tmp_path: Path, done: Command, small_options: tuple[object, ...], monkeypatch: pytest.MonkeyPatch
+    seen: Searches, colour_set: Path, tmp_path: Path, done: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(confidence, "SURE", 0.9 * FOUND_CONFIDENCE)
-    done("simulate", tmp_path / "bayer", "--colour", "bayer", "--snr", 5, *small_options)
     out = tmp_path / "out"
-    done("reconstruct", tmp_path / "bayer", "--out", out, "--sweep-px", "-14:-7:5", *SWEEP[2:])
-    assert read_frame(out / "all_in_focus.tiff").pixels_dn.shape == (72, 96, 3)
-    # 600 mm; nodes are 50 mm apart, and the focal length is 120 px
-    np.testing.assert_allclose(read_frame(out / "disparity_px.tiff").pixels_dn, -10, rtol=0.03)
+    done("reconstruct", colour_set, "--out", out, "--sweep-px", "-9:-5:5", *SWEEP[2:])
+    assert read_frame(out / "all_in_focus.tiff").pixels_dn.shape == (48, 64, 3)
+    # 600 mm; nodes are 50 mm apart, and the focal length is 80 px
+    np.testing.assert_allclose(read_frame(out / "disparity_px.tiff").pixels_dn, -80 * 50 / 600, rtol=0.03)
     assert read_record(out)["depth_map"]["unit"] == "px"
 
 
@@ -153,6 +158,7 @@ def _shuffle(paths: list[Path]) -> None:
         (("--surface", "--depth-range-mm", "400:900"), _copy, (0, 1, 3, 4)),
         (("--surface", "--depth-range-mm", "400:900"), _shuffle, range(9)),
         (("--sweep-mm", "400:900:5", "--depth-map"), _copy, range(9)),
+        pytest.param(("--depth-mm", "auto"), _shuffle, range(9), marks=pytest.mark.deep),
     ],
 )
 def test_views_that_show_no_depth_have_no_map(
@@ -191,19 +197,6 @@ def test_pieces_of_photographed_chess_board_stand_in_order(real_data: Path, tmp_
         # Of this set it is known that points move by −3.4 … +0.8 px
         assert near_to_far[0] == pytest.approx(-3.3, abs=0.2)
         assert -0.2 < near_to_far[-1] < 0.9
-
-
-def test_planes_of_one_pitch_make_one_picture(
-    seen: Searches, simulated_scene: Path, tmp_path: Path, done: Command
-) -> None:
-    call = ("reconstruct", simulated_scene, "--sweep-mm", "400:900:5", *SWEEP[2:], "--out")
-    done(*call, tmp_path / "own", "--pitch-mm", 3)
-    done(*call, tmp_path / "usual")
-    own, usual = (read_frame(tmp_path / name / "all_in_focus.tiff").pixels_dn for name in ("own", "usual"))
-    farthest = read_frame(tmp_path / "own" / "plane_00900.0.tiff").pixels_dn
-    assert own.shape == farthest.shape != usual.shape
-    same = cv2.resize(own, usual.shape[::-1], interpolation=cv2.INTER_AREA)
-    assert np.corrcoef(same.ravel(), usual.ravel())[0, 1] > 0.9
 
 
 SHAPE = (12, 16)

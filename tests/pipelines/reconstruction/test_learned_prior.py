@@ -13,11 +13,10 @@ from faintfield.pipelines.reconstruction.learned_prior import learned_estimate, 
 from faintfield.pipelines.reconstruction.planes import solve
 from faintfield.pipelines.reconstruction.solutions import Settings
 from faintfield.recon.likelihood.images import ElementalImages, Image
-from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.prior.collaborative import Patches, collaborative_wiener
 from faintfield.recon.prior.evidence import Noise, noise_of_back_projection
 from faintfield.recon.solver.initialization import back_projection
+from tests.recon.displaced import views_displaced_by
 
 _FILE = resources.files("faintfield.pipelines.reconstruction") / "networks" / "plane_prior.onnx"
 
@@ -42,11 +41,7 @@ class Known(NamedTuple):
 def known_of(light_e: Image, seed: int, views: int = 25, read_noise_e: float = 3.0) -> Known:
     """Expose views of a plane, displaced by fractions of a pixel, and reconstruct it as the product does."""
     random = np.random.default_rng(seed)
-    homographies = np.stack([np.eye(3)] * views)
-    homographies[:, :2, 2] = random.uniform(-1.5, 0.5, (views, 2))
-    rows, columns = light_e.shape
-    borders = np.stack(np.meshgrid(np.arange(columns + 1.0), np.arange(rows + 1.0)), axis=-1)
-    operator = PlaneOperator(homographies, borders, PlaneGrid((rows, columns), 1.0, (0.0, 0.0)), workers=1)
+    operator = views_displaced_by(random.uniform(-1.5, 0.5, (views, 2)), light_e.shape)
     light = operator.forward(light_e.astype(np.float32))
     electrons = random.poisson(light) + random.normal(0, read_noise_e, light.shape)
     images = ElementalImages(electrons.astype(np.float32), 0.0, read_noise_e**2)

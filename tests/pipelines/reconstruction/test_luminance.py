@@ -1,8 +1,5 @@
 """The light of all colours in bins, as pinhole cameras see it, from frames made by hand."""
 
-import json
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -11,16 +8,13 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.luminance import default_bins, luminance
-from faintfield.recon.surface.pinhole_views import UNKNOWN, PinholeViews
+from faintfield.recon.surface.pinhole_views import UNKNOWN
+from tests.pipelines.by_hand import write_fitted_noise
 from tests.pipelines.conftest import Edit, SetMaker
 
 BAYER = ["RG", "GB"]
 NOISE = {"offset_dn": 100.0, "gain_dn_per_e": 2.0, "read_noise_e": 3.0, "dark_current_e_per_s": 8.0}
 BACKGROUND_E, READ_VARIANCE_E2 = 4.0, 9 + 1 / 48  # in 0.5 s; rounding to 0.5 e⁻
-
-
-def _light(folder: Path, bins: int) -> PinholeViews:
-    return luminance(load_set(folder), bins)
 
 
 def _frames(*shape: int) -> list[NDArray[np.uint16]]:
@@ -35,7 +29,7 @@ def test_bins_add_pixels_of_all_colours(
     mosaic: list[str] | None, bins: int, colours: tuple[int, ...], make_set: SetMaker
 ) -> None:
     frames = _frames(14, 18, *colours)
-    views = _light(make_set(frames, noise=NOISE, camera={"mosaic": mosaic} if mosaic else None), bins)
+    views = luminance(load_set(make_set(frames, noise=NOISE, camera={"mosaic": mosaic} if mosaic else None)), bins)
     assert views.light_e.dtype == np.float32
     rows, columns = 14 // bins, 18 // bins
     for light, frame in zip(views.light_e, frames, strict=True):
@@ -51,9 +45,8 @@ def test_saturated_and_hot_pixels_hide_their_bins(mosaic: list[str] | None, make
     frames = _frames(8, 10)
     frames[1][5, 2] = 1000
     folder = make_set(frames, noise="noise.json", camera={"mosaic": mosaic} if mosaic else None)
-    fitted = {name: {"value": value} for name, value in (NOISE | {"saturation_dn": 1000.0}).items()}
-    (folder / "noise.json").write_text(json.dumps(fitted | {"hot_pixels": [[1, 7]]}))
-    views = _light(folder, 2)
+    write_fitted_noise(folder, NOISE | {"saturation_dn": 1000.0}, hot_pixels=[[1, 7]])
+    views = luminance(load_set(folder), 2)
     assert np.argwhere(views.light_e == UNKNOWN).tolist() == [[0, 0, 3], [1, 0, 3], [1, 2, 1]]
     assert views.light_e[views.light_e != UNKNOWN].min() > -100
 
@@ -63,7 +56,7 @@ def test_response_is_divided_out(make_set: SetMaker) -> None:
     noise = {"offset_dn": 0.0, "gain_dn_per_e": 1.0, "read_noise_e": 0.0}
     folder = make_set([np.rint(1000.0 * response).astype(np.uint16)], camera={"flat": "flat.tiff"}, noise=noise)
     tifffile.imwrite(folder / "flat.tiff", response)
-    np.testing.assert_allclose(_light(folder, 2).light_e, 4000.0, rtol=0.5 / 300)
+    np.testing.assert_allclose(luminance(load_set(folder), 2).light_e, 4000.0, rtol=0.5 / 300)
 
 
 DISTORTION = [-0.25, 0.08, 0.004, -0.003]
@@ -80,7 +73,7 @@ def test_point_lands_where_pinhole_camera_sees_it(ray: tuple[float, float], bins
     spot = 4000 * np.exp(-((column - seen[0]) ** 2 + (row - seen[1]) ** 2) / (2 * 1.6**2))
     noise = {"offset_dn": 100.0, "gain_dn_per_e": 1.0, "read_noise_e": 1.0}
     folder = make_set([np.rint(100 + spot).astype(np.uint16)], noise=noise, camera=LENS | {"distortion": DISTORTION})
-    views = _light(folder, bins)
+    views = luminance(load_set(folder), bins)
     light = np.where(views.light_e[0] == UNKNOWN, 0, views.light_e[0])
     centre = [np.sum(index * light) / light.sum() for index in np.indices(light.shape)[::-1]]
     expected = [
@@ -94,7 +87,7 @@ def test_point_lands_where_pinhole_camera_sees_it(ray: tuple[float, float], bins
 
 def test_beyond_picture_and_beside_unknown_is_unknown(make_set: SetMaker) -> None:
     folder = make_set([np.full((48, 64), 900, np.uint16)], camera=LENS | {"distortion": [0.3]})
-    light = _light(folder, 1).light_e[0]
+    light = luminance(load_set(folder), 1).light_e[0]
     assert light[24, 32] == pytest.approx(400)
     assert (light[[0, 0, -1, -1], [0, -1, 0, -1]] == UNKNOWN).all()
     assert set(np.unique(light)) == {UNKNOWN, np.float32(400)}
@@ -102,7 +95,7 @@ def test_beyond_picture_and_beside_unknown_is_unknown(make_set: SetMaker) -> Non
     frame[24, 50] = 4000
     noise = {"offset_dn": 100.0, "gain_dn_per_e": 2.0, "read_noise_e": 3.0, "saturation_dn": 4000.0}
     folder = make_set([frame], name="saturated", noise=noise, camera=LENS | {"distortion": [-0.1]})
-    light = _light(folder, 1).light_e[0]
+    light = luminance(load_set(folder), 1).light_e[0]
     unknown = np.argwhere(light == UNKNOWN)
     assert 1 <= len(unknown) <= 9
     assert np.abs(unknown - [24, 50]).max() <= 2
@@ -112,7 +105,7 @@ def test_beyond_picture_and_beside_unknown_is_unknown(make_set: SetMaker) -> Non
 def test_views_follow_pose_and_principal_point(make_set: SetMaker, edit: Edit) -> None:
     folder = make_set(_frames(12, 16), camera={"cx_px": 6.0, "cy_px": 7.0})
     edit(folder, lambda settings: settings["view"][1].update(cx_px=9.5, cy_px=2.25))
-    views = _light(folder, 2)
+    views = luminance(load_set(folder), 2)
     # 100 mm in front of the reference camera, 10 mm from the second one's axis: f = 50 px
     point = np.array([20.0, -12.0, 100.0])
     for matrix, centre, x_mm in zip(views.pixel_from_surface, [(6.0, 7.0), (9.5, 2.25)], (20.0, 10.0), strict=True):

@@ -134,6 +134,7 @@ def test_processes_end_with_command_that_is_killed(tmp_path: Path) -> None:
     _wait_until(lambda: not any(_alive(process) for process in processes))
 
 
+@pytest.mark.deep
 def test_process_has_one_thread_and_trusted_modules(tmp_path: Path) -> None:
     """In an interpreter of its own, since it has one process that all others are copied from, with its environment."""
     (tmp_path / "numba.py").write_text("open('run', 'w')")

@@ -23,8 +23,7 @@ from faintfield.pipelines.reconstruction.solutions import Settings
 from faintfield.pipelines.reconstruction.surface_depths import between_pixels, enlarged
 from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.surface.pinhole_views import UNKNOWN
-from tests.pipelines.conftest import Command, Edit
-from tests.pipelines.refusals import assert_refused
+from tests.pipelines.conftest import Command, Edit, assert_refused
 from tests.pipelines.surfaces import Searches
 from tests.recon.surface_scene import expected_light, views_of
 
@@ -61,17 +60,17 @@ def test_search_is_given_electrons_of_light(seen: Searches, scene: Path, edit: E
 
 
 def test_mosaic_is_binned_by_its_period(
-    seen: Searches, tmp_path: Path, edit: Edit, small_options: tuple[object, ...], done: Command
+    seen: Searches, colour_set: Path, tmp_path: Path, edit: Edit, done: Command
 ) -> None:
-    done("simulate", tmp_path / "set", *small_options, "--colour", "bayer")
-    edit(tmp_path / "set", _plain)
-    done("reconstruct", tmp_path / "set", "--surface", *FAST, "--out", tmp_path / "out")
-    cells = _light_e(tmp_path / "set", "view_r1_c1.tiff").reshape(36, 2, 48, 2).sum(axis=(1, 3))
+    folder = Path(shutil.copytree(colour_set, tmp_path / "set"))
+    edit(folder, _plain)
+    done("reconstruct", folder, "--surface", *FAST, "--out", tmp_path / "out")
+    cells = _light_e(folder, "view_r1_c1.tiff").reshape(24, 2, 32, 2).sum(axis=(1, 3))
     np.testing.assert_allclose(seen[0][0].light_e[4], cells, atol=1e-3)
-    assert tifffile.imread(tmp_path / "out" / "picture.tiff").shape == (72, 96, 3)
+    assert tifffile.imread(tmp_path / "out" / "picture.tiff").shape == (48, 64, 3)
     visibility = tifffile.imread(tmp_path / "out" / "visibility.tiff")
-    assert visibility[28:44, 38:58].mean() == pytest.approx(9, rel=0.1)
-    assert tifffile.imread(tmp_path / "out" / "depth_mm.tiff").shape == (72, 96)
+    assert visibility[20:28, 26:38].mean() == pytest.approx(9, rel=0.1)
+    assert tifffile.imread(tmp_path / "out" / "depth_mm.tiff").shape == (48, 64)
 
 
 def test_imported_grid_may_have_own_principal_points(

@@ -18,7 +18,7 @@ from faintfield.pipelines.formats.results.verification import records_of, verify
 from faintfield.pipelines.reconstruction.map_pictures import robust_limits
 from faintfield.pipelines.reconstruction.surface_files import write_surface
 from tests.pipelines.by_hand import write_by_hand
-from tests.pipelines.forms import read_record
+from tests.pipelines.forms import flip_last_bit, read_record
 from tests.pipelines.surfaces import OPTIONS, SHAPE, surface_facts, surface_maps, write_example
 
 # Every file of a surface in mm.
@@ -26,26 +26,18 @@ MAPS = ("picture", "picture_sigma", "depth_mm", "depth_sigma_mm", "depth_confide
 FILES = {"surface.ply", "parallax.webp", *(f"{name}{suffix}" for name in MAPS for suffix in (".tiff", ".png"))}
 
 
-@pytest.fixture(scope="module")
-def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A surface, to be read only."""
-    folder = tmp_path_factory.mktemp("surface")
-    write_example(folder)
-    return folder
-
-
 @pytest.fixture
-def surface(written: Path, tmp_path: Path) -> Path:
+def surface(written_surface: Path, tmp_path: Path) -> Path:
     """A copy of the surface that a test may change."""
-    return Path(shutil.copytree(written, tmp_path / "surface"))
+    return Path(shutil.copytree(written_surface, tmp_path / "surface"))
 
 
-def test_maps_are_written_and_recorded_as_they_are(written: Path) -> None:
-    maps, record = surface_maps(), surfaces_below(written)[written]
-    assert {path.name for path in written.iterdir()} == FILES | {SURFACE_FILE}
+def test_maps_are_written_and_recorded_as_they_are(written_surface: Path) -> None:
+    maps, record = surface_maps(), surfaces_below(written_surface)[written_surface]
+    assert {path.name for path in written_surface.iterdir()} == FILES | {SURFACE_FILE}
     assert set(record.files) == FILES == set(record.sha256)
     for name in MAPS:
-        found = tifffile.imread(written / f"{name}.tiff")
+        found = tifffile.imread(written_surface / f"{name}.tiff")
         assert (str(found.dtype), found.shape) == ("float32", SHAPE)
         np.testing.assert_allclose(found, getattr(maps, name.removesuffix("_mm")), rtol=1e-6)  # NaN where it is NaN
     ball = sum((r - 40) ** 2 + (c - 50) ** 2 < 400 for r in range(90) for c in range(120))
@@ -68,8 +60,8 @@ def test_colours_are_kept_and_disparities_named_as_such(tmp_path: Path) -> None:
     assert ratio.max() < 1.05 * ratio.min()  # red stays red
 
 
-def test_points_are_known_samples(written: Path) -> None:
-    header, _, body = (written / "surface.ply").read_bytes().partition(b"end_header\n")
+def test_points_are_known_samples(written_surface: Path) -> None:
+    header, _, body = (written_surface / "surface.ply").read_bytes().partition(b"end_header\n")
     points = np.frombuffer(body, [("place", "<f4", 3), ("rest", "V15")])["place"]
     depth = surface_maps().depth
     rows, columns = np.nonzero(np.isfinite(depth))
@@ -79,9 +71,9 @@ def test_points_are_known_samples(written: Path) -> None:
     np.testing.assert_allclose(points, expected, rtol=1e-5, atol=1e-4)
 
 
-def test_film_repeats_for_ever_and_shows_picture(written: Path) -> None:
+def test_film_repeats_for_ever_and_shows_picture(written_surface: Path) -> None:
     image = pytest.importorskip("PIL.Image")
-    with image.open(written / "parallax.webp") as film:
+    with image.open(written_surface / "parallax.webp") as film:
         assert (film.format, film.n_frames, film.info["loop"]) == ("WEBP", 24, 0)
         assert film.width <= 480
         means = []
@@ -106,11 +98,10 @@ def test_verify_compares_every_file(surface: Path) -> None:
         assert verdict is not None
         assert (verdict.records, verdict.files, verdict.problems) == (1, len(FILES), ())
     for name in sorted(FILES):
-        whole = (surface / name).read_bytes()
-        (surface / name).write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+        flip_last_bit(surface / name)
         (problem,) = verify_results(records_of(surface)).problems
         assert f"{name}: was altered" in problem
-        (surface / name).write_bytes(whole)
+        flip_last_bit(surface / name)
 
 
 @pytest.mark.parametrize("changes", [{"picture": "../picture.tiff"}, {"film": "/dev/zero"}], ids=str)

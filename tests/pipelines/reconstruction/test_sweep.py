@@ -17,6 +17,7 @@ from faintfield.pipelines.formats.results.plane_files import PARTS, PlaneFiles
 from faintfield.pipelines.formats.results.records import FocusPoint, PlaneRecord
 from faintfield.pipelines.reconstruction.request import Request
 from tests.pipelines.conftest import Command
+from tests.pipelines.forms import files_in
 
 SWEEP = ("--sweep-mm", "500:700:3", "--method", "backprojection")
 
@@ -38,8 +39,7 @@ main(sys.argv[2:])
 
 def _contents(folder: Path) -> dict[str, bytes]:
     """Return all files but for what they say of times: of the page, and of the wall time."""
-    found = {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    del found["report.html"]
+    found = files_in(folder, "report.html")
     record = json.loads(found["reconstruction.json"])
     del record["wall_time_s"], record["record_sha256"]
     return found | {"reconstruction.json": json.dumps(record).encode()}
