@@ -19,8 +19,11 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.cli import run
 from faintfield.pipelines.formats.image_files import encoded
-from faintfield.pipelines.reconstruction import penalised, surface, surface_depths, surface_files
+from faintfield.pipelines.reconstruction.depth import search as surface_depths
 from faintfield.pipelines.reconstruction.options import Options
+from faintfield.pipelines.reconstruction.planes import penalised
+from faintfield.pipelines.reconstruction.surface import files as surface_files
+from faintfield.pipelines.reconstruction.surface import reconstruct as surface
 from faintfield.recon.surface.estimate import SurfaceEstimate
 from tests.pipelines.by_hand import View, write_set
 from tests.pipelines.sessions import captured, rig_toml, steps_run

@@ -9,7 +9,7 @@ import pytest
 from faintfield.pipelines.launcher import app
 from faintfield.pipelines.reconstruction.options import Options
 from faintfield.pipelines.reconstruction.request import select_planes
-from faintfield.pipelines.reconstruction.surface_request import select_surface
+from faintfield.pipelines.reconstruction.surface.request import select_surface
 from faintfield.recon.errors import NothingInFocus
 from tests.pipelines.conftest import Command
 from tests.pipelines.forms import read_record
@@ -62,7 +62,7 @@ def test_planes_solved_together_are_made_once(session: Path, monkeypatch: pytest
     assert {plane["method"] for plane in record["planes"]} == {"joint"}
     assert all((session / "reconstructions" / plane["sigma_file"]).is_file() for plane in record["planes"])
     assert steps_run(session, asked) == []
-    monkeypatch.setattr("faintfield.pipelines.reconstruction.tasks.solve_together", _FAIL)
+    monkeypatch.setattr("faintfield.pipelines.reconstruction.planes.tasks.solve_together", _FAIL)
     with pytest.raises(NothingInFocus, match="begun"):
         steps_run(session, replace(asked, uncertainty=False, likelihood="poisson"))
 

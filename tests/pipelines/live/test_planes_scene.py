@@ -17,8 +17,8 @@ from faintfield.pipelines.live.planes_scene import LiveScene, bins_of, live_scen
 from faintfield.pipelines.live.planes_so_far import PlanesSoFar
 from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
-from faintfield.pipelines.reconstruction.penalised import Objective, certified
-from faintfield.pipelines.reconstruction.solutions import Settings
+from faintfield.pipelines.reconstruction.planes.penalised import Objective, certified
+from faintfield.pipelines.reconstruction.planes.solutions import Settings
 from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.solver.initialization import back_projection, universal_penalty_weight
 from faintfield.rig.cameras.settings import FolderSettings

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from faintfield.pipelines.reconstruction.penalised import Objective, certified, solve_pmlem
-from faintfield.pipelines.reconstruction.planes import solve
-from faintfield.pipelines.reconstruction.solutions import PriorName, Settings
+from faintfield.pipelines.reconstruction.planes.penalised import Objective, certified, solve_pmlem
+from faintfield.pipelines.reconstruction.planes.solutions import PriorName, Settings
+from faintfield.pipelines.reconstruction.planes.solve import solve
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.prior.answers import ProposalAnswers
 from faintfield.recon.prior.evidence import evidence_of_planes
