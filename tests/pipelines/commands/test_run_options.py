@@ -68,7 +68,7 @@ def test_planes_solved_together_are_made_once(session: Path, monkeypatch: pytest
 
 
 def test_depths_are_searched_only_once(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in ("autofocus", "request"):
+    for module in ("depth.autofocus", "request"):
         monkeypatch.setattr(f"faintfield.pipelines.reconstruction.{module}.searched_range_mm", lambda _: _SEARCHED_MM)
     asked = replace(_FAST, depth_mm=["auto"])
     assert steps_run(session, asked) == ["reconstruct"]

@@ -18,7 +18,7 @@ from faintfield.recon.prior.evidence import Noise, noise_of_back_projection
 from faintfield.recon.solver.initialization import back_projection
 from tests.recon.displaced import views_displaced_by
 
-_FILE = resources.files("faintfield.pipelines.reconstruction") / "networks" / "plane_prior.onnx"
+_FILE = resources.files("faintfield.pipelines.reconstruction.planes") / "networks" / "plane_prior.onnx"
 
 # By training/reference.py, sums in numpy for waves.
 _VALUES = {(0, 0): -0.050578, (3, 5): 0.375013, (11, 15): 0.026569, (23, 8): 0.191935}
