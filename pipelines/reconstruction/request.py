@@ -21,10 +21,15 @@ from faintfield.pipelines.formats.results.records import (
 )
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.formats.sets.stated import plane_stem
-from faintfield.pipelines.reconstruction.autofocus import best_focus, found_range_mm, searched_range_mm, sweep_of_range
+from faintfield.pipelines.reconstruction.depth.autofocus import (
+    best_focus,
+    found_range_mm,
+    searched_range_mm,
+    sweep_of_range,
+)
 from faintfield.pipelines.reconstruction.operators import check_in_front
 from faintfield.pipelines.reconstruction.options import PLACES, Options
-from faintfield.pipelines.reconstruction.solutions import PriorName, Settings
+from faintfield.pipelines.reconstruction.planes.solutions import PriorName, Settings
 
 DEFAULT_METHOD: Method = "pmlem"
 

@@ -15,13 +15,13 @@ from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_s
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, load_session
 from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.reconstruction.channels import keeping_frames
-from faintfield.pipelines.reconstruction.cluster import make_runner
 from faintfield.pipelines.reconstruction.options import OF_PLANES, Options
+from faintfield.pipelines.reconstruction.planes.cluster import make_runner
+from faintfield.pipelines.reconstruction.planes.sweep import Runner, run_serially
 from faintfield.pipelines.reconstruction.request import Request, resolve, select_planes
 from faintfield.pipelines.reconstruction.run import Outcome, reconstruct_set
-from faintfield.pipelines.reconstruction.surface import reconstruct_surface
-from faintfield.pipelines.reconstruction.surface_request import SURFACE_FOLDER, SurfaceRequest, select_surface
-from faintfield.pipelines.reconstruction.sweep import Runner, run_serially
+from faintfield.pipelines.reconstruction.surface.reconstruct import reconstruct_surface
+from faintfield.pipelines.reconstruction.surface.request import SURFACE_FOLDER, SurfaceRequest, select_surface
 from faintfield.rig.session.session import has_session
 
 

@@ -23,8 +23,9 @@ from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, files_of_scene
 from faintfield.pipelines.formats.units import record_of
 from faintfield.pipelines.pages.report import write_report
-from faintfield.pipelines.reconstruction.cluster import make_runner
 from faintfield.pipelines.reconstruction.options import OF_PLANES, PLACES, Options
+from faintfield.pipelines.reconstruction.planes.cluster import make_runner
+from faintfield.pipelines.reconstruction.planes.sweep import Runner
 from faintfield.pipelines.reconstruction.request import (
     Selection,
     distinct_depths,
@@ -32,8 +33,7 @@ from faintfield.pipelines.reconstruction.request import (
     resolve,
     select_planes,
 )
-from faintfield.pipelines.reconstruction.surface_request import SURFACE_FOLDER, SurfaceSelection, select_surface
-from faintfield.pipelines.reconstruction.sweep import Runner
+from faintfield.pipelines.reconstruction.surface.request import SURFACE_FOLDER, SurfaceSelection, select_surface
 from faintfield.pipelines.workflows.geometry import measure_stage
 from faintfield.pipelines.workflows.noise import measure_sensor
 from faintfield.pipelines.workflows.reconstruct import open_set, reconstruct_and_report, surface_and_report

@@ -30,9 +30,8 @@ from faintfield.pipelines.formats.sets.elemental_set import load_set, with_measu
 from faintfield.pipelines.formats.sets.ground_truth import read_truth
 from faintfield.pipelines.workflows.geometry import GeometrySummary
 from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
-from tests.pipelines.conftest import Command
+from tests.pipelines.conftest import Command, assert_refused, drawing_nothing
 from tests.pipelines.forms import check_layout
-from tests.pipelines.refusals import assert_refused
 from tests.simulated_boards import simulate_board_set
 
 BOARDS = [Board(f"b{index}", 9, 7, 40.0, 29.0, "DICT_4X4_250", 31 * index) for index in range(4)]
@@ -53,7 +52,8 @@ def measured(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pat
     truth = read_truth(scene)
     assert truth is not None
     simulate_board_set(folder, experiment, np.array(truth.true_rt_cam_ref), BOARDS, np.random.default_rng(1))
-    return folder, geometry(folder)
+    with drawing_nothing():
+        return folder, geometry(folder)
 
 
 def test_files_hold_true_poses(measured: tuple[Path, GeometrySummary], scene: Path) -> None:
