@@ -272,7 +272,8 @@ class SimulatedSettings(MosaicSettings, frozen=True, forbid_unknown_fields=True,
             raise ValueError(f"camera.size_px = {list(self.size_px)} is too small; give at least 8 x 8")
         width, height = self.size_px
         if width * height > MAX_SIMULATED_PIXELS:
-            raise ValueError(f"camera.size_px = {list(self.size_px)}; give {MAX_SIMULATED_PIXELS} pixels at most")
+            size = f"{width * height} pixels, at most {MAX_SIMULATED_PIXELS} are simulated"
+            raise ValueError(f"camera.size_px = {list(self.size_px)} has {size}; give a smaller frame")
         if self.gain_dn_per_e <= 0 or min(self.read_noise_e, self.position_error_mm, self.rotation_error_mrad) < 0:
             raise ValueError("camera: a gain is positive, and read noise and errors are not negative; correct them")
         if min(self.lit_photons_per_s, self.unlit_photons_per_s, self.seed) < 0 or not 0 < self.saturation_dn < 2**16:
