@@ -8,8 +8,15 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.signal import fftconvolve
 
-from faintfield.calib.noise.estimates import estimate_all
-from faintfield.calib.noise.fitting import MAX_TABLE_WIDTH_DN, NoiseLikelihood, SeriesFit, collect_counts, fit_series
+from faintfield.calib.noise.emva.estimates import estimate_all
+from faintfield.calib.noise.fit.series_fit import (
+    MAX_TABLE_WIDTH_DN,
+    NoiseLikelihood,
+    SeriesFit,
+    collect_counts,
+    fit_series,
+)
+from faintfield.calib.noise.fit.temperature import settle_temperature, with_doubling_error
 from faintfield.calib.noise.likelihood.marginal import mass_function
 from faintfield.calib.noise.likelihood.response import BENDS
 from faintfield.calib.noise.maps.measure import measure_pixels, noise_maps
@@ -23,11 +30,9 @@ from faintfield.calib.noise.misfit.diagnostics import (
     saturation_warnings,
     scatter_warnings,
 )
-from faintfield.calib.noise.misfit.goodness import series_goodness
-from faintfield.calib.noise.misfit.temperature import settle_temperature, with_doubling_error
-from faintfield.calib.noise.result import Histogram, NoiseCalibration, TransferPoint
-from faintfield.calib.noise.series.flat_levels import check_flat_levels
-from faintfield.calib.noise.series.saturation import Saturation, find_saturation
+from faintfield.calib.noise.misfit.goodness import series_goodness, transfer_points
+from faintfield.calib.noise.result import Histogram, NoiseCalibration
+from faintfield.calib.noise.series.flats import Saturation, check_flat_levels, find_saturation
 from faintfield.calib.noise.series.statistics import Series
 from faintfield.calib.noise_model import BentResponse
 
@@ -83,7 +88,7 @@ def _result(
     fitted: SeriesFit, outlying: NDArray[np.bool_], hot: NDArray[np.bool_], saturation: Saturation, saturation_dn: float
 ) -> NoiseCalibration:
     """Return the numbers, maps and warnings that follow from a fit."""
-    pixels, points = measure_pixels(fitted, hot, outlying), _points(fitted)
+    pixels, points = measure_pixels(fitted, hot, outlying), transfer_points(fitted)
     level, noise = level_warning(fitted), noise_warning(fitted, points)
     estimates, covariance = estimate_all(
         fitted, pixels.response, saturation, levels_hold=level is None, noise_holds=noise is None
@@ -188,24 +193,3 @@ def _histogram(values_dn: NDArray[np.int32], exposure_s: float, fitted: SeriesFi
     value = np.arange(lowest, highest + 1)
     count = np.bincount((values_dn - lowest).ravel(), minlength=value.size)
     return Histogram(exposure_s, value, count, np.maximum(mass, 0) * values_dn.size)
-
-
-def _points(fitted: SeriesFit) -> tuple[TransferPoint, ...]:
-    """Return the photon transfer and dark signal points."""
-    values, darks, flats = fitted.fit.values, fitted.moments.darks, fitted.moments.flats
-    dark_models = values["offset_dn"] + values.get("dark_signal_dn_per_s", 0.0) * darks.exposure_s
-    rows = zip(
-        (*fitted.darks, *fitted.flats),
-        (*darks.mean_dn, *flats.mean_dn),
-        (*darks.within_dn2, *flats.within_dn2),
-        (*dark_models, *flats.mean_dn),
-        (*fitted.dark_noise_dn2, *fitted.flat_noise_dn2),
-        strict=True,
-    )
-    points = []
-    for flat, mean, within, *model in rows:
-        degrees = max((flat.frames - 1) * fitted.moments.freedom, 1.0)
-        measured = within / degrees if flat.frames > 1 else np.nan
-        numbers = map(float, (mean, measured, measured * np.sqrt(2 / degrees), *model))
-        points.append(TransferPoint(flat.conditions.kind, flat.conditions.exposure_s, flat.frames, *numbers))
-    return tuple(points)

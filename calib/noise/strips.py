@@ -1,20 +1,71 @@
-"""Work on large arrays by strips of rows, in threads: a strip stays in the cache, and no copy of the whole is made."""
+"""Large arrays, worked on by strips of rows in threads: a strip stays in the cache, no copy of the whole is made.
 
+Maps of large sensors may lie in files, so that memory holds only the strips that are worked on.
+"""
+
+import mmap
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any
+from weakref import WeakSet
 
+import numba
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
-
-from faintfield.calib.noise.room import new_map, release
 
 # Pixels of a strip, and strips after which maps in files are taken out of memory.
 _STRIP_PX, _RELEASE = 1 << 16, 32
 
 # Pixels that tell a median or a quantile well enough where nothing but a start or a scale depends on it.
 _ENOUGH_PX = 1 << 22
+
+
+# Makes an uninitialised array, given its shape and dtype; one in a file is memory-mapped and shared.
+type Allocate = Callable[[tuple[int, ...], DTypeLike], NDArray[Any]]
+
+_allocate: ContextVar[Allocate] = ContextVar("allocate", default=np.empty)
+_mapped: WeakSet[mmap.mmap] = WeakSet()
+
+# Sums may be reordered, but infinities and NaN keep their meaning.
+_OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "nsz", "arcp", "reassoc"}, "nogil": True}
+
+
+def compiled(function: Any) -> Any:
+    """Return a function that is compiled at its first call with new types, or found in numba's cache."""
+    try:
+        return numba.njit(cache=True, **_OPTIONS)(function)
+    except RuntimeError:  # numba has no folder for its cache that can be written
+        return numba.njit(**_OPTIONS)(function)
+
+
+@contextmanager
+def maps_by(allocate: Allocate) -> Iterator[None]:
+    """Have the maps made by `allocate` while the block runs, instead of in memory."""
+    token = _allocate.set(allocate)
+    try:
+        yield
+    finally:
+        _allocate.reset(token)
+
+
+def new_map(shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> NDArray[Any]:
+    """Return an uninitialised map (row, column)."""
+    made: Any = _allocate.get()(shape, dtype)
+    holder = made
+    while holder is not None:
+        if isinstance(holder, mmap.mmap):
+            _mapped.add(holder)
+        holder = getattr(holder, "base", None)
+    return np.asarray(made)
+
+
+def release() -> None:
+    """Take out of memory what the files of all maps hold; it is read again when it is needed."""
+    for mapping in list(_mapped):
+        mapping.madvise(mmap.MADV_DONTNEED)
 
 
 def usable_cores() -> int:

@@ -63,7 +63,7 @@ def noise(
 
 def measure(folder: Path, out: Path | None) -> "NoiseRecord":
     """Measure a sensor from the frames in a folder, and write the result with its pages, there if not to `out`."""
-    from faintfield.calib.noise.room import maps_by
+    from faintfield.calib.noise.strips import maps_by
     from faintfield.pipelines.calibration.noise import calibrate_sensor, noise_maps, noise_record
     from faintfield.pipelines.formats.files import removed_if_empty
     from faintfield.pipelines.formats.large_arrays import maps_in_files

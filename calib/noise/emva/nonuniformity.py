@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from faintfield.calib.noise.intervals import root
-from faintfield.calib.noise.result import Estimate
+from faintfield.calib.noise.estimate import Estimate, root
 from faintfield.calib.noise.series.statistics import Series
 from faintfield.calib.noise.strips import map_of, mean_over, over_strips, total_of
 

@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from faintfield.calib.noise.intervals import interval
+from faintfield.calib.noise.estimate import Estimate, interval
 from faintfield.calib.noise.likelihood.rounding import ROUNDING_DN2
-from faintfield.calib.noise.result import Estimate
 
 type Array = NDArray[np.float64]
 

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.calib.noise.compiled import compiled
 from faintfield.calib.noise.series.statistics import Series
-from faintfield.calib.noise.strips import over_strips
+from faintfield.calib.noise.strips import compiled, over_strips
 
 type Array = NDArray[np.float64]
 

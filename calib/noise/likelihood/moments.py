@@ -86,7 +86,7 @@ class FlatMoments:
 
 @dataclass(frozen=True)
 class Excess:
-    """Scatter that the model of the pixels does not explain; see `calib.noise.misfit.goodness`.
+    """Scatter that the model of the pixels does not explain; see `calib.noise.fit.scatter`.
 
     Attributes
     ----------

@@ -1,12 +1,13 @@
 """Maps of the pixels in the order in which they are measured: noise, offset, response to light, gain."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.calib.noise.fitting import NoiseLikelihood, SeriesFit
+from faintfield.calib.noise.estimate import Estimate
+from faintfield.calib.noise.fit.series_fit import NoiseLikelihood, SeriesFit
 from faintfield.calib.noise.likelihood.response import charge_dn, charge_slope
 from faintfield.calib.noise.maps.gain import PixelGain, measure_gain, photon_transfer
 from faintfield.calib.noise.maps.photo_response import Response, measure_response
@@ -14,9 +15,7 @@ from faintfield.calib.noise.maps.pixels import PixelLevels, line_pattern, noisy_
 from faintfield.calib.noise.maps.read_noise import PixelReadNoise, measure_read_noise
 from faintfield.calib.noise.maps.seams import Seam, find_seams
 from faintfield.calib.noise.maps.telegraph import telegraph_pixels
-from faintfield.calib.noise.result import Estimate, NoiseMaps
-from faintfield.calib.noise.room import new_map
-from faintfield.calib.noise.strips import map_of, total_of
+from faintfield.calib.noise.strips import map_of, new_map, total_of
 
 type Array = NDArray[np.float64]
 type Map = NDArray[np.floating]
@@ -25,6 +24,45 @@ type Map = NDArray[np.floating]
 _NOTABLE_STEP, _NOTABLE_SHARE = 0.1, 1e-4
 
 _CENSORED = NoiseLikelihood.CENSORED
+
+
+@dataclass(frozen=True)
+class NoiseMaps:
+    """Maps per pixel, arrays (row, column) of float32; None if the frames do not determine them.
+
+    Attributes
+    ----------
+    offset_dn, offset_variance_dn2 : array
+        Posterior mean of the offset, and the variance of its error.
+    dark_current_e_per_s, dark_current_variance_e2_per_s2 : array, optional
+        Posterior mean of the dark current, and the variance of its error.
+    read_noise_e, read_noise_se_e : array, optional
+        Posterior mean of the read noise, and its standard error.
+    gain_dn_per_e, gain_se_dn_per_e : array, optional
+        Gain, and the standard error of its difference from the mean gain. Maps in electrons are in those of this gain.
+    relative_response, relative_response_se : array, optional
+        Photo response in electrons over its mean, vignetting and PRNU, and its standard error.
+    vignetting : array, optional
+        Smooth part of the photo response.
+    unusable : array, bool
+        Pixels that are hot, noisy or dead.
+    absent : dict of str
+        Why there is no map of the gain or of the read noise, by the name of the map.
+    """
+
+    offset_dn: NDArray[np.float32]
+    offset_variance_dn2: NDArray[np.float32]
+    unusable: NDArray[np.bool_]
+    dark_current_e_per_s: NDArray[np.float32] | None = None
+    dark_current_variance_e2_per_s2: NDArray[np.float32] | None = None
+    read_noise_e: NDArray[np.float32] | None = None
+    read_noise_se_e: NDArray[np.float32] | None = None
+    gain_dn_per_e: NDArray[np.float32] | None = None
+    gain_se_dn_per_e: NDArray[np.float32] | None = None
+    relative_response: NDArray[np.float32] | None = None
+    relative_response_se: NDArray[np.float32] | None = None
+    vignetting: NDArray[np.float32] | None = None
+    absent: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

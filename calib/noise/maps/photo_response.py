@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from faintfield.calib.noise.intervals import interval
-from faintfield.calib.noise.result import Estimate
+from faintfield.calib.noise.estimate import Estimate, interval
 from faintfield.calib.noise.strips import map_of, maps_of, mean_over, over_strips, thinned, variance_over
 
 type Array = NDArray[np.float64]

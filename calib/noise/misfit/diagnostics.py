@@ -6,11 +6,11 @@ import numpy as np
 from scipy import stats
 
 from faintfield.calib.errors import CopiedFrame, NotIdentifiable, TooFewFrames
-from faintfield.calib.noise.fitting import NoiseLikelihood, SeriesFit
+from faintfield.calib.noise.fit.scatter import light_signal
+from faintfield.calib.noise.fit.series_fit import NoiseLikelihood, SeriesFit
 from faintfield.calib.noise.likelihood.response import UNKNOWN_BEND_SE, charge_dn
-from faintfield.calib.noise.misfit.scatter import light_signal
-from faintfield.calib.noise.result import TransferPoint
-from faintfield.calib.noise.series.saturation import Saturation
+from faintfield.calib.noise.misfit.goodness import TransferPoint
+from faintfield.calib.noise.series.flats import Saturation
 from faintfield.calib.noise.series.statistics import Series
 
 # Smallest frames, in pixels and in rows or columns; fewer leave the spreads over pixels to chance.

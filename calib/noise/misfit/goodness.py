@@ -6,11 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from faintfield.calib.noise.fit.scatter import flat_variances_of_nodes, light_signal, noise_freedom
+from faintfield.calib.noise.fit.series_fit import SeriesFit
 from faintfield.calib.noise.likelihood.gaussian import dark_variances_dn2, flat_variances_dn2, level_variances_dn2
 from faintfield.calib.noise.likelihood.maximum import NoiseFit
 from faintfield.calib.noise.likelihood.moments import Moments
 from faintfield.calib.noise.likelihood.response import charge_dn, charge_slope
-from faintfield.calib.noise.misfit.scatter import flat_variances_of_nodes, light_signal, noise_freedom
 from faintfield.calib.noise.series.statistics import Series
 
 type Array = NDArray[np.float64]
@@ -48,6 +49,41 @@ class SeriesGoodness:
     rows: Scatter | None = None
     columns: Scatter | None = None
     frames: Scatter | None = None
+
+
+@dataclass(frozen=True)
+class TransferPoint:
+    """One series as EMVA 1288 plots it: measured and modelled mean and variance, in DN and DN²."""
+
+    kind: str
+    exposure_s: float
+    frames: int
+    mean_dn: float
+    variance_dn2: float
+    variance_se_dn2: float
+    model_mean_dn: float
+    model_variance_dn2: float
+
+
+def transfer_points(fitted: SeriesFit) -> tuple[TransferPoint, ...]:
+    """Return the photon transfer and dark signal points."""
+    values, darks, flats = fitted.fit.values, fitted.moments.darks, fitted.moments.flats
+    dark_models = values["offset_dn"] + values.get("dark_signal_dn_per_s", 0.0) * darks.exposure_s
+    rows = zip(
+        (*fitted.darks, *fitted.flats),
+        (*darks.mean_dn, *flats.mean_dn),
+        (*darks.within_dn2, *flats.within_dn2),
+        (*dark_models, *flats.mean_dn),
+        (*fitted.dark_noise_dn2, *fitted.flat_noise_dn2),
+        strict=True,
+    )
+    points = []
+    for flat, mean, within, *model in rows:
+        degrees = max((flat.frames - 1) * fitted.moments.freedom, 1.0)
+        measured = within / degrees if flat.frames > 1 else np.nan
+        numbers = map(float, (mean, measured, measured * np.sqrt(2 / degrees), *model))
+        points.append(TransferPoint(flat.conditions.kind, flat.conditions.exposure_s, flat.frames, *numbers))
+    return tuple(points)
 
 
 def series_goodness(

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.calib.noise.compiled import compiled
-from faintfield.calib.noise.room import new_map
+from faintfield.calib.noise.strips import compiled, new_map
 
 _NONE = np.iinfo(np.int64).min
 

@@ -13,9 +13,9 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from faintfield.calib.errors import BadFrame, LightLeak
-from faintfield.calib.noise.series.outliers import outlier
 from faintfield.calib.noise.series.powers import Moments, sum_lines
 from faintfield.calib.noise.strips import over_strips, total_of
 
@@ -31,6 +31,9 @@ _CERTAIN_LEAK, _MIN_LEAK = 5.0, 0.25
 
 # A dark has another pattern if its variance exceeds that of its series by these fractions, likewise.
 _CERTAIN_EXCESS, _MIN_EXCESS = 1.0, 0.2
+
+# Probability below which a value is no chance.
+MAX_CHANCE = 1e-7
 
 # Pixels whose values are kept for histograms and for the likelihood of single values.
 SAMPLE_PX = 65_536
@@ -351,3 +354,20 @@ def _check_alike(series: Series, spreads_dn2: NDArray[np.float64]) -> None:
             f"{series.names[odd]}: its pixels spread {np.sqrt(1 + excess):.2f} times as far as in the other "
             f"{series.conditions}: light leaked in or the readout failed; record it again, or leave it out"
         )
+
+
+def outlier(values: NDArray[np.float64], min_excess: float, certain_excess: float) -> tuple[int, float]:
+    """Return the index of the largest value, and its excess over the mean of the others; 0 if it can be chance.
+
+    An excess above `certain_excess` always counts. One above `min_excess` counts if its probability, by Student's t
+    from the scatter of the others, is below `MAX_CHANCE`.
+    """
+    largest = int(values.argmax())
+    others = np.delete(values, largest)
+    excess = float(values[largest] - others.mean())
+    if excess > certain_excess:
+        return largest, excess
+    if excess < min_excess or others.size < 2:
+        return largest, 0.0
+    t = excess / max(float(others.std(ddof=1)) * np.sqrt(1 + 1 / others.size), 1e-12)
+    return largest, excess if stats.t.sf(t, others.size - 1) < MAX_CHANCE else 0.0

@@ -7,7 +7,7 @@ import pytest
 
 from faintfield.calib.errors import CalibrationError, CopiedFrame, NotIdentifiable, TooFewFrames
 from faintfield.calib.noise import Conditions, NoiseCalibration, Series, calibrate, measure_series
-from faintfield.calib.noise.fitting import NoiseLikelihood
+from faintfield.calib.noise.fit.series_fit import NoiseLikelihood
 from tests.calib.noise.darkroom import Chip, dark_series, darks, expose, flat_series, specimen
 
 EXPOSURES_S = (0.1, 1.0, 10.0, 60.0)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from faintfield.calib.noise.estimates import _in_electrons, _levels_quantile, _why_no_current, _why_no_gain
-from faintfield.calib.noise.intervals import interval, root
+from faintfield.calib.noise.emva.estimates import _in_electrons, _levels_quantile, _why_no_current, _why_no_gain
+from faintfield.calib.noise.estimate import interval, root
 from faintfield.calib.noise.likelihood.maximum import NoiseFit
 from faintfield.calib.noise.likelihood.moments import DarkMoments, FlatMoments, Moments
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from faintfield.calib.noise import NoiseCalibration, calibrate
-from faintfield.calib.noise.fitting import NoiseLikelihood
+from faintfield.calib.noise.fit.series_fit import NoiseLikelihood
 from faintfield.calib.noise.likelihood.exact import Bent, _flat_part, _Maximum
 from faintfield.calib.noise.likelihood.marginal import (
     DARK_LOG_WEIGHTS,

@@ -4,14 +4,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from faintfield.calib.noise.fitting import SeriesFit
-from faintfield.calib.noise.intervals import root
-from faintfield.calib.noise.likelihood.gaussian import level_variances_dn2
+from faintfield.calib.noise.estimate import Estimate, root
+from faintfield.calib.noise.fit.series_fit import SeriesFit
+from faintfield.calib.noise.likelihood.gaussian import flat_variances_dn2, level_variances_dn2
+from faintfield.calib.noise.likelihood.maximum import NoiseFit
+from faintfield.calib.noise.likelihood.moments import Moments
 from faintfield.calib.noise.likelihood.response import BENDS, FittedLevels, charge_dn
-from faintfield.calib.noise.misfit.drift import lamp_flicker2
 from faintfield.calib.noise.misfit.goodness import series_goodness
-from faintfield.calib.noise.result import Estimate
-from faintfield.calib.noise.series.saturation import Saturation
+from faintfield.calib.noise.series.flats import Saturation
 
 # Largest scatter of the noise of series about the model, and largest departure of one, as fractions of the variance.
 MAX_NOISE_ERROR, _MAX_DEPARTURE, _MIN_SIGMAS = 0.05, 0.1, 6.0
@@ -72,11 +72,24 @@ def of_light(fitted: SeriesFit, saturation: Saturation, gain: Estimate, efficien
     }
 
 
-def _light_error(fitted: SeriesFit) -> Estimate:
-    """Return the relative scatter of the flats' levels about the response."""
-    if not _knows_light(fitted):
-        return Estimate(None, why=_NO_LIGHT)
-    return Estimate(float(np.sqrt(fitted.moments.excess.light2)))
+def lamp_flicker2(fit: NoiseFit, moments: Moments) -> tuple[float, float] | None:
+    """Return the relative variance of the light from frame to frame with its standard error; None without flats.
+
+    It is what the levels of the frames of a series scatter beyond pixel noise and jitter of the black level. Neither
+    enters the pixel noise, since levels are taken out of every frame.
+    """
+    flats = moments.flats
+    if not flats.frames.size:
+        return None
+    noise = np.array(flat_variances_dn2(fit.values, flats.mean_dn), float) / moments.pixels
+    still = fit.values.get("jitter_dn2", 0.0) + noise
+    freedom, signal2 = flats.frames - 1, (flats.mean_dn - fit.values["offset_dn"]) ** 2
+    total = float(freedom @ signal2)
+    if not total > 0:
+        return None
+    found = float(np.sum(flats.level_scatter_dn2 - freedom * still)) / total
+    spread = np.sqrt(2 * float(freedom @ (still + max(found, 0.0) * signal2) ** 2))
+    return found, float(spread) / total
 
 
 def _knows_light(fitted: SeriesFit) -> bool:

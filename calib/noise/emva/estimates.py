@@ -10,18 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from faintfield.calib.noise.emva.light_estimates import of_light, why_noise_denies
 from faintfield.calib.noise.emva.nonuniformity import nonuniformity, temporal_noise
-from faintfield.calib.noise.fitting import MIN_ROUNDED_READ_DN, SeriesFit
-from faintfield.calib.noise.intervals import interval, root
-from faintfield.calib.noise.light_estimates import of_light, why_noise_denies
+from faintfield.calib.noise.estimate import Estimate, interval, root
+from faintfield.calib.noise.fit.series_fit import MIN_ROUNDED_READ_DN, SeriesFit
 from faintfield.calib.noise.likelihood.gaussian import dark_variances_dn2, main_quantities
 from faintfield.calib.noise.likelihood.maximum import NoiseFit
 from faintfield.calib.noise.likelihood.moments import Moments
 from faintfield.calib.noise.likelihood.response import charge_dn
 from faintfield.calib.noise.maps.photo_response import Response
 from faintfield.calib.noise.maps.pixels import quantum_efficiency
-from faintfield.calib.noise.result import Estimate
-from faintfield.calib.noise.series.saturation import Saturation
+from faintfield.calib.noise.series.flats import Saturation
 from faintfield.calib.noise.series.statistics import Series
 from faintfield.calib.noise.strips import map_of
 

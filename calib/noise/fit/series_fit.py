@@ -11,7 +11,9 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.calib.noise.likelihood.exact import Bent, fit_exact
+from faintfield.calib.noise.fit.odd_light import without_odd
+from faintfield.calib.noise.fit.scatter import fit_with_excess
+from faintfield.calib.noise.likelihood.exact import Bent, censored_start, fit_exact, gaussian_start
 from faintfield.calib.noise.likelihood.gaussian import dark_variances_dn2, flat_variances_dn2
 from faintfield.calib.noise.likelihood.marginal import Counts
 from faintfield.calib.noise.likelihood.maximum import NoiseFit
@@ -23,9 +25,6 @@ from faintfield.calib.noise.likelihood.response import (
     bend_range_dn,
     choose_bends,
 )
-from faintfield.calib.noise.likelihood.starts import censored_start, gaussian_start
-from faintfield.calib.noise.misfit.odd_light import without_odd
-from faintfield.calib.noise.misfit.scatter import fit_with_excess
 from faintfield.calib.noise.series.statistics import Series, any_suspect, sample_index
 
 # Read noise, in electrons and in DN, below which single electrons or the rounding shape the distribution of values.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from faintfield.calib.noise import Conditions, calibrate, measure_series
-from faintfield.calib.noise.fitting import NoiseLikelihood, _shared_noise_dn2, choose_likelihood
+from faintfield.calib.noise.fit.series_fit import NoiseLikelihood, _shared_noise_dn2, choose_likelihood
 from faintfield.calib.noise.likelihood.marginal import Counts
 from faintfield.calib.noise.likelihood.maximum import NoiseFit
 from tests.calib.noise.darkroom import dark_series, darks, flat_series, specimen
