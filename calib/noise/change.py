@@ -3,10 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
-type Array = NDArray[np.float64]
+from faintfield.calib.noise.strips import Array
 
 _QUANTILE = float(stats.norm.ppf(0.975))
 

@@ -10,6 +10,7 @@ from faintfield.calib.noise.estimate import Estimate
 from faintfield.calib.noise.maps.measure import NoiseMaps
 from faintfield.calib.noise.misfit.goodness import SeriesGoodness, TransferPoint
 from faintfield.calib.noise.series.flats import Saturation
+from faintfield.calib.noise.strips import Array, Mask
 from faintfield.calib.noise_model import BentResponse, Map, NoiseModel
 
 # Quantities without which there is no noise model.
@@ -33,7 +34,7 @@ class Histogram:
     exposure_s: float
     value_dn: NDArray[np.int64]
     count: NDArray[np.int64]
-    expected: NDArray[np.float64]
+    expected: Array
 
 
 @dataclass(frozen=True)
@@ -76,13 +77,13 @@ class NoiseCalibration:
     """
 
     estimates: dict[str, Estimate]
-    covariance: tuple[tuple[str, ...], NDArray[np.float64]]
+    covariance: tuple[tuple[str, ...], Array]
     likelihood: str
     maps: NoiseMaps
-    hot: NDArray[np.bool_]
-    noisy: NDArray[np.bool_]
-    dead: NDArray[np.bool_]
-    telegraph: NDArray[np.bool_]
+    hot: Mask
+    noisy: Mask
+    dead: Mask
+    telegraph: Mask
     variance_ratio: NDArray[np.float32]
     points: tuple[TransferPoint, ...]
     histograms: tuple[Histogram, ...]
@@ -110,7 +111,7 @@ class NoiseCalibration:
         fields: dict[str, Map] = {name: value or 0.0 for name, value in values.items()}
         fields["dark_current_e_per_s"] = max(values["dark_current_e_per_s"] or 0.0, 0.0)
         if per_pixel:
-            maps = {name: getattr(self.maps, name, None) for name in fields}
+            maps = {name: getattr(self.maps, name) for name in fields}
             fields |= {name: values for name, values in maps.items() if values is not None}
         return NoiseModel(
             **fields,

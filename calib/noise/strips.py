@@ -16,6 +16,11 @@ import numba
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+# Numbers; quantity of every pixel (row, column); pixels (row, column) that are in use, or of one kind.
+type Array = NDArray[np.float64]
+type Map = NDArray[np.floating]
+type Mask = NDArray[np.bool_]
+
 # Pixels of a strip, and strips after which maps in files are taken out of memory.
 _STRIP_PX, _RELEASE = 1 << 16, 32
 
@@ -127,24 +132,20 @@ def total_of[T](work: Callable[[slice], T], shape: tuple[int, ...], parts: int |
     return first
 
 
-def thinned(
-    values: NDArray[np.floating], usable: NDArray[np.bool_], scale: Callable[[slice], NDArray[Any]] | None = None
-) -> NDArray[np.floating]:
+def thinned(values: Map, usable: Mask, scale: Callable[[slice], NDArray[Any]] | None = None) -> Map:
     """Return the values of usable pixels (pixel,), over their scale if given; of large arrays those of some rows."""
     every = max(values.size // _ENOUGH_PX, 1) | 1  # odd, so that even and odd rows have their share
 
-    def work(rows: slice) -> NDArray[np.floating]:
+    def work(rows: slice) -> Map:
         first = -rows.start % every
         some = values[rows][first::every]
-        found: NDArray[np.floating] = (some if scale is None else some / scale(rows)[first::every])[
-            usable[rows][first::every]
-        ]
+        found: Map = (some if scale is None else some / scale(rows)[first::every])[usable[rows][first::every]]
         return found
 
     return np.concatenate(over_strips(work, values.shape))
 
 
-def mean_over(values_of: Callable[[slice], NDArray[Any]], usable: NDArray[np.bool_]) -> float:
+def mean_over(values_of: Callable[[slice], NDArray[Any]], usable: Mask) -> float:
     """Return the mean over the usable pixels of what a function returns for the rows of each strip."""
 
     def work(rows: slice) -> float:
@@ -153,7 +154,7 @@ def mean_over(values_of: Callable[[slice], NDArray[Any]], usable: NDArray[np.boo
     return total_of(work, usable.shape) / float(usable.sum())
 
 
-def variance_over(values_of: Callable[[slice], NDArray[Any]], usable: NDArray[np.bool_]) -> float:
+def variance_over(values_of: Callable[[slice], NDArray[Any]], usable: Mask) -> float:
     """Return the variance over the usable pixels, likewise."""
     mean = mean_over(values_of, usable)
     return mean_over(lambda rows: np.square(values_of(rows) - mean), usable)

@@ -1,7 +1,6 @@
 """Saturation and response from the flats, and the scatter of the series about the model."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
 from faintfield.calib.noise.estimate import Estimate, root
@@ -9,9 +8,10 @@ from faintfield.calib.noise.fit.series_fit import SeriesFit
 from faintfield.calib.noise.likelihood.gaussian import flat_variances_dn2, level_variances_dn2
 from faintfield.calib.noise.likelihood.maximum import NoiseFit
 from faintfield.calib.noise.likelihood.moments import Moments
-from faintfield.calib.noise.likelihood.response import BENDS, FittedLevels, charge_dn
+from faintfield.calib.noise.likelihood.response import FittedLevels, charge_dn
 from faintfield.calib.noise.misfit.goodness import series_goodness
 from faintfield.calib.noise.series.flats import Saturation
+from faintfield.calib.noise.strips import Array
 
 # Largest scatter of the noise of series about the model, and largest departure of one, as fractions of the variance.
 MAX_NOISE_ERROR, _MAX_DEPARTURE, _MIN_SIGMAS = 0.05, 0.1, 6.0
@@ -56,18 +56,18 @@ def why_noise_denies(fitted: SeriesFit) -> str | None:
     return None
 
 
-def of_light(fitted: SeriesFit, saturation: Saturation, gain: Estimate, efficiency: Estimate) -> dict[str, Estimate]:
+def light_estimates(
+    fitted: SeriesFit, saturation: Saturation, gain: Estimate, efficiency: Estimate
+) -> dict[str, Estimate]:
     """Return linearity error, saturation capacity and the scatter between series."""
     excess, quantile = fitted.moments.excess, float(stats.norm.ppf(0.975))
-    flicker = lamp_flicker2(fitted.fit, fitted.moments)
+    flicker, light_error = lamp_flicker2(fitted.fit, fitted.moments), Estimate(float(np.sqrt(excess.light2)))
     return {
         "linearity_error": _linearity(fitted, saturation),
         "saturation_e": _capacity(fitted, saturation, gain, efficiency),
         "noise_error": Estimate(float(np.sqrt(excess.variance2))),
         "drift_dn": Estimate(float(np.sqrt(excess.drift_dn2))),
-        "light_error": Estimate(float(np.sqrt(excess.light2)))
-        if _knows_light(fitted)
-        else Estimate(None, why=_NO_LIGHT),
+        "light_error": light_error if _knows_light(fitted) else Estimate(None, why=_NO_LIGHT),
         "lamp_flicker": root(*flicker, quantile) if flicker else Estimate(None, why="there are no flats"),
     }
 
@@ -87,13 +87,12 @@ def lamp_flicker2(fit: NoiseFit, moments: Moments) -> tuple[float, float] | None
     total = float(freedom @ signal2)
     if not total > 0:
         return None
-    found = float(np.sum(flats.level_scatter_dn2 - freedom * still)) / total
-    spread = np.sqrt(2 * float(freedom @ (still + max(found, 0.0) * signal2) ** 2))
-    return found, float(spread) / total
+    variance = float(np.sum(flats.level_scatter_dn2 - freedom * still)) / total
+    spread = np.sqrt(2 * float(freedom @ (still + max(variance, 0.0) * signal2) ** 2))
+    return variance, float(spread) / total
 
 
 def _knows_light(fitted: SeriesFit) -> bool:
-    """Return whether the levels of the flats tell the response."""
     return bool(fitted.bend is not None and fitted.moments.flats.light.groups.size)
 
 
@@ -113,32 +112,24 @@ def _linearity(fitted: SeriesFit, saturation: Saturation) -> Estimate:
         return Estimate(None, why=_POOR_RESPONSE)
     if value is None:
         return Estimate(None, why="fewer than 3 levels are within 5 to 95 % of saturation; record more light levels")
-    names = [name for name in fit.values if name in BENDS]
-    at = [list(fit.values).index(name) for name in names]
-    covariance, bends = fit.covariance[np.ix_(at, at)], np.array([fit.values[name] for name in names])
+    names, covariance = list(fit.bend.values), fit.bend.covariance
+    bends = np.array([*fit.bend.values.values()])
+
+    def error_of(draw: Array) -> float | None:
+        return levels.linearity(dict(zip(names, draw.tolist(), strict=True)))
+
     drawn = np.random.default_rng(1288).multivariate_normal(bends, covariance, _DRAWS, method="svd")
-    found = [levels.linearity(dict(zip(names, draw.tolist(), strict=True))) for draw in drawn]
-    errors = np.array([error for error in found if error is not None])
+    errors = np.array([error for error in map(error_of, drawn) if error is not None])
     if errors.size < (1 - _MAX_IMPOSSIBLE) * _DRAWS:
         return Estimate(None, why=_POOR_RESPONSE)
     se = float(np.sqrt(np.mean((errors - value) ** 2)))
-    gradient = np.zeros(len(fit.values))
-    gradient[at] = _slopes(levels, names, bends, covariance)
-    half = fit.quantile(gradient) * se
+    gradient = dict.fromkeys(fit.values, 0.0)
+    for name, direction, step in zip(names, np.eye(len(names)), 0.1 * np.sqrt(np.diag(covariance)), strict=True):
+        low, high = (error_of(bends + sign * step * direction) or 0.0 for sign in (-1, 1))
+        gradient[name] = (high - low) / max(2 * step, 1e-300)
+    half = fit.quantile(np.array([*gradient.values()])) * se
     straight = stats.chi2.sf(float(bends @ np.linalg.pinv(covariance) @ bends), len(names)) > 0.05
     return Estimate(value, se, (0.0 if straight else max(value - half, 0.0), value + half))
-
-
-def _slopes(
-    levels: FittedLevels, names: list[str], bends: NDArray[np.float64], covariance: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the derivatives of the linearity error by the bends, over a tenth of their errors."""
-    found = []
-    for index, step in enumerate(0.1 * np.sqrt(np.diag(covariance))):
-        ends = [bends + sign * step * np.eye(len(names))[index] for sign in (-1, 1)]
-        low, high = (levels.linearity(dict(zip(names, end.tolist(), strict=True))) or 0.0 for end in ends)
-        found.append((high - low) / max(2 * step, 1e-300))
-    return np.array(found)
 
 
 def _capacity(fitted: SeriesFit, saturation: Saturation, gain: Estimate, efficiency: Estimate) -> Estimate:
@@ -151,27 +142,34 @@ def _capacity(fitted: SeriesFit, saturation: Saturation, gain: Estimate, efficie
         return Estimate(None, why="no series of flats reaches saturation; record light levels up to it")
     if gain.value is None or gain.se is None:
         return Estimate(None, why=gain.why)
-    values = fitted.fit.values
-    if saturation.limit == "full well":
-        return _full_well(saturation, efficiency)
-    ends = (saturation.level_dn, *saturation.interval_dn)
-    charges = [float(charge_dn(values, level - values["offset_dn"])) / gain.value for level in ends]
-    relative = 1.96 * gain.se / gain.value
-    low, high = charges[1] * (1 - relative), charges[2] * (1 + relative)
-    return Estimate(charges[0], (high - low) / 3.92, (low, high))
-
-
-def _full_well(saturation: Saturation, efficiency: Estimate) -> Estimate:
-    """Return the capacity from the photons of the noisiest series and its neighbours."""
+    if saturation.limit == "ADC":
+        values, ends = fitted.fit.values, (saturation.level_dn, *saturation.interval_dn)
+        charges = [float(charge_dn(values, level - values["offset_dn"])) / gain.value for level in ends]
+        return _capacity_estimate(charges, 1.96 * gain.se / gain.value)
     flats = sorted(
         (*saturation.kept, *(flat for flat, _ in saturation.left_out)), key=lambda flat: flat.levels_dn.mean()
     )
     means = [float(flat.levels_dn.mean()) for flat in flats]
-    at = int(np.argmin(np.abs(np.array(means) - (saturation.level_dn or 0.0))))
+    at = int(np.argmin(np.abs(np.array(means) - saturation.level_dn)))
     photons = [flats[k].conditions.photons for k in (at, max(at - 1, 0), min(at + 1, len(flats) - 1))]
     if efficiency.value is None or efficiency.se is None or not all(photons):
         return Estimate(None, why="the charge of a full well follows from its photons, which are not stated")
     charges = [efficiency.value * float(number or 0.0) for number in photons]
-    relative = 1.96 * efficiency.se / efficiency.value
-    low, high = charges[1] * (1 - relative), charges[2] * (1 + relative)
-    return Estimate(charges[0], (high - low) / 3.92, (low, high))
+    return _capacity_estimate(charges, 1.96 * efficiency.se / efficiency.value)
+
+
+def _capacity_estimate(charges_e: list[float], relative: float) -> Estimate:
+    """Return the first charge, with an interval from the second to the third, widened by a relative half width."""
+    low, high = charges_e[1] * (1 - relative), charges_e[2] * (1 + relative)
+    return Estimate(charges_e[0], (high - low) / 3.92, (low, high))
+
+
+def quantum_efficiency(photons: Array, charge_e: Array, gain_relative_se: float) -> tuple[float, float]:
+    """Return electrons per photon with the standard error, from the charges of flats (series,) and their photons.
+
+    EMVA 1288's η = R/K is the slope of charge over photons through the origin. Its error is that of the gain and of the
+    light's steadiness.
+    """
+    slope = float(charge_e @ photons / (photons @ photons))
+    scatter = float(np.sum((charge_e - slope * photons) ** 2)) / max(photons.size - 1, 1) / float(photons @ photons)
+    return slope, float(np.hypot(slope * gain_relative_se, np.sqrt(scatter)))

@@ -15,10 +15,7 @@ from scipy import stats
 
 from faintfield.calib.noise.estimate import Estimate, root
 from faintfield.calib.noise.series.statistics import Series
-from faintfield.calib.noise.strips import map_of, mean_over, over_strips, total_of
-
-type Array = NDArray[np.float64]
-type Mask = NDArray[np.bool_]
+from faintfield.calib.noise.strips import Array, Mask, map_of, mean_over, over_strips, total_of
 
 # Width of the box whose mean is subtracted from bright images before their histogram is taken.
 _BOX_PX = 5
@@ -115,7 +112,6 @@ def _of_means(means: Array, noise: float, noise_se: float) -> tuple[float, float
 
 
 def _freedom_share(used: Mask) -> float:
-    """Return the share of degrees of freedom left when rows and columns are taken out."""
     return max(float(used.sum()) - sum(used.shape) + 1, 1.0) / float(used.sum())
 
 
@@ -126,7 +122,7 @@ def _parts(image: NDArray[Any], used: Mask) -> tuple[Array, Array, float]:
     def deviation(rows: slice) -> Array:
         return np.where(used[rows], image[rows] - np.float64(mean), 0.0)
 
-    sums = over_strips(lambda rows: ((it := deviation(rows)).sum(1), it.sum(0)), used.shape)
+    sums = over_strips(lambda rows: ((part := deviation(rows)).sum(1), part.sum(0)), used.shape)
     of_rows, of_columns = zip(*sums, strict=True)
     per_row, per_column = used.sum(1), used.sum(0)
     row = np.concatenate(of_rows) / np.maximum(per_row, 1)

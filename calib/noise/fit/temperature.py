@@ -4,16 +4,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 from scipy.optimize import minimize_scalar
 
 from faintfield.calib.noise.estimate import Estimate, interval
 from faintfield.calib.noise.likelihood.maximum import NoiseFit
 from faintfield.calib.noise.likelihood.moments import Moments
-from faintfield.calib.noise.series.statistics import Series
-
-type Array = NDArray[np.float64]
+from faintfield.calib.noise.series.statistics import Conditions, Series
+from faintfield.calib.noise.strips import Array
 
 # Smallest range of temperatures that shows the growth, and limits of the kelvins over which dark current may double.
 _MIN_RANGE_K, _MIN_DOUBLING_K, _MAX_DOUBLING_K = 5.0, 2.0, 30.0
@@ -57,24 +55,31 @@ def settle_temperature(series: Sequence[Series]) -> tuple[Sequence[Series], Warm
     warmth = np.array([dark.conditions.temperature_c for dark in darks], np.float64)
     if np.unique(warmth).size < 2:
         return series, Warmth()
-    range_k, found = float(np.ptp(warmth)), _doubling(darks)
+    range_k, doubling = float(np.ptp(warmth)), _doubling(darks)
     stated_k = _stated_doubling_k(darks)
     if stated_k is not None:
-        return series, Warmth(range_k=range_k, warnings=_contradiction(stated_k, found))
-    if found.value is None:
+        return series, Warmth(range_k=range_k, warnings=_contradiction(stated_k, doubling))
+    if doubling.value is None:
         why = (
             f"the darks have {warmth.min():g} to {warmth.max():g} °C and nothing tells how their dark current grows: "
             f"its interval allows for {_USUAL_PER_K:.0%} per kelvin; state dark_current_doubling_k, or record all "
-            f"darks at one temperature ({found.why})"
+            f"darks at one temperature ({doubling.why})"
         )
-        return series, Warmth(found, range_k, (why,))
-    frames = np.array([dark.frames for dark in darks])
-    reference_c = float(np.average(warmth, weights=frames))
+        return series, Warmth(doubling, range_k, (why,))
+    doubling_k, reference_c = doubling.value, float(np.average(warmth, weights=[dark.frames for dark in darks]))
     note = (
-        f"dark_current_doubling_k is not stated: the dark current of these darks doubles every {found.value:.3g} ± "
-        f"{found.se:.2g} K, by which it is taken to that at {reference_c:.1f} °C"
+        f"dark_current_doubling_k is not stated: the dark current of these darks doubles every {doubling.value:.3g} ± "
+        f"{doubling.se:.2g} K, by which it is taken to that at {reference_c:.1f} °C"
     )
-    return [_at(item, reference_c, found.value) for item in series], Warmth(found, range_k, (note,))
+
+    def at_reference(conditions: Conditions) -> Conditions:
+        if conditions.temperature_c is None:
+            return conditions
+        factor = dark_factor(conditions.temperature_c, reference_c, doubling_k)
+        return replace(conditions, dark_factor=factor)
+
+    settled = [replace(item, conditions=at_reference(item.conditions)) for item in series]
+    return settled, Warmth(doubling, range_k, (note,))
 
 
 def with_doubling_error(fit: NoiseFit, moments: Moments, darks: Sequence[Series], warmth: Warmth) -> NoiseFit:
@@ -85,22 +90,17 @@ def with_doubling_error(fit: NoiseFit, moments: Moments, darks: Sequence[Series]
     if warmth.doubling.value is not None and warmth.doubling.se is not None:
         doublings = np.log2([dark.conditions.dark_factor for dark in darks]) * warmth.doubling.value
         ends = [warmth.doubling.value + sign * warmth.doubling.se for sign in (-1, 1)]
-        slopes = [_slope(moments, 2.0 ** (doublings / end), darks) for end in ends]
-        error = 0.5 * (slopes[1] - slopes[0])
+        exposure_s, weights = [dark.conditions.exposure_s for dark in darks], np.sqrt(moments.darks.frames)
+        times_s = [2.0 ** (doublings / end) * exposure_s for end in ends]
+        low, high = (float(np.polyfit(t, moments.darks.mean_dn, 1, w=weights)[0]) for t in times_s)
+        error = 0.5 * (high - low)
     at = list(fit.values).index("dark_signal_dn_per_s")
     covariance = fit.covariance.copy()
     covariance[at, at] += error**2
     return replace(fit, covariance=covariance)
 
 
-def _slope(moments: Moments, factor: Array, darks: Sequence[Series]) -> float:
-    """Return the slope of the dark levels over the exposure times at given factors of the dark current."""
-    times = factor * [dark.conditions.exposure_s for dark in darks]
-    return float(np.polyfit(times, moments.darks.mean_dn, 1, w=np.sqrt(moments.darks.frames))[0])
-
-
 def _doubling(darks: Sequence[Series]) -> Estimate:
-    """Return the kelvins over which the dark current of the darks doubles."""
     exposures, warmth = ([getattr(dark.conditions, of) for dark in darks] for of in ("exposure_s", "temperature_c"))
     frames = [dark.frames for dark in darks]
     levels = np.concatenate([dark.levels_dn for dark in darks])
@@ -115,23 +115,16 @@ def _stated_doubling_k(darks: Sequence[Series]) -> float | None:
     return float((high.temperature_c - low.temperature_c) / np.log2(high.dark_factor / low.dark_factor))
 
 
-def _contradiction(stated_k: float, found: Estimate) -> tuple[str, ...]:
+def _contradiction(stated_k: float, doubling: Estimate) -> tuple[str, ...]:
     """Return a warning if the darks contradict the stated doubling."""
-    if found.value is None or found.se is None or abs(found.value - stated_k) <= _MAX_SIGMAS * found.se:
+    value, se = doubling.value, doubling.se
+    if value is None or se is None or abs(value - stated_k) <= _MAX_SIGMAS * se:
         return ()
     return (
         f"dark_current_doubling_k = {stated_k:.3g} is stated, but the dark current of these darks doubles every "
-        f"{found.value:.3g} ± {found.se:.2g} K ({abs(found.value - stated_k) / found.se:.0f} standard errors): correct "
-        "it, or leave it out to have it measured",
+        f"{value:.3g} ± {se:.2g} K ({abs(value - stated_k) / se:.0f} standard errors): correct it, or leave it out to "
+        "have it measured",
     )
-
-
-def _at(one: Series, reference_c: float, doubling_k: float) -> Series:
-    """Return a series with its dark current over that at a temperature."""
-    if (warmth := one.conditions.temperature_c) is None:
-        return one
-    factor = dark_factor(warmth, reference_c, doubling_k)
-    return replace(one, conditions=replace(one.conditions, dark_factor=factor))
 
 
 def dark_factor(temperature_c: float, reference_c: float, doubling_k: float) -> float:

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.special import gammaln
 
-type Array = NDArray[np.float64]
+from faintfield.calib.noise.strips import Array
 
 # The parameters of a mass function, and those of the likelihood, in this order.
 MASS_PARAMETERS = ("log_gain", "log_read_e", "log_dark_e_per_s", "dcnu")
@@ -192,15 +192,15 @@ class MassTable:
         Their derivatives by `MASS_PARAMETERS`.
     """
 
-    log_mass: NDArray[np.float64]
-    log_tail: NDArray[np.float64]
-    mass_slope: NDArray[np.float64]
-    tail_slope: NDArray[np.float64]
+    log_mass: Array
+    log_tail: Array
+    mass_slope: Array
+    tail_slope: Array
 
 
 def mass_function(
-    u_dn: NDArray[np.float64], exposure_s: float, max_charge_e: float, *, exact: bool, spread: bool
-) -> Callable[[NDArray[np.float64]], MassTable]:
+    u_dn: Array, exposure_s: float, max_charge_e: float, *, exact: bool, spread: bool
+) -> Callable[[Array], MassTable]:
     """Return the mass function of one exposure, differentiated by casadi.
 
     Parameters
@@ -236,7 +236,7 @@ def mass_function(
     return partial(_tabulate, ca.Function("mass", [x], [table, ca.jacobian(table, x)]), (2, len(mass), u_dn.size))
 
 
-def _tabulate(function: ca.Function, shape: tuple[int, int, int], values: NDArray[np.float64]) -> MassTable:
+def _tabulate(function: ca.Function, shape: tuple[int, int, int], values: Array) -> MassTable:
     """Return the table at some values of `MASS_PARAMETERS`; `shape` is (mass or tail, node, u)."""
     logs, slopes = (np.array(part) for part in function(values))
     logs = logs.reshape(shape).transpose(0, 2, 1)
@@ -244,12 +244,12 @@ def _tabulate(function: ca.Function, shape: tuple[int, int, int], values: NDArra
     return MassTable(logs[0], logs[1], slopes[0], slopes[1])
 
 
-def _normal_tail(u_dn: NDArray[np.float64], charge: ca.MX, gain: ca.MX, read: ca.MX) -> ca.MX:
+def _normal_tail(u_dn: Array, charge: ca.MX, gain: ca.MX, read: ca.MX) -> ca.MX:
     """Return Φ((u − g λ) / s), eq. (3)."""
     return _ndtr((ca.MX(u_dn) - gain * charge) / (gain * ca.sqrt(read**2 + charge)))
 
 
-def _poisson_tail(u_dn: NDArray[np.float64], charge: ca.MX, gain: ca.MX, read: ca.MX, max_charge_e: float) -> ca.MX:
+def _poisson_tail(u_dn: Array, charge: ca.MX, gain: ca.MX, read: ca.MX, max_charge_e: float) -> ca.MX:
     """Return Σ_k P(k; λ) Φ((u − g k) / gσ), eq. (2)."""
     k = np.arange(int(max_charge_e + 8 * np.sqrt(max_charge_e) + 10))
     poisson = ca.exp(ca.DM(k) * ca.log(charge) - charge - ca.DM(gammaln(k + 1.0)))
@@ -258,5 +258,4 @@ def _poisson_tail(u_dn: NDArray[np.float64], charge: ca.MX, gain: ca.MX, read: c
 
 
 def _ndtr(z: ca.MX) -> ca.MX:
-    """Return the normal distribution function Φ."""
     return ca.MX(0.5 * (1 + ca.erf(z / np.sqrt(2.0))))

@@ -6,7 +6,6 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
 from faintfield.calib.errors import PoorFit
@@ -14,6 +13,7 @@ from faintfield.calib.noise.likelihood.gaussian import negative_log_likelihood
 from faintfield.calib.noise.likelihood.moments import Excess, Moments
 from faintfield.calib.noise.likelihood.response import BENDS
 from faintfield.calib.noise.likelihood.rounding import ROUNDING_DN2
+from faintfield.calib.noise.strips import Array, Mask
 
 # IPOPT prints nothing only with all of these. It also tries points with a negative variance, and backs off by itself.
 _QUIET: dict[str, Any] = {"ipopt.print_level": 0, "print_time": False, "ipopt.sb": "yes", "show_eval_warnings": False}
@@ -30,6 +30,14 @@ _SPREADS = ("dsnu_dn2", "dcnu_dn2_per_s2")
 # Largest jitter that counts as zero, over the one that the levels can show: IPOPT stops a little above its bound, where
 # the likelihood may be curved the wrong way.
 _NO_JITTER = 1e-4
+
+
+@dataclass(frozen=True)
+class Bend:
+    """Coefficients κ₁, κ₂ … of the response by their names, and their covariance."""
+
+    values: dict[str, float]
+    covariance: Array
 
 
 @dataclass(frozen=True)
@@ -53,12 +61,19 @@ class NoiseFit:
     """
 
     values: dict[str, float]
-    covariance: NDArray[np.float64]
+    covariance: Array
     log_likelihood: float
-    sources: tuple[tuple[NDArray[np.float64], int], ...] = ()
-    plain_covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
+    sources: tuple[tuple[Array, int], ...] = ()
+    plain_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
-    def quantile(self, gradient: NDArray[np.float64]) -> float:
+    @property
+    def bend(self) -> Bend:
+        """Bend of the response."""
+        at = [index for index, name in enumerate(self.values) if name in BENDS]
+        values = {name: value for name, value in self.values.items() if name in BENDS}
+        return Bend(values, self.covariance[np.ix_(at, at)])
+
+    def quantile(self, gradient: Array) -> float:
         """Return the half width of a 95 % interval, in standard errors, of a linear combination of the parameters.
 
         The scatter between series is known from few of them only. Student's t has Satterthwaite's degrees of freedom
@@ -70,6 +85,10 @@ class NoiseFit:
         if not spread > 1e-6 * variance**2:
             return float(stats.norm.ppf(0.975))
         return float(stats.t.ppf(0.975, variance**2 / spread))
+
+    def quantile_of(self, name: str) -> float:
+        """Return `quantile` of one parameter."""
+        return self.quantile(np.array([float(parameter == name) for parameter in self.values]))
 
     def standard_error(self, name: str) -> float:
         """Return the standard error of one parameter, infinite for one that was not fitted."""
@@ -121,14 +140,14 @@ class GaussianProblem:
         values = dict(zip(self._start, (at * self._units).tolist(), strict=True))
         return NoiseFit(values, self.covariance(values, excess), -minimum)
 
-    def covariance(self, values: Mapping[str, float], excess: Excess) -> NDArray[np.float64]:
+    def covariance(self, values: Mapping[str, float], excess: Excess) -> Array:
         """Return the inverse of the Hessian of −ln L at given parameters, in their order."""
         at = np.array([*values.values()]) / self._units
         free = np.array([name != "jitter_dn2" or at[i] > _NO_JITTER for i, name in enumerate(values)])
         hessian = np.array(self._hessian(at, list(astuple(excess))))
         return _inverse_on(hessian, free) * np.outer(self._units, self._units)
 
-    def _minimize(self, excess: list[float], near: Mapping[str, float]) -> tuple[NDArray[np.float64], float]:
+    def _minimize(self, excess: list[float], near: Mapping[str, float]) -> tuple[Array, float]:
         """Return the minimum in units of the parameters, and the value there."""
         solver, units, start = self._solver, self._units, self._start | dict(near)
         # The spreads over pixels may be negative, as unbiased differences of variances can be. A bound at zero would
@@ -138,18 +157,13 @@ class GaussianProblem:
         # avoid that.
         for share in (1.0, 0.1, 0.01):
             first = [value * (share if name in _SPREADS else 1.0) for name, value in start.items()]
-            found = solver(x0=(first / units).tolist(), p=excess, lbx=limits[:, 0], ubx=limits[:, 1])
+            minimum = solver(x0=(first / units).tolist(), p=excess, lbx=limits[:, 0], ubx=limits[:, 1])
             if solver.stats()["success"]:
-                return np.array(found["x"]).ravel(), float(found["f"])
+                return np.array(minimum["x"]).ravel(), float(minimum["f"])
         raise PoorFit(
             f"the noise likelihood has no maximum: IPOPT stopped with {solver.stats()['return_status']} after "
             f"{solver.stats()['iter_count']} iterations; check that the darks were taken with the lens covered"
         )
-
-
-def fit_gaussian(moments: Moments, *, bends: int = 0) -> NoiseFit:
-    """Maximize the likelihood of the moments, with the scatter that they state; see `GaussianProblem`."""
-    return GaussianProblem(moments, bends).fit(moments.excess)
 
 
 def _start(moments: Moments, bends: int) -> tuple[dict[str, float], dict[str, float]]:
@@ -191,7 +205,7 @@ def _start_gain(moments: Moments, read_dn2: float, slope_dn_per_s: float) -> flo
     return float(np.clip(excess / signal if signal > 0 else 1.0, 1e-2, 1e2))
 
 
-def _inverse_on(hessian: NDArray[np.float64], free: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _inverse_on(hessian: Array, free: Mask) -> Array:
     """Return the inverse of the Hessian over the free parameters, with a huge variance in undetermined directions."""
     covariance = np.zeros_like(hessian)
     values, vectors = np.linalg.eigh(hessian[np.ix_(free, free)])

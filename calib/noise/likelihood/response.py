@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from faintfield.calib.noise.series.statistics import Series
-
-type Array = NDArray[np.float64]
+from faintfield.calib.noise.strips import Array
 
 # κ₁, κ₂, … by their names in a fit.
 BENDS = tuple(f"nonlinearity_per_dn{power}" for power in ("", "2", "3", "4", "5"))
@@ -59,10 +58,10 @@ def charge_slope(values: Mapping[str, Any], signal_dn: Any) -> Any:
 
 def _polynomial(coefficients: Sequence[Any], x: Any) -> Any:
     """Return c₁ x + c₂ x² and so on."""
-    found: Any = 0.0
+    total: Any = 0.0
     for coefficient in reversed(coefficients):
-        found = (coefficient + found) * x
-    return found
+        total = (coefficient + total) * x
+    return total
 
 
 @dataclass(frozen=True)
@@ -136,18 +135,18 @@ def scatter_of_levels(light: Light, signal_dn: Array, variance_dn2: Array, bends
 
     def deviance(excess: float) -> float:
         root = np.sqrt(variance + excess * s**2)
-        found = np.linalg.lstsq(design / root[:, None], s / root)[0]
-        return float(np.sum(((s - design @ found) / root) ** 2))
+        coefficients = np.linalg.lstsq(design / root[:, None], s / root)[0]
+        return float(np.sum(((s - design @ coefficients) / root) ** 2))
 
     return grown_variance(deviance, design.shape[0] - design.shape[1]), deviance(0.0)
 
 
-def grown_variance(deviance: Callable[[float], float], freedom: float, start: float = 1e-12) -> float:
+def grown_variance(deviance: Callable[[float], float], freedom: float) -> float:
     """Return the excess variance at which a falling deviance equals its degrees of freedom; 0 if chance makes it."""
     usual = _USUAL_CHANCE if freedom >= _FEW_FREEDOM else _CHANCE_OF_FEW
     if freedom < 1 or stats.chi2.sf(deviance(0.0), freedom) > usual:
         return 0.0
-    low, high = 0.0, start
+    low, high = 0.0, 1e-12
     while deviance(high) > freedom:
         low, high = high, 4 * high
     for _ in range(50):

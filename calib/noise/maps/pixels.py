@@ -15,9 +15,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from faintfield.calib.noise.series.statistics import Series, robust_sigma
-from faintfield.calib.noise.strips import map_of, maps_of, mean_over
-
-type Array = NDArray[np.float64]
+from faintfield.calib.noise.strips import Array, Map, Mask, map_of, maps_of, mean_over
 
 # Robust standard deviations above the median dark signal from which a pixel is hot.
 _HOT_SIGMA = 5.0
@@ -32,7 +30,7 @@ _NOISY_BY_CHANCE = 1e-2
 _USELESS, _USELESS_TELEGRAPH = 25.0, 4.0
 
 
-def hot_pixels(darks: Sequence[Series]) -> NDArray[np.bool_]:
+def hot_pixels(darks: Sequence[Series]) -> Mask:
     """Return the pixels (row, column) with a large dark signal, the longest exposure minus the shortest.
 
     Parameters
@@ -51,7 +49,7 @@ def hot_pixels(darks: Sequence[Series]) -> NDArray[np.bool_]:
     return map_of(lambda rows: signal_dn[rows] > limit_dn, signal_dn.shape, bool)
 
 
-def outlying_pixels(variance_ratio: NDArray[np.floating], freedom: float) -> NDArray[np.bool_]:
+def outlying_pixels(variance_ratio: Map, freedom: float) -> Mask:
     """Return the pixels (row, column) with more noise than chance allows.
 
     Causes are random telegraph signals, cosmic rays and loose contacts.
@@ -71,7 +69,7 @@ def outlying_pixels(variance_ratio: NDArray[np.floating], freedom: float) -> NDA
     return map_of(lambda rows: variance_ratio[rows] > limit, variance_ratio.shape, bool)
 
 
-def _population_spread(variance_ratio: NDArray[np.floating], freedom: float) -> float:
+def _population_spread(variance_ratio: Map, freedom: float) -> float:
     """Return the standard deviation of the logarithm of the pixels' own variances.
 
     It is read from the median and the quantile at one standard deviation above it, which defects do not move. Those of
@@ -84,9 +82,7 @@ def _population_spread(variance_ratio: NDArray[np.floating], freedom: float) -> 
     return float(np.sqrt(max(np.log(upper / middle) ** 2 - chance**2, 0.0)))
 
 
-def noisy_pixels(
-    outlying: NDArray[np.bool_], variance_ratio: NDArray[np.floating], telegraph: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
+def noisy_pixels(outlying: Mask, variance_ratio: Map, telegraph: Mask) -> Mask:
     """Return the outlying pixels (row, column) that are too noisy to be of use; the others have a noise of their own.
 
     A pixel of five times the usual noise tells a twenty-fifth of what others tell. One that jumps between two levels
@@ -94,7 +90,7 @@ def noisy_pixels(
     """
     middle = max(float(np.median(variance_ratio)), 1e-12)
 
-    def work(rows: slice) -> NDArray[np.bool_]:
+    def work(rows: slice) -> Mask:
         limit = np.where(telegraph[rows], _USELESS_TELEGRAPH, _USELESS)
         return np.asarray(outlying[rows] & (variance_ratio[rows] / middle > limit))
 
@@ -106,7 +102,7 @@ def variance_ratio(darks: Sequence[Series], noise_dn2: Sequence[float]) -> tuple
     freedom = float(sum(series.frames - 1 for series in darks))
 
     def work(rows: slice) -> Array:
-        ratios = [one.within_dn2[rows] / np.float64(v) for one, v in zip(darks, noise_dn2, strict=True)]
+        ratios = [dark.within_dn2[rows] / np.float64(v) for dark, v in zip(darks, noise_dn2, strict=True)]
         return np.asarray(np.sum(ratios, axis=0) / max(freedom, 1.0))
 
     return map_of(work, darks[0].within_dn2.shape), freedom
@@ -116,35 +112,23 @@ def variance_ratio(darks: Sequence[Series], noise_dn2: Sequence[float]) -> tuple
 class PixelLevels:
     """Offset and dark signal of every pixel, arrays (row, column), with the variances of their errors."""
 
-    offset_dn: NDArray[np.floating]
-    dark_signal_dn_per_s: NDArray[np.floating]
-    offset_variance_dn2: NDArray[np.floating]
-    dark_signal_variance_dn2_per_s2: NDArray[np.floating]
+    offset_dn: Map
+    dark_signal_dn_per_s: Map
+    offset_variance_dn2: Map
+    dark_signal_variance_dn2_per_s2: Map
 
 
 @dataclass(frozen=True)
 class LinePattern:
-    """Pattern of rows and columns in the offsets, shrunk by its share of chance.
-
-    Attributes
-    ----------
-    row_dn, column_dn : array (row,), array (column,)
-        Patterns, whose sum the offsets have.
-    variance_dn2 : float
-        Variance of its error.
-    """
+    """Pattern of rows (row,) and of columns (column,) in the offsets, and the variance of the error of their sum."""
 
     row_dn: Array
     column_dn: Array
     variance_dn2: float
 
-    def of(self, rows: slice) -> Array:
-        """Return the pattern of some rows, (row, column)."""
-        return np.add.outer(self.row_dn[rows], self.column_dn)
-
 
 def line_pattern(darks: Sequence[Series], dsnu_dn2: float) -> LinePattern:
-    """Return what rows and columns share in the offsets, by the dark series of most frames.
+    """Return what rows and columns share in the offsets, by the dark series of most frames, shrunk by chance.
 
     Parameters
     ----------
@@ -172,7 +156,7 @@ def pixel_levels(
     values: Mapping[str, float],
     noise_dn2: Sequence[Callable[[slice], Array | float]],
     pattern: LinePattern,
-    hot: NDArray[np.bool_],
+    hot: Mask,
 ) -> PixelLevels:
     """Return the posterior means of every pixel's offset and dark signal.
 
@@ -197,7 +181,7 @@ def pixel_levels(
     levels = [mean_over(series.mean_of, ~hot) for series in darks]
 
     def work(rows: slice) -> tuple[Array, ...]:
-        of_lines = pattern.of(rows)
+        of_lines = np.add.outer(pattern.row_dn[rows], pattern.column_dn)
         # Precision of offset, of both, and of dark signal; and the deviations that they weigh
         offset, signal = np.full(of_lines.shape, offset_prior), np.where(hot[rows], *signal_priors)
         both, of_offset, of_signal = np.zeros((3, *of_lines.shape))
@@ -220,24 +204,3 @@ def pixel_levels(
         return offset_dn, signal_dn, signal / determinant, offset / determinant
 
     return PixelLevels(*maps_of(work, hot.shape, (np.float32,) * 4))
-
-
-def quantum_efficiency(
-    flats: Sequence[Series], charges_e: Sequence[float], gain_relative_se: float
-) -> tuple[float, float] | None:
-    """Return electrons per photon with the standard error, from the flats that state their photons; None without any.
-
-    EMVA 1288's η = R/K is the slope of charge over photons through the origin. Its error is that of the gain and of the
-    light's steadiness.
-    """
-    stated = [
-        (series.conditions.photons, charge)
-        for series, charge in zip(flats, charges_e, strict=True)
-        if series.conditions.photons
-    ]
-    if not stated:
-        return None
-    photons, charge = np.array(stated, float).T
-    slope = float(charge @ photons / (photons @ photons))
-    scatter = float(np.sum((charge - slope * photons) ** 2)) / max(len(stated) - 1, 1) / float(photons @ photons)
-    return slope, float(np.hypot(slope * gain_relative_se, np.sqrt(scatter)))

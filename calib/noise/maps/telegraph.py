@@ -13,9 +13,7 @@ from numpy.typing import NDArray
 
 from faintfield.calib.noise.maps.read_noise import PixelReadNoise
 from faintfield.calib.noise.series.statistics import Series
-from faintfield.calib.noise.strips import map_of
-
-type Array = NDArray[np.float64]
+from faintfield.calib.noise.strips import Array, Mask, map_of
 
 # Probability that normal noise looks like two levels.
 _CHANCE = 1e-3
@@ -30,17 +28,15 @@ _MAX_LONELY = 0.6
 _MIN_FRAMES, _SIMULATED = 8, 4_000_000
 
 
-def telegraph_pixels(darks: Sequence[Series], read: PixelReadNoise, noise_dn2: Sequence[float]) -> NDArray[np.bool_]:
+def telegraph_pixels(darks: Sequence[Series], read: PixelReadNoise, noise_dn2: Sequence[float]) -> Mask:
     """Return the telegraph pixels (row, column).
 
     Parameters
     ----------
-    darks : sequence of Series
-        Dark series.
+    darks, noise_dn2 : sequence (series,)
+        Dark series, and the pixel noise v_j of each by the fit.
     read : PixelReadNoise
         Read noise of their pixels.
-    noise_dn2 : sequence of float
-        v_j, the pixel noise of each series by the fit.
     """
     frames = np.array([dark.frames for dark in darks])
     if not read.resolved or frames.sum() < _MIN_FRAMES:
@@ -48,7 +44,7 @@ def telegraph_pixels(darks: Sequence[Series], read: PixelReadNoise, noise_dn2: S
     typical = np.median(read.read_noise_dn)
     limit = _normal_quotient(frames, np.sqrt(noise_dn2))
 
-    def work(rows: slice) -> NDArray[np.bool_]:
+    def work(rows: slice) -> Mask:
         powers = [
             np.sum([getattr(dark, name)[rows] for dark in darks], axis=0, dtype=np.float64)
             for name in ("within_dn2", "cubes_dn3", "fourths_dn4")
@@ -63,7 +59,6 @@ def telegraph_pixels(darks: Sequence[Series], read: PixelReadNoise, noise_dn2: S
 
 
 def _shape(second: Array, third: Array, fourth: Array) -> tuple[Array, Array]:
-    """Return squared skewness and kurtosis from central moments."""
     second = np.maximum(second, 1e-12)
     return third**2 / second**3, np.maximum(fourth / second**2, 1.0)
 

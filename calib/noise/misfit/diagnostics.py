@@ -112,7 +112,7 @@ def scatter_warnings(fitted: SeriesFit) -> list[str]:
             f"the levels of the flats scatter by {light:.1%} about the response; the intervals have grown by it: let "
             "the lamp settle, or measure its light with each flat"
         )
-    if fitted.flats and fitted.light_unknown:
+    if fitted.flats and fitted.moments.flats.bend_se == UNKNOWN_BEND_SE:
         warnings.append(
             f"the light of the flats is not known well enough to tell a bend of the response from the gain; the "
             f"intervals allow for {2 * UNKNOWN_BEND_SE:.1%} at the end of the range: state the photons of at least 3 "
@@ -170,17 +170,13 @@ def noise_warning(fitted: SeriesFit, points: Sequence[TransferPoint]) -> str | N
     """Return a warning if a series is noisier or quieter than eq. (1) allows."""
     if fitted.likelihood is NoiseLikelihood.CENSORED:
         return None
-    darks, flats = fitted.moments.darks, fitted.moments.flats
-    rounding2 = [np.zeros(item.frames.size) if item.rounding2 is None else item.rounding2 for item in (darks, flats)]
-    several = [
-        (point, error2) for point, error2 in zip(points, np.concatenate(rounding2), strict=True) if point.frames > 1
-    ]
-    measured = [point for point, _ in several]
+    rounding2 = np.concatenate([fitted.moments.darks.rounding2, fitted.moments.flats.rounding2])
+    several = [(point, error2) for point, error2 in zip(points, rounding2, strict=True) if point.frames > 1]
+    excess = [point.variance_dn2 / point.model_variance_dn2 - 1 for point, _ in several]
     # What rounding may make of the noise is no contradiction.
-    left = [max(abs(p.variance_dn2 / p.model_variance_dn2 - 1) - 2 * np.sqrt(error2), 0.0) for p, error2 in several]
-    excess = [point.variance_dn2 / point.model_variance_dn2 - 1 for point in measured]
+    left = [max(abs(share) - 2 * np.sqrt(error2), 0.0) for share, (_, error2) in zip(excess, several, strict=True)]
     worst = int(np.argmax(left))
-    point = measured[worst]
+    point = several[worst][0]
     sigmas = left[worst] * point.model_variance_dn2 / point.variance_se_dn2
     if left[worst] < _NEGLIGIBLE_FRACTION or sigmas < _MIN_SIGMAS:
         return None

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from faintfield.calib.noise.fit.scatter import flat_variances_of_nodes, light_signal, noise_freedom
 from faintfield.calib.noise.fit.series_fit import SeriesFit
@@ -13,8 +12,7 @@ from faintfield.calib.noise.likelihood.maximum import NoiseFit
 from faintfield.calib.noise.likelihood.moments import Moments
 from faintfield.calib.noise.likelihood.response import charge_dn, charge_slope
 from faintfield.calib.noise.series.statistics import Series
-
-type Array = NDArray[np.float64]
+from faintfield.calib.noise.strips import Array
 
 
 @dataclass(frozen=True)
@@ -97,30 +95,28 @@ def series_goodness(
     noise = [*dark_variances_dn2(fit.values, t), *flat_variances_dn2(fit.values, moments.flats.mean_dn)]
     freedom = np.concatenate(noise_freedom(moments))
     within = np.concatenate([moments.darks.within_dn2, moments.flats.within_dn2])
-    found = []
-    for j, one in enumerate((*darks, *flats)):
-        if one.frames < 2:
-            found.append(SeriesGoodness(one, None, None, residuals[j]))
+    goodness = []
+    for j, item in enumerate((*darks, *flats)):
+        if item.frames < 2:
+            goodness.append(SeriesGoodness(item, None, None, residuals[j]))
             continue
-        excess = float(within[j] / ((one.frames - 1) * moments.freedom * noise[j])) - 1
+        excess = float(within[j] / ((item.frames - 1) * moments.freedom * noise[j])) - 1
         sums = moments.noise[j]
-        expected = noise[j] if one.conditions.kind == "dark" else flat_variances_of_nodes(fit, sums)
-        blocks, by_row, by_column = (
-            _scatter(*sums.scatter(groups, expected)) for groups in (sums.blocks, sums.rows, sums.columns)
-        )
+        expected = noise[j] if item.conditions.kind == "dark" else flat_variances_of_nodes(fit, sums)
+        scatter = [_scatter(*sums.scatter(groups, expected)) for groups in (sums.blocks, sums.rows, sums.columns)]
+        # The variance of a frame over its pixels is that of noise and fixed pattern.
+        pattern_dn2 = max(float(item.spreads_dn2.mean()) - float(noise[j]), 0.0)
+        chance = (2 * float(noise[j]) ** 2 + 4 * float(noise[j]) * pattern_dn2) / float((~item.suspect).sum())
+        scatter.append(Scatter(float(item.spreads_dn2.var() * item.frames / chance), item.frames - 1))
         se = float(np.sqrt(2 / max(freedom[j], 1.0)))
-        found.append(
-            SeriesGoodness(
-                one, excess, se, residuals[j], blocks, by_row, by_column, _frame_scatter(one, float(noise[j]))
-            )
-        )
-    return tuple(found)
+        goodness.append(SeriesGoodness(item, excess, se, residuals[j], *scatter))
+    return tuple(goodness)
 
 
 def _light_residuals(fit: NoiseFit, moments: Moments) -> list[float | None]:
     """Return the level of each flat minus that of the response; None where the light is not known."""
     light, signal = moments.flats.light, light_signal(fit, moments)
-    found: list[float | None] = [None] * signal.size
+    residuals: list[float | None] = [None] * signal.size
     slope = charge_slope(fit.values, signal)
     for group in light.groups:
         members = np.flatnonzero(light.group == group)
@@ -128,19 +124,11 @@ def _light_residuals(fit: NoiseFit, moments: Moments) -> list[float | None]:
         weight = 1 / np.array(level_variances_dn2(fit.values, moments), float)[members]
         factor = float(weight * amount @ charge / (weight * amount @ amount))
         for j, rest in zip(members.tolist(), charge - factor * amount, strict=True):
-            found[j] = float(rest / np.broadcast_to(slope, signal.shape)[j])
-    return found
+            residuals[j] = float(rest / np.broadcast_to(slope, signal.shape)[j])
+    return residuals
 
 
 def _scatter(ratio: Array, freedom: Array) -> Scatter:
     """Return the scatter of a series' noise over groups of pixels about its own mean."""
     mean = np.average(ratio, weights=freedom)
     return Scatter(float(np.sum(0.5 * freedom * (ratio / mean - 1) ** 2)), ratio.size - 1)
-
-
-def _frame_scatter(one: Series, noise_dn2: float) -> Scatter:
-    """Return the scatter of the variance of frames over their pixels, which noise and fixed pattern make."""
-    pixels = float((~one.suspect).sum())
-    pattern_dn2 = max(float(one.spreads_dn2.mean()) - noise_dn2, 0.0)
-    chance = (2 * noise_dn2**2 + 4 * noise_dn2 * pattern_dn2) / pixels
-    return Scatter(float(one.spreads_dn2.var() * one.frames / chance), one.frames - 1)

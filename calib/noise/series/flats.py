@@ -7,13 +7,13 @@ counts only if it shows without any one of the series.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from faintfield.calib.errors import BadFrame, SaturatedFlat
 from faintfield.calib.noise.series.statistics import Series
+from faintfield.calib.noise.strips import Array
 
 type Limit = Literal["ADC", "full well", "not reached"]
 
@@ -74,24 +74,19 @@ def check_flat_levels(darks: Sequence[Series], flats: Sequence[Series]) -> None:
     range_dn = np.array([np.ptp(item.levels_dn) for item in several])
     signal_dn = np.array([item.levels_dn.mean() - dark for item in several])
     # The black level jitters in darks, too; dim flats would take it for flicker.
-    jitter_dn = max((float(np.ptp(dark.levels_dn)) for dark in darks), default=0.0)
+    jitter_dn = max(float(np.ptp(item.levels_dn)) for item in darks)
     share = np.maximum(range_dn - _TIMES_FLICKER * jitter_dn, 0.0) / np.maximum(signal_dn, 1e-9)
     for index, item in enumerate(several):
         others = np.delete(share, index)
         limit = max(_MIN_RANGE, _TIMES_FLICKER * float(np.median(others))) if others.size > 1 else _LONE_RANGE
         if share[index] > limit:
-            raise BadFrame(_message(item, float(range_dn[index] / signal_dn[index]), limit))
-
-
-def _message(one: Series, share: float, limit: float) -> str:
-    """Return which frames differ, by how much, and what to do."""
-    low, high = int(one.levels_dn.argmin()), int(one.levels_dn.argmax())
-    return (
-        f"{one.names[high]}: mean {one.levels_dn[high]:.1f} DN, where {one.names[low]} of the same {one.conditions} "
-        f"has {one.levels_dn[low]:.1f} DN: {share:.0%} of their signal apart (limit {limit:.0%}, by the flicker of the "
-        "others); they are of different light or exposure: correct `exposure_s`, `level` or `photons` of the wrong "
-        "one, or leave it out"
-    )
+            low, high = int(item.levels_dn.argmin()), int(item.levels_dn.argmax())
+            raise BadFrame(
+                f"{item.names[high]}: mean {item.levels_dn[high]:.1f} DN, where {item.names[low]} of the same "
+                f"{item.conditions} has {item.levels_dn[low]:.1f} DN: {range_dn[index] / signal_dn[index]:.0%} of "
+                f"their signal apart (limit {limit:.0%}, by the flicker of the others); they are of different light or "
+                "exposure: correct `exposure_s`, `level` or `photons` of the wrong one, or leave it out"
+            )
 
 
 def find_saturation(darks: Sequence[Series], flats: Sequence[Series], saturation_dn: float) -> Saturation:
@@ -111,18 +106,19 @@ def find_saturation(darks: Sequence[Series], flats: Sequence[Series], saturation
     """
     ceiling = _ceiling_dn(flats, saturation_dn)
     clipped = np.array([flat.clipped_share(ceiling) for flat in flats])
-    peak = _noisiest(flats)
-    if peak is not None and clipped[peak[1] :].max(initial=0.0) <= _MAX_CLIPPED_SHARE:
-        odd = _odd_one(flats, *peak)
-        found = _full_well(darks, flats, *peak) if odd is None else _without_odd(darks, flats, *peak, odd)
+    # From dim to bright; a lone frame shows no noise.
+    order = [j for j in np.argsort([flat.levels_dn.mean() for flat in flats]).tolist() if flats[j].frames > 1]
+    noisiest, falls = _noisiest(flats, order)
+    if falls and clipped[noisiest:].max(initial=0.0) <= _MAX_CLIPPED_SHARE:
+        saturation = _full_well(darks, flats, order, noisiest)
     else:
-        found = _converter_end(flats, clipped, ceiling)
-    if flats and not found.kept:
-        first, why = found.left_out[0]
+        saturation = _converter_end(flats, clipped, ceiling)
+    if flats and not saturation.kept:
+        first, why = saturation.left_out[0]
         raise SaturatedFlat(
             f"{first.names[0]}: {why}, and no other flat is below; shorten the exposure or dim the light"
         )
-    return found
+    return saturation
 
 
 def _ceiling_dn(flats: Sequence[Series], saturation_dn: float) -> float:
@@ -135,87 +131,62 @@ def _ceiling_dn(flats: Sequence[Series], saturation_dn: float) -> float:
     return min(float(max(modes, default=np.inf)), saturation_dn)
 
 
-def _converter_end(flats: Sequence[Series], clipped: NDArray[np.float64], ceiling: float) -> Saturation:
+def _converter_end(flats: Sequence[Series], clipped: Array, ceiling: float) -> Saturation:
     """Return the flats that the end of the converter's range does not clip."""
-    over = clipped > _MAX_CLIPPED_SHARE
-    kept = tuple(flat for flat, out in zip(flats, over, strict=True) if not out)
+    shares = list(zip(flats, clipped, strict=True))
+    kept = tuple(flat for flat, share in shares if share <= _MAX_CLIPPED_SHARE)
     left_out = tuple(
         (flat, f"{share:.2%} of the flat's pixels stand at {ceiling:g} DN, the end of the range")
-        for flat, share, out in zip(flats, clipped, over, strict=True)
-        if out
+        for flat, share in shares
+        if share > _MAX_CLIPPED_SHARE
     )
     if not left_out:
         return Saturation("not reached", None, None, kept, left_out)
     return Saturation("ADC", ceiling, (ceiling, ceiling), kept, left_out)
 
 
-def _noise_dn2(one: Series) -> tuple[float, float]:
+def _noise_dn2(flat: Series) -> tuple[float, float]:
     """Return the noise of the regular pixels of a series, and its standard error."""
-    variance = float(one.within_dn2.mean(where=~one.suspect)) / (one.frames - 1)
-    return variance, variance * float(np.sqrt(2 / ((one.frames - 1) * (~one.suspect).sum())))
+    variance = float(flat.within_dn2.mean(where=~flat.suspect)) / (flat.frames - 1)
+    return variance, variance * float(np.sqrt(2 / ((flat.frames - 1) * (~flat.suspect).sum())))
 
 
-def _by_level(flats: Sequence[Series]) -> list[int]:
-    """Return the places of the flats of several frames, from dim to bright."""
-    return [j for j in np.argsort([flat.levels_dn.mean() for flat in flats]).tolist() if flats[j].frames > 1]
-
-
-def _falls(flats: Sequence[Series], order: list[int]) -> tuple[int, bool]:
+def _noisiest(flats: Sequence[Series], order: list[int]) -> tuple[int, bool]:
     """Return the place in the order of the noisiest series, and whether noise falls beyond."""
-    noise: Any = [_noise_dn2(flats[j]) for j in order]
     if len(order) < 2:
         return 0, False
-    variance, se = np.array(noise).T
+    variance, se = np.array([_noise_dn2(flats[j]) for j in order]).T
     at = int(variance.argmax())
     beyond, error = variance[at + 1 :], np.hypot(se[at], se[at + 1 :])
     falls = (beyond < (1 - _MIN_FALL) * variance[at]) & (variance[at] - beyond > _MIN_SIGMAS * error)
     return at, bool(falls.any())
 
 
-def _noisiest(flats: Sequence[Series]) -> tuple[list[int], int] | None:
-    """Return the series by their level and the place of the noisiest among them, if noise falls beyond; else None."""
-    order = _by_level(flats)
-    at, falls = _falls(flats, order)
-    return (order, at) if falls else None
+def _full_well(darks: Sequence[Series], flats: Sequence[Series], order: list[int], noisiest: int) -> Saturation:
+    """Return the flats in which no well is full, unless the noise falls by a single series alone.
 
-
-def _odd_one(flats: Sequence[Series], order: list[int], at: int) -> int | None:
-    """Return the series without which noise does not fall, the noisiest or another one; None if there is no such one.
-
-    The noise of a single series may be anything: its frames may be of different light, or the readout has failed.
+    The noise of one series may be anything: its frames may be of different light, or the readout has failed.
     """
-    ways = [order[at], *(j for j in reversed(order) if j != order[at])]
-    return next((j for j in ways if not _falls(flats, [index for index in order if index != j])[1]), None)
-
-
-def _without_odd(darks: Sequence[Series], flats: Sequence[Series], order: list[int], at: int, odd: int) -> Saturation:
-    """Return the flats that can be relied on if one series alone has noise that may be that of a full well."""
-    if odd == order[at]:
+    suspects = [order[noisiest], *(j for j in reversed(order) if j != order[noisiest])]
+    odd = next((j for j in suspects if not _noisiest(flats, [index for index in order if index != j])[1]), None)
+    if odd == order[noisiest]:
         why = "its noise is larger than that of brighter flats, and it is the only one; record it again"
         kept = tuple(flat for j, flat in enumerate(flats) if j != odd)
         return Saturation("not reached", None, None, kept, ((flats[odd], why),))
-    found = _full_well(darks, flats, order, at)
-    why = (
-        f"the noise of the flats of {flats[odd].levels_dn.mean():.1f} DN alone is less than that of dimmer ones, as "
-        "beyond a full well; record two more levels as bright"
-    )
-    return Saturation("not reached", None, None, found.kept, tuple((flat, why) for flat, _ in found.left_out))
-
-
-def _full_well(darks: Sequence[Series], flats: Sequence[Series], order: list[int], at: int) -> Saturation:
-    """Return the flats in which no well is full."""
     level = [float(flats[j].levels_dn.mean()) for j in order]
+    full = level[noisiest]
     dark = min(float(item.levels_dn.mean()) for item in darks)
-    highest = dark + _MAX_FILLED * (level[at] - dark)
-    kept = {j for j, mean in zip(order, level, strict=True) if mean <= highest}
-    left_out = tuple(
-        (
-            flat,
-            f"its mean of {flat.levels_dn.mean():.1f} DN is over {_MAX_FILLED:.0%} of the full well, "
-            f"{level[at]:.1f} DN",
+    below = {j for j, mean in zip(order, level, strict=True) if mean <= dark + _MAX_FILLED * (full - dark)}
+    kept = tuple(flats[j] for j in sorted(below))
+    beyond = [flat for j, flat in enumerate(flats) if j not in below]
+    if odd is not None:
+        why = (
+            f"the noise of the flats of {flats[odd].levels_dn.mean():.1f} DN alone is less than that of dimmer ones, "
+            "as beyond a full well; record two more levels as bright"
         )
-        for j, flat in enumerate(flats)
-        if j not in kept
+        return Saturation("not reached", None, None, kept, tuple((flat, why) for flat in beyond))
+    left_out = tuple(
+        (flat, f"its mean of {flat.levels_dn.mean():.1f} DN is over {_MAX_FILLED:.0%} of the full well, {full:.1f} DN")
+        for flat in beyond
     )
-    around = (level[max(at - 1, 0)], level[at + 1])
-    return Saturation("full well", level[at], around, tuple(flats[j] for j in sorted(kept)), left_out)
+    return Saturation("full well", full, (level[max(noisiest - 1, 0)], level[noisiest + 1]), kept, left_out)

@@ -22,8 +22,10 @@ def fit(errors: dict[str, float] | None = None, **changes: float) -> NoiseFit:
 def moments(*frames: float, exposure_s: tuple[float, ...] = (0.1, 10.0, 60.0)) -> Moments:
     several = np.array(frames or (10.0, 10.0, 10.0), float)
     zeros = np.zeros(len(several))
-    darks = DarkMoments(np.array(exposure_s), several, zeros, zeros, zeros, np.zeros((len(several), len(several))))
-    return Moments(3600.0, 3500.0, darks, FlatMoments(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0)))
+    darks = DarkMoments(
+        np.array(exposure_s), several, zeros, zeros, zeros, np.zeros((len(several), len(several))), zeros
+    )
+    return Moments(3600.0, 3500.0, darks, FlatMoments(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0)))
 
 
 def test_positive_quantities_have_logarithmic_intervals() -> None:

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from faintfield.calib.noise import Conditions, Series, calibrate, measure_series
 from faintfield.calib.noise.estimate import Estimate
-from faintfield.calib.noise.fit.odd_light import without_odd
-from faintfield.calib.noise.fit.scatter import trend_dn2
+from faintfield.calib.noise.fit.scatter import trend_dn2, without_odd
 from faintfield.calib.noise.fit.temperature import Warmth, settle_temperature, with_doubling_error
 from faintfield.calib.noise.likelihood.maximum import NoiseFit
 from faintfield.calib.noise.likelihood.moments import gather_moments

@@ -11,7 +11,7 @@ from scipy import stats
 
 from faintfield.calib.noise import NoiseCalibration, calibrate
 from faintfield.calib.noise.fit.series_fit import NoiseLikelihood
-from faintfield.calib.noise.likelihood.exact import Bent, _flat_part, _Maximum
+from faintfield.calib.noise.likelihood.exact import _flat_part, _Maximum
 from faintfield.calib.noise.likelihood.marginal import (
     DARK_LOG_WEIGHTS,
     DARK_NODES,
@@ -20,6 +20,7 @@ from faintfield.calib.noise.likelihood.marginal import (
     MarginalLikelihood,
     mass_function,
 )
+from faintfield.calib.noise.likelihood.maximum import Bend
 from faintfield.calib.noise.likelihood.moments import DarkMoments, FlatMoments, Moments
 from tests.calib.noise.darkroom import dark_series, expose, specimen
 from tests.calib.noise.likelihood.slopes import slopes
@@ -150,10 +151,10 @@ def test_covariance_passes_on_by_slopes_of_parameters() -> None:
 
 
 def test_likelihood_of_flats_has_slopes_and_information() -> None:
-    at, straight = np.array([np.log(2.0), np.log(1.4), np.log(0.2), 0.0, 100.0, np.log(3.0)]), Bent({}, np.eye(0))
+    at, straight = np.array([np.log(2.0), np.log(1.4), np.log(0.2), 0.0, 100.0, np.log(3.0)]), Bend({}, np.eye(0))
     frames, mean_dn, within_dn2 = np.array([4.0, 3.0]), np.array([2100.0, 9100.0]), np.array([9e6, 3e7])
-    evenness, no_darks = np.array([0.95, 0.9]), DarkMoments(*[np.zeros(0)] * 6)
-    flats = FlatMoments(frames, mean_dn, within_dn2, evenness)
+    evenness, no_darks = np.array([0.95, 0.9]), DarkMoments(*[np.zeros(0)] * 7)
+    flats = FlatMoments(frames, mean_dn, within_dn2, evenness, np.zeros(2))
     degrees = (frames - 1) * 1000.0 * evenness
 
     def by_hand(x: NDArray[np.float64]) -> NDArray[np.float64]:
