@@ -6,7 +6,7 @@
 from faintfield.calib.noise.calibrate import calibrate
 from faintfield.calib.noise.estimate import Estimate
 from faintfield.calib.noise.maps.measure import NoiseMaps
-from faintfield.calib.noise.misfit.goodness import TransferPoint
+from faintfield.calib.noise.misfit import TransferPoint
 from faintfield.calib.noise.result import NoiseCalibration
 from faintfield.calib.noise.series.statistics import Conditions, Series, SeriesSums, measure_series
 

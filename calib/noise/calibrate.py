@@ -7,6 +7,7 @@ import numpy as np
 from scipy import stats
 from scipy.signal import fftconvolve
 
+from faintfield.calib.errors import CopiedFrame, NotIdentifiable, TooFewFrames
 from faintfield.calib.noise.emva.estimates import estimate_all
 from faintfield.calib.noise.fit.series_fit import (
     MAX_TABLE_WIDTH_DN,
@@ -19,21 +20,22 @@ from faintfield.calib.noise.fit.temperature import settle_temperature, with_doub
 from faintfield.calib.noise.likelihood.marginal import Counts, mass_function
 from faintfield.calib.noise.maps.measure import measure_pixels, noise_maps
 from faintfield.calib.noise.maps.pixels import hot_pixels, outlying_pixels, variance_ratio
-from faintfield.calib.noise.misfit.diagnostics import (
-    check_series,
+from faintfield.calib.noise.misfit import (
     frame_warnings,
     level_warning,
     noise_warning,
-    odd_light_warnings,
-    saturation_warnings,
     scatter_warnings,
+    series_goodness,
+    transfer_points,
 )
-from faintfield.calib.noise.misfit.goodness import series_goodness, transfer_points
 from faintfield.calib.noise.result import Histogram, NoiseCalibration
 from faintfield.calib.noise.series.flats import check_flat_levels, find_saturation
 from faintfield.calib.noise.series.statistics import Series
 from faintfield.calib.noise.strips import Mask
 from faintfield.calib.noise_model import BentResponse
+
+# Smallest frames, in pixels and in rows or columns; fewer leave the spreads over pixels to chance.
+_MIN_PIXELS, _MIN_SIDE_PX = 256, 8
 
 # Mean charge in electrons above which the normal law replaces the Poisson sum: as good there, and smaller in memory.
 _MAX_POISSON_CHARGE_E = 200.0
@@ -70,11 +72,11 @@ def calibrate(series: Sequence[Series], saturation_dn: float = np.inf) -> NoiseC
     series, warmth = settle_temperature(series)
     darks = [item for item in series if item.conditions.kind == "dark"]
     flats = [item for item in series if item.conditions.kind == "flat"]
-    check_series(darks, [])
+    _check_series(darks, [])
     check_flat_levels(darks, flats)
     saturation = find_saturation(darks, flats, saturation_dn)
     # Frames that are saturated all over are identical, which is no fault of theirs.
-    check_series(darks, saturation.kept)
+    _check_series(darks, saturation.kept)
     hot = hot_pixels(darks)
     end_dn = saturation_dn if saturation.level_dn is None else saturation.level_dn
     fitted, outlying = fit_series(darks, saturation.kept, ~hot, end_dn), np.zeros_like(hot)
@@ -107,14 +109,43 @@ def calibrate(series: Sequence[Series], saturation_dn: float = np.inf) -> NoiseC
         goodness=series_goodness(fitted.fit, fitted.moments, fitted.darks, fitted.flats),
         warnings=(
             *warmth.warnings,
-            *frame_warnings(fitted),
-            *saturation_warnings(saturation),
+            *frame_warnings(fitted, saturation),
             *filter(None, (level, noise)),
-            *odd_light_warnings(fitted),
             *scatter_warnings(fitted),
             *pixels.warnings(),
         ),
     )
+
+
+def _check_series(darks: Sequence[Series], flats: Sequence[Series]) -> None:
+    """Check that the series are enough for a calibration."""
+    if not darks:
+        raise NotIdentifiable("no dark frames: the offset cannot be told from the light; record darks, lens covered")
+    frames: dict[bytes, str] = {}
+    for item in (*darks, *flats):
+        for digest, name in zip(item.digests, item.names, strict=True):
+            if digest in frames:
+                raise CopiedFrame(
+                    f"{name} and {frames[digest]}: the same frame twice, pixel for pixel; noise never repeats: record "
+                    "it again, or leave one out"
+                )
+            frames[digest] = name
+    if all(dark.frames < 2 for dark in darks):
+        raise TooFewFrames(
+            f"{darks[0].names[0]}: the only one of the {darks[0].conditions}, and no exposure has two dark frames, so "
+            "that noise and pattern cannot be told apart; record at least 2 of one exposure, better 10 of each"
+        )
+    if lone := next((flat for flat in flats if flat.frames < 2), None):
+        raise TooFewFrames(
+            f"{lone.names[0]}: the only one of the {lone.conditions}; photon transfer needs 2 frames at least of each "
+            "light level: record another or leave it out"
+        )
+    pixels = darks[0].pattern_dn.size
+    if pixels < _MIN_PIXELS or min(darks[0].pattern_dn.shape) < _MIN_SIDE_PX:
+        raise TooFewFrames(
+            f"frames of {pixels} pixels, limits {_MIN_PIXELS} pixels and {_MIN_SIDE_PX} rows and columns; "
+            "record larger frames, or widen the region"
+        )
 
 
 def _bent_response(fitted: SeriesFit) -> BentResponse | None:
@@ -166,9 +197,8 @@ def _histogram(counts: Counts, index: int, fitted: SeriesFit) -> Histogram:
     slope = max(signal, 1e-9)
     charge = float(slope / np.exp(log_gain)) * exposure_s
     masses = mass_function(u, exposure_s, charge, exact=charge < _MAX_POISSON_CHARGE_E, spread=False)
-    table = masses(np.array([log_gain, 0.5 * fit["log_read_dn2"] - log_gain, np.log(slope) - log_gain, 0.0]))
-    logs = (table.log_mass[:, 0], table.log_tail[:, 0])
-    mass, tail = (fftconvolve(np.exp(log), prior, "valid")[::per_dn] for log in logs)
+    logs, _ = masses(np.array([log_gain, 0.5 * fit["log_read_dn2"] - log_gain, np.log(slope) - log_gain, 0.0]))
+    mass, tail = (fftconvolve(np.exp(log), prior, "valid")[::per_dn] for log in logs[:, :, 0])
     if counts.floor_dn == lowest:
         mass[0] = tail[0]
     count = np.bincount((values_dn - lowest).ravel())

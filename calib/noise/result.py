@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from faintfield.calib.errors import NotIdentifiable
 from faintfield.calib.noise.estimate import Estimate
 from faintfield.calib.noise.maps.measure import NoiseMaps
-from faintfield.calib.noise.misfit.goodness import SeriesGoodness, TransferPoint
+from faintfield.calib.noise.misfit import SeriesGoodness, TransferPoint
 from faintfield.calib.noise.series.flats import Saturation
 from faintfield.calib.noise.strips import Array, Mask
 from faintfield.calib.noise_model import BentResponse, Map, NoiseModel

@@ -4,11 +4,13 @@ Maps of large sensors may lie in files, so that memory holds only the strips tha
 """
 
 import mmap
+import operator
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
+from functools import reduce
 from typing import Any
 from weakref import WeakSet
 
@@ -94,20 +96,19 @@ def over_strips[T](work: Callable[[slice], T], shape: tuple[int, ...], parts: in
     strips = [slice(first, min(first + step, shape[0])) for first in range(0, shape[0], step)]
     if len(strips) == 1:
         return [work(strips[0])]
-    found: list[T] = []
+    results: list[T] = []
     with ThreadPoolExecutor(usable_cores()) as pool:
         for first in range(0, len(strips), _RELEASE):
-            found += pool.map(work, strips[first : first + _RELEASE])
+            results += pool.map(work, strips[first : first + _RELEASE])
             release()
-    return found
+    return results
 
 
 def map_of(
     work: Callable[[slice], NDArray[Any]], shape: tuple[int, ...], dtype: DTypeLike = np.float32
 ) -> NDArray[Any]:
     """Return a map (row, column) of what `work` returns for the rows of each strip."""
-    (found,) = maps_of(lambda rows: (work(rows),), shape, (dtype,))
-    return found
+    return maps_of(lambda rows: (work(rows),), shape, (dtype,))[0]
 
 
 def maps_of(
@@ -117,8 +118,8 @@ def maps_of(
     maps = tuple(new_map(shape, dtype) for dtype in dtypes)
 
     def fill(rows: slice) -> None:
-        for one, values in zip(maps, work(rows), strict=True):
-            one[rows] = values
+        for target, values in zip(maps, work(rows), strict=True):
+            target[rows] = values
 
     over_strips(fill, shape)
     return maps
@@ -126,10 +127,7 @@ def maps_of(
 
 def total_of[T](work: Callable[[slice], T], shape: tuple[int, ...], parts: int | None = None) -> T:
     """Return the sum, from the first strip to the last, of what `work` returns for the rows of each."""
-    first, *others = over_strips(work, shape, parts)
-    for part in others:
-        first = first + part  # type: ignore[operator]
-    return first
+    return reduce(operator.add, over_strips(work, shape, parts))
 
 
 def thinned(values: Map, usable: Mask, scale: Callable[[slice], NDArray[Any]] | None = None) -> Map:
@@ -137,10 +135,9 @@ def thinned(values: Map, usable: Mask, scale: Callable[[slice], NDArray[Any]] | 
     every = max(values.size // _ENOUGH_PX, 1) | 1  # odd, so that even and odd rows have their share
 
     def work(rows: slice) -> Map:
-        first = -rows.start % every
-        some = values[rows][first::every]
-        found: Map = (some if scale is None else some / scale(rows)[first::every])[usable[rows][first::every]]
-        return found
+        some = slice(-rows.start % every, None, every)
+        chosen = values[rows][some] if scale is None else values[rows][some] / scale(rows)[some]
+        return np.asarray(chosen[usable[rows][some]])
 
     return np.concatenate(over_strips(work, values.shape))
 

@@ -9,7 +9,7 @@ from faintfield.calib.noise.likelihood.gaussian import flat_variances_dn2, level
 from faintfield.calib.noise.likelihood.maximum import NoiseFit
 from faintfield.calib.noise.likelihood.moments import Moments
 from faintfield.calib.noise.likelihood.response import FittedLevels, charge_dn
-from faintfield.calib.noise.misfit.goodness import series_goodness
+from faintfield.calib.noise.misfit import series_goodness
 from faintfield.calib.noise.series.flats import Saturation
 from faintfield.calib.noise.strips import Array
 

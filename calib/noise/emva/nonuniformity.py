@@ -5,7 +5,7 @@ over frames is known from the scatter of the frames, and is taken out.
 """
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -31,32 +31,26 @@ _QUANTILE = float(stats.norm.ppf(0.975))
 
 @dataclass(frozen=True)
 class TemporalNoise:
-    """Variances of what temporal noise leaves in a mean image: of each pixel, and of the mean of a row and a column.
+    """Temporal noise that is left in a mean image.
 
-    Those that end in `_se` are their standard errors: of few frames, the noise is known no better than the pattern.
+    Attributes
+    ----------
+    variances, errors : array (3,)
+        Variance of a pixel, of the mean of a row and of that of a column, and their standard errors: of few frames, the
+        noise is known no better than the pattern.
     """
 
-    pixel: float
-    row: float
-    column: float
-    pixel_se: float = 0.0
-    row_se: float = 0.0
-    column_se: float = 0.0
+    variances: Array
+    errors: Array
 
     def scaled(self, factor: float) -> "TemporalNoise":
-        """Return the variances of an image that is multiplied by √factor."""
-        return TemporalNoise(*(getattr(self, field.name) * factor for field in fields(self)))
+        """Return the noise of an image that is multiplied by √factor."""
+        return TemporalNoise(self.variances * factor, self.errors * factor)
 
     def __add__(self, other: "TemporalNoise") -> "TemporalNoise":
-        """Return the variances of a sum or difference of images."""
-        return TemporalNoise(
-            self.pixel + other.pixel,
-            self.row + other.row,
-            self.column + other.column,
-            math.hypot(self.pixel_se, other.pixel_se),
-            math.hypot(self.row_se, other.row_se),
-            math.hypot(self.column_se, other.column_se),
-        )
+        """Return the noise of a sum or difference of images."""
+        errors = np.array([*map(math.hypot, self.errors, other.errors)])
+        return TemporalNoise(self.variances + other.variances, errors)
 
 
 @dataclass(frozen=True)
@@ -77,8 +71,7 @@ def temporal_noise(series: Series, used: Mask) -> TemporalNoise:
     rows, columns = (size - 1 for size in used.shape)
     row, column = series.row_noise_dn2 * (1 + 1 / rows), series.column_noise_dn2 * (1 + 1 / columns)
     variances = np.array([within, row, column]) / series.frames
-    errors = variances * np.sqrt(2 / (again * np.array([pixels, rows, columns])))
-    return TemporalNoise(*variances.tolist(), *errors.tolist())
+    return TemporalNoise(variances, variances * np.sqrt(2 / (again * np.array([pixels, rows, columns]))))
 
 
 def nonuniformity(image: NDArray[Any], used: Mask, noise: TemporalNoise, scale: float = 1.0) -> Nonuniformity:
@@ -91,9 +84,10 @@ def nonuniformity(image: NDArray[Any], used: Mask, noise: TemporalNoise, scale: 
     freedom = used.sum() * _freedom_share(used)
     across = used.sum() / rows.size, used.sum() / columns.size
     scatter = squares / freedom
-    pixel, pixel_se = scatter - noise.pixel, math.hypot(scatter * math.sqrt(2 / freedom), noise.pixel_se)
-    row, row_se = _of_means(rows, noise.row + pixel / across[0], noise.row_se)
-    column, column_se = _of_means(columns, noise.column + pixel / across[1], noise.column_se)
+    (of_pixel, of_row, of_column), errors = noise.variances.tolist(), noise.errors.tolist()
+    pixel, pixel_se = scatter - of_pixel, math.hypot(scatter * math.sqrt(2 / freedom), errors[0])
+    row, row_se = _of_means(rows, of_row + pixel / across[0], errors[1])
+    column, column_se = _of_means(columns, of_column + pixel / across[1], errors[2])
     total_se = float(np.sqrt(pixel_se**2 + row_se**2 + column_se**2))
     return Nonuniformity(
         total=root(pixel + row + column, total_se, _QUANTILE, scale),

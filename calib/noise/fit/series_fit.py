@@ -19,7 +19,6 @@ from faintfield.calib.noise.likelihood.moments import Moments, gather_moments
 from faintfield.calib.noise.likelihood.response import (
     MEASURED_BEND_SE,
     UNKNOWN_BEND_SE,
-    bend_range_dn,
     choose_bends,
 )
 from faintfield.calib.noise.series.statistics import Series, any_suspect, sample_index
@@ -44,6 +43,9 @@ _MAX_FRACTION_AT_FLOOR = 2e-3
 
 # Largest range of the values of a series, in DN; for wider tables of masses the Gaussian is good enough.
 MAX_TABLE_WIDTH_DN = 2000
+
+# Largest range that counts, over the brightest flat, since 16 bits may hold 12; no converter has fewer than 8.
+_RANGE_OVER_BRIGHTEST, _MIN_RANGE_DN = 2.0, 255.0
 
 # Largest scatter of the levels of flats about the response, as a fraction; a worse light tells nothing about it.
 MAX_LIGHT_ERROR = 0.05
@@ -167,7 +169,8 @@ def _fit_gaussian(
         return fit, None, moments
     offset_dn = float(moments.darks.mean_dn.min())
     signal = moments.flats.mean_dn - offset_dn
-    range_dn = bend_range_dn(float(signal.max()), saturation_dn - offset_dn)
+    # The end of the range, near the brightest flat at most.
+    range_dn = min(saturation_dn - offset_dn, max(_RANGE_OVER_BRIGHTEST * float(signal.max()), _MIN_RANGE_DN))
     light = moments.flats.light
     chance = moments.flats.within_dn2 / np.maximum(moments.flats.frames - 1, 1) / moments.freedom
     level_dn2 = (chance / moments.pixels + moments.darks.level_scatter_dn2.mean()) / moments.flats.frames

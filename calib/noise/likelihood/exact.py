@@ -78,19 +78,14 @@ def fit_exact(
 
         return evaluate
 
-    even = _maximize(objective(spread=False), np.array([start[name] for name in PARAMETERS]), ~_IS_DCNU)
-    if not try_spread:
-        return _with_bend(even.fit(), bend)
-    spread = objective(spread=True)
-    tried = [np.where(_IS_DCNU, dcnu, even.x) for dcnu in _TRIED_DCNU]
-    rises = [spread(x)[0] - even.log_likelihood for x in tried]
-    if max(rises) < _MIN_RISE:
-        return _with_bend(even.fit(), bend)
-    return _with_bend(_maximize(spread, tried[int(np.argmax(rises))], np.ones_like(_IS_DCNU)).fit(), bend)
-
-
-def _with_bend(fit: NoiseFit, bend: Bend) -> NoiseFit:
-    size = len(fit.values)
+    maximum = _maximize(objective(spread=False), np.array([start[name] for name in PARAMETERS]), ~_IS_DCNU)
+    if try_spread:
+        spread = objective(spread=True)
+        starts = [np.where(_IS_DCNU, dcnu, maximum.x) for dcnu in _TRIED_DCNU]
+        rises = [spread(x)[0] - maximum.log_likelihood for x in starts]
+        if max(rises) >= _MIN_RISE:
+            maximum = _maximize(spread, starts[int(np.argmax(rises))], np.ones_like(_IS_DCNU))
+    size, fit = len(PARAMETERS), maximum.fit()
     covariance = np.zeros((size + len(bend.values),) * 2)
     covariance[:size, :size], covariance[size:, size:] = fit.covariance, bend.covariance
     return NoiseFit(fit.values | bend.values, covariance, fit.log_likelihood)
@@ -139,26 +134,20 @@ def _maximize(objective: _Objective, begin: Array, free: Mask) -> _Maximum:
         step[free] = np.linalg.lstsq(best[2][np.ix_(free, free)], best[1][free])[0]
         step *= min(1.0, 1.0 / max(float(np.abs(step).max()), 1e-12))
         if best[1] @ step < _MIN_GAIN:
-            covariance = np.zeros_like(best[2])
-            covariance[np.ix_(free, free)] = _inverse(best[2][np.ix_(free, free)])
+            # The logarithm of a dark current near zero has next to no information, but the dark current has an error.
+            information, covariance = best[2][np.ix_(free, free)], np.zeros_like(best[2])
+            root = np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
+            scale = np.outer(root, root)
+            covariance[np.ix_(free, free)] = np.linalg.pinv(information / scale) / scale
             return _Maximum(x, covariance, best[0])
         length = 1.0
-        while (tried := objective(x + length * step))[0] < best[0] and length > _MIN_STEP_LENGTH:
+        while (trial := objective(x + length * step))[0] < best[0] and length > _MIN_STEP_LENGTH:
             length /= 2
-        x, best = x + length * step, tried
+        x, best = x + length * step, trial
     raise PoorFit(
         f"the likelihood of the dark values did not settle in {_MAX_STEPS} steps; check that the darks were taken "
         "with the lens covered, or record flats, which fix the gain"
     )
-
-
-def _inverse(information: Array) -> Array:
-    """Return the inverse of the information, where that of one parameter may be much smaller than that of others.
-
-    The logarithm of a dark current near zero has next to none, but the dark current itself has an error.
-    """
-    scale = np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
-    return np.asarray(np.linalg.pinv(information / np.outer(scale, scale)) / np.outer(scale, scale))
 
 
 def _flat_part(x: Array, moments: Moments, bend: Bend) -> tuple[float, Array, Array]:

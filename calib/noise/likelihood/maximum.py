@@ -13,7 +13,7 @@ from faintfield.calib.noise.likelihood.gaussian import negative_log_likelihood
 from faintfield.calib.noise.likelihood.moments import Excess, Moments
 from faintfield.calib.noise.likelihood.response import BENDS
 from faintfield.calib.noise.likelihood.rounding import ROUNDING_DN2
-from faintfield.calib.noise.strips import Array, Mask
+from faintfield.calib.noise.strips import Array
 
 # IPOPT prints nothing only with all of these. It also tries points with a negative variance, and backs off by itself.
 _QUIET: dict[str, Any] = {"ipopt.print_level": 0, "print_time": False, "ipopt.sb": "yes", "show_eval_warnings": False}
@@ -141,11 +141,15 @@ class GaussianProblem:
         return NoiseFit(values, self.covariance(values, excess), -minimum)
 
     def covariance(self, values: Mapping[str, float], excess: Excess) -> Array:
-        """Return the inverse of the Hessian of −ln L at given parameters, in their order."""
+        """Return the inverse of the Hessian of −ln L at given parameters, in their order; huge if undetermined."""
         at = np.array([*values.values()]) / self._units
         free = np.array([name != "jitter_dn2" or at[i] > _NO_JITTER for i, name in enumerate(values)])
         hessian = np.array(self._hessian(at, list(astuple(excess))))
-        return _inverse_on(hessian, free) * np.outer(self._units, self._units)
+        eigenvalues, vectors = np.linalg.eigh(hessian[np.ix_(free, free)])
+        inverse = np.where(eigenvalues > 1e-9, 1.0 / np.maximum(eigenvalues, 1e-9), 1e12)
+        covariance = np.zeros_like(hessian)
+        covariance[np.ix_(free, free)] = (vectors * inverse) @ vectors.T
+        return covariance * np.outer(self._units, self._units)
 
     def _minimize(self, excess: list[float], near: Mapping[str, float]) -> tuple[Array, float]:
         """Return the minimum in units of the parameters, and the value there."""
@@ -184,31 +188,14 @@ def _start(moments: Moments, bends: int) -> tuple[dict[str, float], dict[str, fl
     if repeated.size > 1:
         start["dcnu_dn2_per_s2"], scale["dcnu_dn2_per_s2"] = 0.01 * read / longest**2, read / longest**2
     if flats.frames.size or repeated.size > 1:
-        start["log_gain"], scale["log_gain"] = float(np.log(_start_gain(moments, read, float(line[0])))), 1.0
+        # Excess variance over signal, of the brightest flat or the longest dark.
+        k = int(flats.mean_dn.argmax()) if flats.frames.size else int((darks.exposure_s * measured).argmax())
+        series = flats if flats.frames.size else darks
+        excess = series.within_dn2[k] / max((series.frames[k] - 1) * moments.freedom, 1) - read
+        signal = flats.mean_dn[k] - darks.mean_dn.min() if flats.frames.size else float(line[0]) * darks.exposure_s[k]
+        gain = float(np.clip(excess / signal if signal > 0 else 1.0, 1e-2, 1e2))
+        start["log_gain"], scale["log_gain"] = float(np.log(gain)), 1.0
     for power, name in enumerate(BENDS[:bends], 1):
         brightest = float(flats.mean_dn.max()) - float(line[1])
         start[name], scale[name] = 0.0, 0.01 / brightest**power
     return start, scale
-
-
-def _start_gain(moments: Moments, read_dn2: float, slope_dn_per_s: float) -> float:
-    """Return an initial gain: excess variance over signal, from the brightest flat or the longest dark."""
-    darks, flats = moments.darks, moments.flats
-    if flats.frames.size:
-        k = int(flats.mean_dn.argmax())
-        excess = flats.within_dn2[k] / ((flats.frames[k] - 1) * moments.freedom) - read_dn2
-        signal = flats.mean_dn[k] - darks.mean_dn.min()
-    else:
-        k = int((darks.exposure_s * (darks.frames > 1)).argmax())
-        excess = darks.within_dn2[k] / max((darks.frames[k] - 1) * moments.freedom, 1) - read_dn2
-        signal = slope_dn_per_s * darks.exposure_s[k]
-    return float(np.clip(excess / signal if signal > 0 else 1.0, 1e-2, 1e2))
-
-
-def _inverse_on(hessian: Array, free: Mask) -> Array:
-    """Return the inverse of the Hessian over the free parameters, with a huge variance in undetermined directions."""
-    covariance = np.zeros_like(hessian)
-    values, vectors = np.linalg.eigh(hessian[np.ix_(free, free)])
-    inverse = np.where(values > 1e-9, 1.0 / np.maximum(values, 1e-9), 1e12)
-    covariance[np.ix_(free, free)] = (vectors * inverse) @ vectors.T
-    return covariance

@@ -28,9 +28,6 @@ BENDS = tuple(f"nonlinearity_per_dn{power}" for power in ("", "2", "3", "4", "5"
 # where nothing does. The second is the model error of an unbent sensor: 95 % of cameras bend by less than twice that.
 MEASURED_BEND_SE, UNKNOWN_BEND_SE = 0.3, 0.012
 
-# Largest range that counts, over the brightest flat, since 16 bits may hold 12; no converter has fewer than 8.
-_RANGE_OVER_BRIGHTEST, _MIN_RANGE_DN = 2.0, 255.0
-
 # A light must span this factor to show a bend; so many levels beyond its scales give 1, 2, 3, 4 coefficients.
 _MIN_SPAN, _LEVELS_FOR_BENDS = 2.0, (2, 4, 7, 11)
 
@@ -106,11 +103,6 @@ def known_light(flats: Sequence[Series]) -> Light:
         if np.unique(among).size < 3 or among.min() <= 0 or among.max() < _MIN_SPAN * among.min():
             group[group == index] = -1
     return Light(amount, group)
-
-
-def bend_range_dn(brightest_dn: float, saturation_dn: float) -> float:
-    """Return the signal that the size of a bend refers to: the end of the range, near the brightest flat at most."""
-    return float(min(saturation_dn, max(_RANGE_OVER_BRIGHTEST * brightest_dn, _MIN_RANGE_DN)))
 
 
 def level_design(light: Light, signal_dn: Array, bends: int) -> Array:

@@ -138,8 +138,13 @@ def measure_pixels(fitted: SeriesFit, hot: Mask, outlying: Mask) -> Pixels:
             # A step of the gain is no spread of the pixels, and no smooth part of the response takes it out
             even = _response(fitted, levels, usable, gain_of_regions(gain.seams, usable.shape))
             response = replace(response, prnu=even.prnu, prnu_se=even.prnu_se, why_no_prnu=even.why_no_prnu)
-    seams = () if fitted.likelihood is _CENSORED else _offset_seams(fitted, levels, read, usable)
-    return Pixels(read, ratio, telegraph, noisy, levels, response, response_e, gain, why, seams)
+    seams = []
+    if fitted.likelihood is not _CENSORED:
+        read_dn = float(np.median(read.read_noise_dn))
+        spread_dn2 = max(fitted.fit.values["dsnu_dn2"], 0.0) + read_dn**2 / sum(dark.frames for dark in fitted.darks)
+        seams = find_seams(levels.offset_dn, usable, 1 / spread_dn2)
+        seams = [seam for seam in seams if seam.difference > _NOTABLE_STEP * read_dn]
+    return Pixels(read, ratio, telegraph, noisy, levels, response, response_e, gain, why, tuple(seams))
 
 
 def noise_maps(fitted: SeriesFit, estimates: Mapping[str, Estimate], pixels: Pixels, unusable: Mask) -> NoiseMaps:
@@ -224,10 +229,3 @@ def _response(fitted: SeriesFit, levels: PixelLevels, usable: Mask, relative_gai
         for v, flat, mean in zip(fitted.flat_noise_dn2, flats, means, strict=True)
     )
     return measure_response(total, sum(noise), usable)
-
-
-def _offset_seams(fitted: SeriesFit, levels: PixelLevels, read: PixelReadNoise, usable: Mask) -> tuple[Seam, ...]:
-    read_dn = float(np.median(read.read_noise_dn))
-    spread_dn2 = max(fitted.fit.values["dsnu_dn2"], 0.0) + read_dn**2 / sum(dark.frames for dark in fitted.darks)
-    seams = find_seams(levels.offset_dn, usable, 1 / spread_dn2)
-    return tuple(seam for seam in seams if seam.difference > _NOTABLE_STEP * read_dn)

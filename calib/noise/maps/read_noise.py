@@ -271,15 +271,6 @@ def _line_shifts(values: Map, usable: Mask) -> tuple[Array, Array]:
     return shifts[0], shifts[1]
 
 
-def _grid(low: float, high: float, read_dn2: float, degrees: float) -> Array:
-    """Return the grid of ln r (step,): half as wide as chance scatters it, and as far as ratios reach."""
-    blur = np.sqrt(2 / degrees)
-    first, last = np.log(np.clip([low, high], 1e-3, 1e4)) + np.array([-1, 1]) * blur
-    # Where shot noise is most of the noise, read noise may be anything down to nothing.
-    steps = int(np.clip(np.ceil((last - first + 1.0) / max(0.5 * blur, 0.02)), 32, 300))
-    return np.asarray(np.log(read_dn2) + np.linspace(first - 1.0, last, steps))
-
-
 def _bins(squares: _Squares, ratio: Map, factor: _LineFactor, usable: Mask) -> tuple[Array, Array, float]:
     """Return mean squares (bin, group) and number (bin,) of pixels that tell the population, and the sum of ln factor.
 
@@ -333,7 +324,12 @@ def _population(squares: _Squares, ratio: Map, factor: _LineFactor, read_dn2: fl
     def highest(rows: slice) -> float:
         return float((ratio[rows] / factor.at(rows)).max(where=usable[rows], initial=0.0))
 
-    grid = _grid(float(np.quantile(some, 0.002)), max(over_strips(highest, usable.shape)), read_dn2, degrees)
+    # The grid is half as wide as chance scatters ln r, and reaches as far as ratios do. Where shot noise is most of the
+    # noise, read noise may be anything down to nothing.
+    blur, ends = np.sqrt(2 / degrees), [float(np.quantile(some, 0.002)), max(over_strips(highest, usable.shape))]
+    first, last = np.log(np.clip(ends, 1e-3, 1e4)) + np.array([-1, 1]) * blur
+    steps = int(np.clip(np.ceil((last - first + 1.0) / max(0.5 * blur, 0.02)), 32, 300))
+    grid = np.asarray(np.log(read_dn2) + np.linspace(first - 1.0, last, steps))
     binned, count, log_factors = _bins(squares, ratio, factor, usable)
     variance = np.exp(grid) + squares.shot_dn2[:, None]
     log = binned @ (-0.5 / variance)

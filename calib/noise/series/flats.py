@@ -145,17 +145,13 @@ def _converter_end(flats: Sequence[Series], clipped: Array, ceiling: float) -> S
     return Saturation("ADC", ceiling, (ceiling, ceiling), kept, left_out)
 
 
-def _noise_dn2(flat: Series) -> tuple[float, float]:
-    """Return the noise of the regular pixels of a series, and its standard error."""
-    variance = float(flat.within_dn2.mean(where=~flat.suspect)) / (flat.frames - 1)
-    return variance, variance * float(np.sqrt(2 / ((flat.frames - 1) * (~flat.suspect).sum())))
-
-
 def _noisiest(flats: Sequence[Series], order: list[int]) -> tuple[int, bool]:
     """Return the place in the order of the noisiest series, and whether noise falls beyond."""
     if len(order) < 2:
         return 0, False
-    variance, se = np.array([_noise_dn2(flats[j]) for j in order]).T
+    freedom = [float((flats[j].frames - 1) * (~flats[j].suspect).sum()) for j in order]
+    regular = [float(flats[j].within_dn2.mean(where=~flats[j].suspect)) / (flats[j].frames - 1) for j in order]
+    variance, se = np.array(regular), np.array(regular) * np.sqrt(2 / np.array(freedom))
     at = int(variance.argmax())
     beyond, error = variance[at + 1 :], np.hypot(se[at], se[at + 1 :])
     falls = (beyond < (1 - _MIN_FALL) * variance[at]) & (variance[at] - beyond > _MIN_SIGMAS * error)

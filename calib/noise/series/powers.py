@@ -32,16 +32,7 @@ class Moments:
         self.sums = [np.zeros(shape, np.float32) for _ in range(3 if higher else 1)]
 
     def add(self, frames: int, rows: slice, frame, regular: Mask, of_rows, of_columns, top: float):
-        """Add some rows of a frame, which is the `frames`-th.
-
-        Parameters
-        ----------
-        frame, regular : array (row, column)
-            Its values, and the pixels that count.
-        of_rows, of_columns : array (row,), array (column,)
-            Sum of which is subtracted.
-        top : float
-            A value.
+        """Add some rows of the `frames`-th frame (row, column), less the sum of `of_rows` and `of_columns`.
 
         Returns
         -------

@@ -212,7 +212,12 @@ class SeriesSums:
             return np.array(self._moments.add(frames, strip, frame_dn[strip], regular, of_rows, columns, top), float)
 
         squares, at, below = total_of(work, frame_dn.shape).tolist()
-        self._count_top(top, int(at), int(below))
+        if self.conditions.kind == "flat":
+            if top == self._top_dn:
+                at, below = at + self._at_top, below + self._below_top
+            elif top == self._top_dn + 1:
+                below += self._at_top
+            self._top_dn, self._at_top, self._below_top = top, int(at), int(below)
         return level, rows, columns, squares / self._row_count.sum()
 
     def _means(self, frame_dn: NDArray[Any]) -> tuple[float, Array, Array, float]:
@@ -230,16 +235,6 @@ class SeriesSums:
         row, column = self._suspect_at
         taken = (level + means).sum() - np.bincount(column, (level + means)[row], frame_dn.shape[1])
         return level, means, (columns - taken) / np.maximum(self._column_count, 1), float(max(*highs, min(lows)))
-
-    def _count_top(self, top: float, at: int, below: int) -> None:
-        """Add the numbers of values of a flat at the highest so far, and one below it."""
-        if self.conditions.kind != "flat":
-            return
-        if top == self._top_dn:
-            at, below = at + self._at_top, below + self._below_top
-        elif top == self._top_dn + 1:
-            below += self._at_top
-        self._top_dn, self._at_top, self._below_top = top, at, below
 
     def series(self) -> Series:
         """Return the statistics of the frames so far.
