@@ -18,8 +18,8 @@ from faintfield.calib.noise.fit.series_fit import (
 )
 from faintfield.calib.noise.fit.temperature import settle_temperature, with_doubling_error
 from faintfield.calib.noise.likelihood.marginal import Counts, mass_function
+from faintfield.calib.noise.maps.defects import hot_pixels, outlying_pixels, variance_ratio
 from faintfield.calib.noise.maps.measure import measure_pixels, noise_maps
-from faintfield.calib.noise.maps.pixels import hot_pixels, outlying_pixels, variance_ratio
 from faintfield.calib.noise.misfit import (
     frame_warnings,
     level_warning,
@@ -106,7 +106,7 @@ def calibrate(series: Sequence[Series], saturation_dn: float = np.inf) -> NoiseC
         saturation_dn=end_dn,
         saturation=saturation,
         response=_bent_response(fitted),
-        goodness=series_goodness(fitted.fit, fitted.moments, fitted.darks, fitted.flats),
+        goodness=series_goodness(fitted),
         warnings=(
             *warmth.warnings,
             *frame_warnings(fitted, saturation),
@@ -118,7 +118,6 @@ def calibrate(series: Sequence[Series], saturation_dn: float = np.inf) -> NoiseC
 
 
 def _check_series(darks: Sequence[Series], flats: Sequence[Series]) -> None:
-    """Check that the series are enough for a calibration."""
     if not darks:
         raise NotIdentifiable("no dark frames: the offset cannot be told from the light; record darks, lens covered")
     frames: dict[bytes, str] = {}

@@ -8,7 +8,7 @@ from scipy import stats
 
 from faintfield.calib.noise.fit.scatter import flat_variances_of_nodes, light_signal, noise_freedom
 from faintfield.calib.noise.fit.series_fit import NoiseLikelihood, SeriesFit
-from faintfield.calib.noise.likelihood.gaussian import dark_variances_dn2, flat_variances_dn2, level_variances_dn2
+from faintfield.calib.noise.likelihood.gaussian import level_variances_dn2
 from faintfield.calib.noise.likelihood.maximum import NoiseFit
 from faintfield.calib.noise.likelihood.moments import Moments
 from faintfield.calib.noise.likelihood.response import UNKNOWN_BEND_SE, charge_dn, charge_slope
@@ -93,19 +93,17 @@ def transfer_points(fitted: SeriesFit) -> tuple[TransferPoint, ...]:
     return tuple(points)
 
 
-def series_goodness(
-    fit: NoiseFit, moments: Moments, darks: Sequence[Series], flats: Sequence[Series]
-) -> tuple[SeriesGoodness, ...]:
+def series_goodness(fitted: SeriesFit) -> tuple[SeriesGoodness, ...]:
     """Return the goodness of fit of each series, darks first."""
-    t = moments.darks.exposure_s
-    line = fit.values["offset_dn"] + fit.values.get("dark_signal_dn_per_s", 0.0) * t
+    fit, moments = fitted.fit, fitted.moments
+    line = fit.values["offset_dn"] + fit.values.get("dark_signal_dn_per_s", 0.0) * moments.darks.exposure_s
     residuals: list[float | None] = [float(x) for x in moments.darks.mean_dn - line]
     residuals += _light_residuals(fit, moments)
-    noise = [*dark_variances_dn2(fit.values, t), *flat_variances_dn2(fit.values, moments.flats.mean_dn)]
+    noise = [*fitted.dark_noise_dn2, *fitted.flat_noise_dn2]
     freedom = np.concatenate(noise_freedom(moments))
     within = np.concatenate([moments.darks.within_dn2, moments.flats.within_dn2])
     goodness = []
-    for j, item in enumerate((*darks, *flats)):
+    for j, item in enumerate((*fitted.darks, *fitted.flats)):
         if item.frames < 2:
             goodness.append(SeriesGoodness(item, None, None, residuals[j]))
             continue
@@ -114,8 +112,9 @@ def series_goodness(
         expected = noise[j] if item.conditions.kind == "dark" else flat_variances_of_nodes(fit, sums)
         scatter = [_scatter(*sums.scatter(groups, expected)) for groups in (sums.blocks, sums.rows, sums.columns)]
         # The variance of a frame over its pixels is that of noise and fixed pattern.
-        pattern_dn2 = max(float(item.spreads_dn2.mean()) - float(noise[j]), 0.0)
-        chance = (2 * float(noise[j]) ** 2 + 4 * float(noise[j]) * pattern_dn2) / float((~item.suspect).sum())
+        noise_dn2 = float(noise[j])
+        pattern_dn2 = max(float(item.spreads_dn2.mean()) - noise_dn2, 0.0)
+        chance = (2 * noise_dn2**2 + 4 * noise_dn2 * pattern_dn2) / float((~item.suspect).sum())
         scatter.append(Scatter(float(item.spreads_dn2.var() * item.frames / chance), item.frames - 1))
         se = float(np.sqrt(2 / max(freedom[j], 1.0)))
         goodness.append(SeriesGoodness(item, excess, se, residuals[j], *scatter))
@@ -177,8 +176,8 @@ def scatter_warnings(fitted: SeriesFit) -> list[str]:
             continue
         factor = float(np.median(charge_dn(values, signal[members]) / flats.light.amount[members]))
         conditions = fitted.flats[index].conditions
-        kind = "photons" if conditions.photons == flats.light.amount[index] else "s"
-        key = "photons" if kind == "photons" else "exposure_s"
+        stated = conditions.photons == flats.light.amount[index]
+        kind, key = ("photons", "photons") if stated else ("s", "exposure_s")
         warnings.append(
             f"the {conditions}: {flats.light.amount[index]:.5g} {kind} are stated, their level is that of "
             f"{float(charge_dn(values, signal[index])) / factor:.5g} {kind} by the other levels; they are left out of "
@@ -212,13 +211,12 @@ def scatter_warnings(fitted: SeriesFit) -> list[str]:
 
 def level_warning(fitted: SeriesFit) -> str | None:
     """Return a warning if the dark levels do not lie on a straight line over exposure time."""
-    moments, values = fitted.moments, fitted.fit.values
-    darks = moments.darks
+    darks, values = fitted.moments.darks, fitted.fit.values
     within = float((darks.frames - 1).sum())
     free = np.unique(darks.exposure_s).size - 2
     if fitted.likelihood is NoiseLikelihood.CENSORED or free < 1 or within < 1:
         return None
-    noise = np.array(fitted.dark_noise_dn2) / moments.pixels
+    noise = np.array(fitted.dark_noise_dn2) / fitted.moments.pixels
     jitter = max(float(darks.level_scatter_dn2.sum()) / within - float(noise.mean()), 0.0)
     weight = darks.frames / (jitter + noise)
     slope, offset = np.polyfit(darks.exposure_s, darks.mean_dn, 1, w=np.sqrt(weight))

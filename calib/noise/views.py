@@ -165,7 +165,7 @@ def _residuals(
     saturation_dn: float,
     floor_dn: float,
 ) -> tuple[Array, Array, Array]:
-    """Return mean, variance and texture (block,) of one colour."""
+    """Return mean, variance and texture, the mean square of the gradient, (block,) of one colour."""
     parts = [
         _windows(view[:, :, colour], corners + move - 1, _BLOCK_PX + 2).astype(float)
         for view, move in zip(views, moves, strict=True)
@@ -182,7 +182,9 @@ def _residuals(
     )
     left = residual - (terms @ explained)[:, :, 0]
     variance = np.sum(left**2, axis=1) / (_RESIDUAL_FACTOR * (_BLOCK_PX**2 - _TERMS))
-    return total[:, 1:-1, 1:-1].mean(axis=(1, 2)) / 3, variance, _texture(total)
+    across, along = total[:, 1:-1, 2:] - total[:, 1:-1, :-2], total[:, 2:, 1:-1] - total[:, :-2, 1:-1]
+    texture = np.asarray(np.mean(across**2 + along**2, axis=(1, 2)))
+    return total[:, 1:-1, 1:-1].mean(axis=(1, 2)) / 3, variance, texture
 
 
 def _explaining(total: Array) -> Array:
@@ -196,11 +198,6 @@ def _explaining(total: Array) -> Array:
     terms = np.stack([one, one * x, one * y, right - left, down - up, *curvatures], axis=-1)
     terms = terms.reshape(-1, _BLOCK_PX**2, _TERMS)
     return np.asarray(terms / (np.sqrt(np.mean(terms**2, axis=1, keepdims=True)) + 1e-9))
-
-
-def _texture(total: Array) -> Array:
-    across, along = total[:, 1:-1, 2:] - total[:, 1:-1, :-2], total[:, 2:, 1:-1] - total[:, :-2, 1:-1]
-    return np.asarray(np.mean(across**2 + along**2, axis=(1, 2)))
 
 
 def estimate_view_noise(

@@ -12,7 +12,7 @@ from scipy import stats
 from faintfield.calib.noise.emva.light_estimates import light_estimates, quantum_efficiency, why_noise_denies
 from faintfield.calib.noise.emva.nonuniformity import nonuniformity, temporal_noise
 from faintfield.calib.noise.estimate import Estimate, interval, root
-from faintfield.calib.noise.fit.series_fit import MIN_ROUNDED_READ_DN, SeriesFit
+from faintfield.calib.noise.fit.series_fit import NoiseLikelihood, SeriesFit
 from faintfield.calib.noise.likelihood.gaussian import dark_variances_dn2, main_quantities
 from faintfield.calib.noise.likelihood.maximum import NoiseFit
 from faintfield.calib.noise.likelihood.moments import Moments
@@ -23,6 +23,13 @@ from faintfield.calib.noise.strips import Array, map_of
 
 # Largest relative standard error of the gain, without which no quantity in electrons has a value.
 MAX_RELATIVE_SE = 0.1
+
+# Read noise in DN below which the Gaussian cannot tell the noise from the rounding, unless the phases of the
+# pixels average out.
+_MIN_ROUNDED_READ_DN = 0.35
+
+# Largest error that rounding may make of the noise of a series of darks with so little read noise.
+_MAX_ROUNDING_ERROR = 0.05
 
 _FLATS_REMEDY = "record at least 2 flats at half of saturation, or darks long enough for tens of dark electrons"
 _ONE_EXPOSURE = "all darks have one exposure; record darks of at least 2 exposures, better 4 up to 60 s"
@@ -116,18 +123,18 @@ def _why_no_gain(fit: NoiseFit, moments: Moments, *, from_darks: bool, holds: bo
 
 
 def _why_rounded(fitted: SeriesFit) -> str | None:
-    if not fitted.rounding_hides_noise:
+    read_dn, rounding2 = float(np.exp(0.5 * fitted.fit.values["log_read_dn2"])), fitted.moments.darks.rounding2
+    shown = read_dn >= _MIN_ROUNDED_READ_DN or float(rounding2.max()) <= _MAX_ROUNDING_ERROR**2
+    if shown or fitted.likelihood is not NoiseLikelihood.GAUSSIAN:
         return None
-    read_dn = float(np.exp(0.5 * fitted.fit.values["log_read_dn2"]))
     return (
-        f"the read noise is about {read_dn:.2g} DN (limit {MIN_ROUNDED_READ_DN:g} DN), so little that rounding to "
+        f"the read noise is about {read_dn:.2g} DN (limit {_MIN_ROUNDED_READ_DN:g} DN), so little that rounding to "
         "whole DN hides it, and the level of the darks moves too much for the likelihood of whole values; record at a "
         "higher gain or with more bits, the camera settled"
     )
 
 
 def _why_no_growth(moments: Moments) -> str:
-    """Return why the darks do not determine the growth of noise and pattern with exposure time."""
     return _ONE_EXPOSURE if np.unique(moments.darks.exposure_s).size < 2 else _ONE_REPEATED
 
 
@@ -161,7 +168,6 @@ def _why_no_current(
 
 
 def _in_dn(fit: NoiseFit, quantile: float, levels_quantile: float) -> dict[str, Estimate]:
-    """Return the quantities that need no gain."""
     read_dn = float(np.exp(0.5 * fit.values["log_read_dn2"]))
     half, se = max(quantile, fit.quantile_of("log_read_dn2")), 0.5 * read_dn * fit.standard_error("log_read_dn2")
     signal = Estimate(None, why=_ONE_EXPOSURE)
@@ -175,7 +181,6 @@ def _parameter(fit: NoiseFit, name: str, quantile: float) -> Estimate:
 
 
 def _spreads(fitted: SeriesFit, gain: Estimate, quantile: float) -> dict[str, Estimate]:
-    """Return the spreads over the pixels: DSNU and DCNU."""
     fit = fitted.fit
     dsnu2, se = fit.values["dsnu_dn2"], fit.standard_error("dsnu_dn2")
     spreads = {"dsnu_dn": root(dsnu2, se, quantile)}
@@ -189,7 +194,6 @@ def _spreads(fitted: SeriesFit, gain: Estimate, quantile: float) -> dict[str, Es
 
 
 def _shared_noise(fitted: SeriesFit, quantile: float) -> dict[str, Estimate]:
-    """Return the noise that all pixels of a frame, a row or a column share."""
     fit, darks, pixels = fitted.fit, fitted.darks, fitted.moments.pixels
     if "jitter_dn2" not in fit.values:
         unknown = Estimate(None, why="the likelihood of single values has no part for it; it needs Gaussian darks")
@@ -214,7 +218,6 @@ def _shared_noise(fitted: SeriesFit, quantile: float) -> dict[str, Estimate]:
 
 
 def _from_flats(fitted: SeriesFit, gain: Estimate, response: Response | None, quantile: float) -> dict[str, Estimate]:
-    """Return the quantities that only flats determine."""
     prnu = Estimate(None, why=_NO_FLATS) if response is None else response.prnu_estimate(quantile)
     nonlinearity = Estimate(None, why="flats of at least 3 light levels are needed")
     if fitted.bend is not None:

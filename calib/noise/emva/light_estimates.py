@@ -36,22 +36,20 @@ def why_noise_denies(fitted: SeriesFit) -> str | None:
     """Return why the noise of the series denies the model, None if it does not; only with flats."""
     if not fitted.flats:
         return None
-    series = series_goodness(fitted.fit, fitted.moments, fitted.darks, fitted.flats)
-    for item in series:
-        # Darks have the scatter of their pixels' means beside them, which pickup may set against their noise.
-        if item.noise_excess is None or item.noise_se is None or item.series.conditions.kind == "dark":
-            continue
-        if abs(item.noise_excess) > max(_MAX_DEPARTURE, _MIN_SIGMAS * item.noise_se):
+    # Darks have the scatter of their pixels' means beside them, which pickup may set against their noise.
+    for item in series_goodness(fitted)[len(fitted.darks) :]:
+        excess, se = item.noise_excess or 0.0, item.noise_se or np.inf
+        if abs(excess) > max(_MAX_DEPARTURE, _MIN_SIGMAS * se):
             return (
-                f"the noise of the {item.series.conditions} is {item.noise_excess:+.1%} off the model's in variance "
-                f"({abs(item.noise_excess) / item.noise_se:.0f} standard errors); record it again or leave it out"
+                f"the noise of the {item.series.conditions} is {excess:+.1%} off the model's in variance "
+                f"({abs(excess) / se:.0f} standard errors); record it again or leave it out"
             )
     scatter = float(np.sqrt(fitted.moments.excess.variance2))
     if scatter > MAX_NOISE_ERROR:
         return (
             f"the noise of the series scatters by {scatter:.1%} in variance about the model (limit "
-            f"{MAX_NOISE_ERROR:.0%}): "
-            "the noise of the camera changed, or the response is not that of one sensor; record all series in one go"
+            f"{MAX_NOISE_ERROR:.0%}): the noise of the camera changed, or the response is not that of one sensor; "
+            "record all series in one go"
         )
     return None
 

@@ -7,7 +7,7 @@ response. A fourth is that of the noise over blocks of pixels, which is wider th
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, replace
 
 import numpy as np
 from scipy import stats
@@ -45,12 +45,8 @@ _MAX_SHARE, _MIN_FREEDOM = 0.1, 4
 _MAX_ROUNDS, _SETTLED = 5, 0.02
 
 
-@dataclass(frozen=True)
-class Known:
-    """Knowledge of an excess variance: degrees of freedom, and its share in the variance that it is part of."""
-
-    freedom: int
-    share: float
+# Degrees of freedom of an excess variance, and its share in the variance that it is part of.
+type Known = tuple[int, float]
 
 
 def noise_freedom(moments: Moments) -> tuple[Array, Array]:
@@ -94,14 +90,14 @@ def measure_excess(fit: NoiseFit, moments: Moments, darks: Sequence[Series]) -> 
     drift_dn2, drift_known = _drift(fit, moments, trend_dn2(darks))
     light = moments.flats.light
     bends = sum(name.startswith("nonlinearity") for name in fit.values)
-    light2, light_known = 0.0, Known(0, 1.0)
+    light2, light_known = 0.0, (0, 1.0)
     if light.groups.size:
         signal = light_signal(fit, moments)
         slope = charge_slope(fit.values, signal)
         still = replace(moments, excess=replace(excess, drift_dn2=drift_dn2))
         variance = np.array(level_variances_dn2(fit.values, still), float) * slope**2
         light2, _ = scatter_of_levels(light, signal, variance, bends)
-        light_known = Known(light.freedom - bends, _share(variance / signal**2, light2))
+        light_known = (light.freedom - bends, _share(variance / signal**2, light2))
     excess = replace(excess, variance2=variance2, drift_dn2=drift_dn2, light2=light2)
     return excess, {"variance2": noise_known, "drift_dn2": drift_known, "light2": light_known}
 
@@ -147,7 +143,7 @@ def _noise_scatter(fit: NoiseFit, moments: Moments, excess: Excess) -> tuple[flo
         return float(np.sum((rest / root) ** 2))
 
     variance2 = grown_variance(deviance, left)
-    return variance2, Known(left, _share(chance, variance2))
+    return variance2, (left, _share(chance, variance2))
 
 
 def trend_dn2(darks: Sequence[Series]) -> float:
@@ -182,7 +178,7 @@ def _drift(fit: NoiseFit, moments: Moments, trend2: float) -> tuple[float, Known
         return float(np.sum(((darks.mean_dn - line) * weight) ** 2))
 
     drift2 = grown_variance(deviance, left)
-    return (trend2, Known(0, 1.0)) if drift2 < trend2 else (drift2, Known(left, _share(chance, drift2)))
+    return (trend2, (0, 1.0)) if drift2 < trend2 else (drift2, (left, _share(chance, drift2)))
 
 
 def fit_with_excess(moments: Moments, darks: Sequence[Series], bends: int) -> tuple[NoiseFit, Moments]:
@@ -206,11 +202,11 @@ def fit_with_excess(moments: Moments, darks: Sequence[Series], bends: int) -> tu
             break
         fit = problem.fit(excess, fit.values)
     sources = []
-    for name, part in known.items():
-        if (value := getattr(moments.excess, name)) > 0 and part.freedom > 0:
+    for name, (freedom, share) in known.items():
+        if (value := getattr(moments.excess, name)) > 0 and freedom > 0:
             grown = problem.covariance(fit.values, replace(moments.excess, **{name: 1.1 * value}))
             # Residuals tell the whole of these variances, not only the excess.
-            sources.append(((grown - fit.covariance) / (0.1 * part.share), part.freedom))
+            sources.append(((grown - fit.covariance) / (0.1 * share), freedom))
     plain = problem.covariance(fit.values, NO_EXCESS)
     return replace(fit, sources=tuple(sources), plain_covariance=plain), moments
 

@@ -27,13 +27,6 @@ from faintfield.calib.noise.strips import Mask
 # Read noise, in electrons and in DN, below which single electrons or the rounding shape the distribution of values.
 _MIN_GAUSSIAN_READ_E, _MIN_GAUSSIAN_READ_DN = 1.0, 0.5
 
-# Read noise in DN below which the Gaussian cannot tell the noise from the rounding, unless the
-# phases of the pixels average out.
-MIN_ROUNDED_READ_DN = 0.35
-
-# Largest error that rounding may make of the noise of a series of darks with so little read noise.
-_MAX_ROUNDING_ERROR = 0.05
-
 # Largest noise that pixels share, as a fraction of the read noise variance, for the exact likelihood; more blurs single
 # electrons.
 _MAX_SHARED_FRACTION = 0.03
@@ -96,14 +89,6 @@ class SeriesFit:
     def flat_noise_dn2(self) -> list[float]:
         """Pixel noise of the flat series."""
         return flat_variances_dn2(self.fit.values, self.moments.flats.mean_dn)
-
-    @property
-    def rounding_hides_noise(self) -> bool:
-        """Return whether the read noise is too small for the Gaussian, and the drift too large for the values."""
-        if self.likelihood is not NoiseLikelihood.GAUSSIAN:
-            return False
-        read_dn = float(np.exp(0.5 * self.fit.values["log_read_dn2"]))
-        return read_dn < MIN_ROUNDED_READ_DN and float(self.moments.darks.rounding2.max()) > _MAX_ROUNDING_ERROR**2
 
 
 def fit_series(

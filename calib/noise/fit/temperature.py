@@ -55,7 +55,9 @@ def settle_temperature(series: Sequence[Series]) -> tuple[Sequence[Series], Warm
     warmth = np.array([dark.conditions.temperature_c for dark in darks], np.float64)
     if np.unique(warmth).size < 2:
         return series, Warmth()
-    range_k, doubling = float(np.ptp(warmth)), _doubling(darks)
+    levels, frames = np.concatenate([dark.levels_dn for dark in darks]), [dark.frames for dark in darks]
+    times_s = np.repeat([dark.conditions.exposure_s for dark in darks], frames)
+    range_k, doubling = float(np.ptp(warmth)), dark_current_doubling(levels, times_s, np.repeat(warmth, frames))
     stated_k = _stated_doubling_k(darks)
     if stated_k is not None:
         return series, Warmth(range_k=range_k, warnings=_contradiction(stated_k, doubling))
@@ -66,7 +68,7 @@ def settle_temperature(series: Sequence[Series]) -> tuple[Sequence[Series], Warm
             f"darks at one temperature ({doubling.why})"
         )
         return series, Warmth(doubling, range_k, (why,))
-    doubling_k, reference_c = doubling.value, float(np.average(warmth, weights=[dark.frames for dark in darks]))
+    doubling_k, reference_c = doubling.value, float(np.average(warmth, weights=frames))
     note = (
         f"dark_current_doubling_k is not stated: the dark current of these darks doubles every {doubling.value:.3g} ± "
         f"{doubling.se:.2g} K, by which it is taken to that at {reference_c:.1f} °C"
@@ -100,13 +102,6 @@ def with_doubling_error(fit: NoiseFit, moments: Moments, darks: Sequence[Series]
     return replace(fit, covariance=covariance)
 
 
-def _doubling(darks: Sequence[Series]) -> Estimate:
-    exposures, warmth = ([getattr(dark.conditions, of) for dark in darks] for of in ("exposure_s", "temperature_c"))
-    frames = [dark.frames for dark in darks]
-    levels = np.concatenate([dark.levels_dn for dark in darks])
-    return dark_current_doubling(levels, np.repeat(exposures, frames), np.repeat(np.array(warmth, float), frames))
-
-
 def _stated_doubling_k(darks: Sequence[Series]) -> float | None:
     """Return the kelvins over which the stated dark current doubles, None if none is stated."""
     low, high = (pick(darks, key=lambda dark: dark.conditions.temperature_c or 0.0).conditions for pick in (min, max))
@@ -116,7 +111,6 @@ def _stated_doubling_k(darks: Sequence[Series]) -> float | None:
 
 
 def _contradiction(stated_k: float, doubling: Estimate) -> tuple[str, ...]:
-    """Return a warning if the darks contradict the stated doubling."""
     value, se = doubling.value, doubling.se
     if value is None or se is None or abs(value - stated_k) <= _MAX_SIGMAS * se:
         return ()

@@ -190,10 +190,8 @@ def mass_function(
         Exposure time t.
     max_charge_e : float
         Largest λ at which the function will be evaluated; the Poisson sum extends well above it.
-    exact : bool
-        Use eq. (2) rather than (3).
-    spread : bool
-        Let pixels differ in dark current, with several nodes rather than one.
+    exact, spread : bool
+        As for `MarginalLikelihood`; a spread needs several nodes.
 
     Returns
     -------

@@ -136,9 +136,22 @@ class GaussianProblem:
         PoorFit
             IPOPT did not converge.
         """
-        at, minimum = self._minimize(list(astuple(excess)), near or {})
-        values = dict(zip(self._start, (at * self._units).tolist(), strict=True))
-        return NoiseFit(values, self.covariance(values, excess), -minimum)
+        solver, units, start = self._solver, self._units, self._start | dict(near or {})
+        # The spreads over pixels may be negative, as unbiased differences of variances can be. A bound at zero would
+        # push what contradicts it (pickup whose phase turns from frame to frame, for example) into the read noise.
+        limits = np.array([_LIMITS.get(name, (-np.inf, np.inf)) for name in start]) / units[:, None]
+        # The first step from the spreads that the frames suggest may overshoot to a variance of zero; smaller spreads
+        # avoid that.
+        for share in (1.0, 0.1, 0.01):
+            first = [value * (share if name in _SPREADS else 1.0) for name, value in start.items()]
+            minimum = solver(x0=(first / units).tolist(), p=list(astuple(excess)), lbx=limits[:, 0], ubx=limits[:, 1])
+            if solver.stats()["success"]:
+                values = dict(zip(start, (np.array(minimum["x"]).ravel() * units).tolist(), strict=True))
+                return NoiseFit(values, self.covariance(values, excess), -float(minimum["f"]))
+        raise PoorFit(
+            f"the noise likelihood has no maximum: IPOPT stopped with {solver.stats()['return_status']} after "
+            f"{solver.stats()['iter_count']} iterations; check that the darks were taken with the lens covered"
+        )
 
     def covariance(self, values: Mapping[str, float], excess: Excess) -> Array:
         """Return the inverse of the Hessian of −ln L at given parameters, in their order; huge if undetermined."""
@@ -150,24 +163,6 @@ class GaussianProblem:
         covariance = np.zeros_like(hessian)
         covariance[np.ix_(free, free)] = (vectors * inverse) @ vectors.T
         return covariance * np.outer(self._units, self._units)
-
-    def _minimize(self, excess: list[float], near: Mapping[str, float]) -> tuple[Array, float]:
-        """Return the minimum in units of the parameters, and the value there."""
-        solver, units, start = self._solver, self._units, self._start | dict(near)
-        # The spreads over pixels may be negative, as unbiased differences of variances can be. A bound at zero would
-        # push what contradicts it (pickup whose phase turns from frame to frame, for example) into the read noise.
-        limits = np.array([_LIMITS.get(name, (-np.inf, np.inf)) for name in start]) / units[:, None]
-        # The first step from the spreads that the frames suggest may overshoot to a variance of zero; smaller spreads
-        # avoid that.
-        for share in (1.0, 0.1, 0.01):
-            first = [value * (share if name in _SPREADS else 1.0) for name, value in start.items()]
-            minimum = solver(x0=(first / units).tolist(), p=excess, lbx=limits[:, 0], ubx=limits[:, 1])
-            if solver.stats()["success"]:
-                return np.array(minimum["x"]).ravel(), float(minimum["f"])
-        raise PoorFit(
-            f"the noise likelihood has no maximum: IPOPT stopped with {solver.stats()['return_status']} after "
-            f"{solver.stats()['iter_count']} iterations; check that the darks were taken with the lens covered"
-        )
 
 
 def _start(moments: Moments, bends: int) -> tuple[dict[str, float], dict[str, float]]:

@@ -217,7 +217,6 @@ def _scatter(rest: Callable[[slice], Array], information: Map, usable: Mask) -> 
 
 
 def _why(information: float, response: Response, share_se: float, scatter_se: float) -> str:
-    """Return why pixels have no gain of their own, and what to record."""
     why = (
         f"photon transfer tells the gain of one pixel to ±{information**-0.5:.0%}, and nothing shows that "
         f"gains differ; differences of {np.sqrt(_MIN_SCATTER_SIGMA * scatter_se):.1%} would show"

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from faintfield.calib.noise.estimate import Estimate
 from faintfield.calib.noise.fit.series_fit import NoiseLikelihood, SeriesFit
 from faintfield.calib.noise.likelihood.response import charge_dn, charge_slope
+from faintfield.calib.noise.maps.defects import noisy_pixels, telegraph_pixels, variance_ratio
 from faintfield.calib.noise.maps.gain import PixelGain, gain_of_regions, measure_gain, photon_transfer
+from faintfield.calib.noise.maps.levels import PixelLevels, line_pattern, pixel_levels
 from faintfield.calib.noise.maps.photo_response import Response, measure_response
-from faintfield.calib.noise.maps.pixels import PixelLevels, line_pattern, noisy_pixels, pixel_levels, variance_ratio
 from faintfield.calib.noise.maps.read_noise import PixelReadNoise, measure_read_noise
 from faintfield.calib.noise.maps.seams import Seam, find_seams
-from faintfield.calib.noise.maps.telegraph import telegraph_pixels
 from faintfield.calib.noise.strips import Array, Map, Mask, map_of, new_map, total_of
 
 # A step of the offsets is named from this fraction of the read noise, telegraph pixels from this share of all.

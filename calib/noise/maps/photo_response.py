@@ -110,12 +110,9 @@ def measure_response(signal_dn: Map, noise_dn2: float, usable: Mask) -> Response
     error2 = (spread2 + mean_noise) * np.sqrt(2 / usable.sum())
 
     def work(rows: slice) -> tuple[Map, Map]:
-        chance = noise(rows)
+        chance, smooth = noise(rows), vignetting[rows]
         kept = spread2 / (spread2 + chance)
-        return (
-            vignetting[rows] * (1 + np.where(usable[rows], kept * pixel(rows), 0.0)),
-            vignetting[rows] * np.sqrt(kept * chance),
-        )
+        return smooth * (1 + np.where(usable[rows], kept * pixel(rows), 0.0)), smooth * np.sqrt(kept * chance)
 
     relative, relative_se = maps_of(work, raw.shape, (raw.dtype,) * 2)
     return Response(

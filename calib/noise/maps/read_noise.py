@@ -317,7 +317,6 @@ class _Population:
 
 
 def _population(squares: _Squares, ratio: Map, factor: _LineFactor, read_dn2: float, usable: Mask) -> _Population:
-    """Return the population of the squares over `factor`."""
     degrees = float(squares.freedom.sum())
     some = thinned(ratio, usable, factor.at)
 

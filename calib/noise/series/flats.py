@@ -15,8 +15,6 @@ from faintfield.calib.errors import BadFrame, SaturatedFlat
 from faintfield.calib.noise.series.statistics import Series
 from faintfield.calib.noise.strips import Array
 
-type Limit = Literal["ADC", "full well", "not reached"]
-
 # Share of the values at a known end of the range beyond which the noise of a series is clipped: the variance of a
 # normal law that loses this share of one tail falls by 0.05 %.
 _MAX_CLIPPED_SHARE = 3e-4
@@ -54,7 +52,7 @@ class Saturation:
         Flats beyond, each with the reason.
     """
 
-    limit: Limit
+    limit: Literal["ADC", "full well", "not reached"]
     level_dn: float | None
     interval_dn: tuple[float, float] | None
     kept: tuple[Series, ...]

@@ -187,20 +187,17 @@ class SeriesSums:
             The frame differs in size from earlier ones.
         """
         if not self._frames:
-            self._begin(frame_dn)
+            self._suspect = _suspects(frame_dn)
+            self._regular = ~self._suspect
+            self._suspect_at = np.nonzero(self._suspect)
+            self._row_count, self._column_count = self._regular.sum(1), self._regular.sum(0)
+            self._sampled = sample_index(frame_dn.shape)
+            self._moments = Moments(frame_dn.shape, higher=self.conditions.kind == "dark")
         if frame_dn.shape != self._suspect.shape:
             raise ValueError(f"{name}: {frame_dn.shape} pixels, where the series began with {self._suspect.shape}")
         digest = hashlib.blake2b(np.ascontiguousarray(frame_dn), digest_size=16).digest()
         sample = frame_dn.ravel()[self._sampled].astype(np.int32)
         self._frames.append((name, digest, sample, *self._add_residual(frame_dn)))
-
-    def _begin(self, first_dn: NDArray[Any]) -> None:
-        self._suspect = _suspects(first_dn)
-        self._regular = ~self._suspect
-        self._suspect_at = np.nonzero(self._suspect)
-        self._row_count, self._column_count = self._regular.sum(1), self._regular.sum(0)
-        self._sampled = sample_index(first_dn.shape)
-        self._moments = Moments(first_dn.shape, higher=self.conditions.kind == "dark")
 
     def _add_residual(self, frame_dn: NDArray[Any]) -> tuple[Any, ...]:
         """Add a frame without its level, row and column means to the sums; return them and the spread of the rest."""
@@ -326,7 +323,6 @@ def robust_sigma(values: NDArray[Any]) -> float:
 
 
 def _check_alike(series: Series) -> None:
-    """Check that no dark is brighter, or has another pattern, than the others of its series."""
     if series.conditions.kind != "dark" or series.frames < 2:
         return
     noise_dn = float(np.sqrt(np.median(series.within_dn2) / (series.frames - 1)))

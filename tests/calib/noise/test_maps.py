@@ -8,13 +8,9 @@ from numpy.typing import NDArray
 
 from faintfield.calib.noise import Conditions, NoiseCalibration, Series, calibrate, measure_series
 from faintfield.calib.noise.emva.light_estimates import quantum_efficiency
+from faintfield.calib.noise.maps.defects import outlying_pixels
+from faintfield.calib.noise.maps.levels import LinePattern, line_pattern, pixel_levels
 from faintfield.calib.noise.maps.photo_response import Response, _kept_share, _running_mean, measure_response
-from faintfield.calib.noise.maps.pixels import (
-    LinePattern,
-    line_pattern,
-    outlying_pixels,
-    pixel_levels,
-)
 from faintfield.calib.noise.maps.read_noise import PixelReadNoise, kept_of, measure_read_noise
 from faintfield.calib.noise.maps.seams import find_seams, share_of_seam
 from tests.calib.noise.darkroom import darks, specimen
