@@ -74,8 +74,8 @@ class Inputs:
         order = list(self.values)
         at = [order.index(name) for name in needs]
         covariance = self.covariance[np.ix_(at, at)]
-        found, se = propagate(formula, np.array([self.values[name] for name in needs]), covariance)
-        return interval(found, se, _QUANTILE, positive=True)
+        value, se = propagate(formula, np.array([self.values[name] for name in needs]), covariance)
+        return interval(value, se, _QUANTILE, positive=True)
 
 
 def propagate(formula: Callable[..., float], values: Array, covariance: Array) -> tuple[float, float]:

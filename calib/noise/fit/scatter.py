@@ -23,6 +23,7 @@ from faintfield.calib.noise.likelihood.response import (
     grown_variance,
     level_design,
     scatter_of_levels,
+    scatter_of_line,
 )
 from faintfield.calib.noise.likelihood.rounding import ROUNDING_DN2
 from faintfield.calib.noise.series.statistics import Series
@@ -43,7 +44,6 @@ _MAX_SHARE, _MIN_FREEDOM = 0.1, 4
 
 # Rounds of fits in which the scatter is measured, and its relative change at which they end.
 _MAX_ROUNDS, _SETTLED = 5, 0.02
-
 
 # Degrees of freedom of an excess variance, and its share in the variance that it is part of.
 type Known = tuple[int, float]
@@ -136,13 +136,7 @@ def _noise_scatter(fit: NoiseFit, moments: Moments, excess: Excess) -> tuple[flo
     chance = 2 * wider[use] / freedom[use] + np.concatenate([darks.rounding2, flats.rounding2])[use]
     target, columns = (measured - ROUNDING_DN2)[use] / noise[use], design[use] / noise[use][:, None]
     left = target.size - int(np.linalg.matrix_rank(columns / np.maximum(np.abs(columns).max(0), 1e-300)))
-
-    def deviance(more: float) -> float:
-        root = np.sqrt(chance + more)
-        rest = target - columns @ np.linalg.lstsq(columns / root[:, None], target / root)[0]
-        return float(np.sum((rest / root) ** 2))
-
-    variance2 = grown_variance(deviance, left)
+    variance2, _ = scatter_of_line(columns, target, chance, np.ones_like(chance), left)
     return variance2, (left, _share(chance, variance2))
 
 

@@ -99,8 +99,8 @@ def known_light(flats: Sequence[Series]) -> Light:
         amount = np.array([flat.conditions.exposure_s for flat in flats], float)
         group = np.unique([flat.conditions.level for flat in flats], return_inverse=True)[1].astype(int)
     for index in np.unique(group):
-        among = amount[group == index]
-        if np.unique(among).size < 3 or among.min() <= 0 or among.max() < _MIN_SPAN * among.min():
+        amounts = amount[group == index]
+        if np.unique(amounts).size < 3 or amounts.min() <= 0 or amounts.max() < _MIN_SPAN * amounts.min():
             group[group == index] = -1
     return Light(amount, group)
 
@@ -123,14 +123,19 @@ def scatter_of_levels(light: Light, signal_dn: Array, variance_dn2: Array, bends
     and Paule, Analytical Chemistry 42, 1194, 1970).
     """
     use, design = light.group >= 0, level_design(light, signal_dn, bends)
-    s, variance = signal_dn[use], variance_dn2[use]
+    s = signal_dn[use]
+    return scatter_of_line(design, s, variance_dn2[use], s**2, design.shape[0] - design.shape[1])
+
+
+def scatter_of_line(design: Array, target: Array, variance: Array, scale2: Array, freedom: int) -> tuple[float, float]:
+    """Return the scatter of a target about its linear fit beyond `variance`, over `scale2`, and Σ r²/variance."""
 
     def deviance(excess: float) -> float:
-        root = np.sqrt(variance + excess * s**2)
-        coefficients = np.linalg.lstsq(design / root[:, None], s / root)[0]
-        return float(np.sum(((s - design @ coefficients) / root) ** 2))
+        root = np.sqrt(variance + excess * scale2)
+        coefficients = np.linalg.lstsq(design / root[:, None], target / root)[0]
+        return float(np.sum(((target - design @ coefficients) / root) ** 2))
 
-    return grown_variance(deviance, design.shape[0] - design.shape[1]), deviance(0.0)
+    return grown_variance(deviance, freedom), deviance(0.0)
 
 
 def grown_variance(deviance: Callable[[float], float], freedom: float) -> float:
@@ -196,7 +201,7 @@ def level_log_likelihood(
 def bend_log_prior(values: Mapping[str, Any], range_dn: float, bend_se: float) -> Any:
     """Return ln of the normal density of the bends at the end of the range, of standard error `bend_se`."""
     at_end = [values[name] * range_dn**power for power, name in enumerate(BENDS, 1) if name in values]
-    return -0.5 * sum((bend / bend_se) ** 2 for bend in at_end) if at_end else 0.0
+    return -0.5 * sum((bend / bend_se) ** 2 for bend in at_end)
 
 
 def signal_of_charge(values: Mapping[str, float], charge: Array, range_dn: float) -> Array:

@@ -235,8 +235,8 @@ def _kept_share(usable: Mask) -> Callable[[slice], Array]:
     weight = _box(usable.astype(np.float32), window)
 
     def share(rows: slice) -> Array:
-        taken = 2 * np.outer(own[0][rows], own[1]) - np.outer(squares[0][rows], squares[1])
-        return np.asarray(np.maximum(1 - taken / np.maximum(weight[rows], 1e-6), 0.05))
+        loss = 2 * np.outer(own[0][rows], own[1]) - np.outer(squares[0][rows], squares[1])
+        return np.asarray(np.maximum(1 - loss / np.maximum(weight[rows], 1e-6), 0.05))
 
     return share
 

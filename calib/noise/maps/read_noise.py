@@ -125,10 +125,8 @@ def kept_of(variance_of: Callable[[slice], Array], regular: Mask) -> Callable[[s
     def kept(rows: slice, variance: Array) -> Array:
         counts = regular[rows]
         variance = np.where(counts, 1 - 2 / per_column, 1.0) * variance + sums / per_column**2
-        in_row = per_row[rows, None]
-        return np.asarray(
-            np.where(counts, 1 - 2 / in_row, 1.0) * variance + variance.sum(1, keepdims=True, where=counts) / in_row**2
-        )
+        in_row, row_sums = per_row[rows, None], variance.sum(1, keepdims=True, where=counts)
+        return np.asarray(np.where(counts, 1 - 2 / in_row, 1.0) * variance + row_sums / in_row**2)
 
     return kept
 
@@ -178,13 +176,7 @@ class _Squares:
         return np.asarray(self.at(rows) @ (1 / (read_dn2 + self.shot_dn2)) / self.freedom.sum())
 
 
-def _measure(
-    darks: Sequence[Series],
-    read_dn2: float,
-    shot_dn2: Array,
-    kept: Map,
-    usable: Mask,
-) -> PixelReadNoise:
+def _measure(darks: Sequence[Series], read_dn2: float, shot_dn2: Array, kept: Map, usable: Mask) -> PixelReadNoise:
     """Return the posterior if `kept` is the share of its variance that each pixel shows, (row, column)."""
     shot_dn2, which = np.unique(shot_dn2, return_inverse=True)
     freedom = np.bincount(which, [series.frames - 1.0 for series in darks])
@@ -199,9 +191,8 @@ def _measure(
         common = map_of(lambda rows: _scaled(np.sqrt(read_dn2), region.at(rows), shot, read_dn2), kept.shape)
         se_dn = map_of(lambda rows: common[rows] * 0.5 * np.sqrt(limit), kept.shape)
         return PixelReadNoise(common, se_dn, resolved=region.varies)
-    lines = _LineFactor(
-        *_line_shifts(map_of(lambda rows: np.log(np.maximum(ratio[rows], 1e-9)), kept.shape), usable), np.exp
-    )
+    log_ratio = map_of(lambda rows: np.log(np.maximum(ratio[rows], 1e-9)), kept.shape)
+    lines = _LineFactor(*_line_shifts(log_ratio, usable), np.exp)
     # A spot of noisier pixels shifts its rows, columns and regions, too; a number for each must explain more than it
     # may by chance (Akaike, IEEE Transactions on Automatic Control 19, 716, 1974).
     even = _LineFactor(np.zeros(kept.shape[0]), np.zeros(kept.shape[1]), np.exp)

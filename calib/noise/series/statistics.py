@@ -230,8 +230,8 @@ class SeriesSums:
         level = float(total / self._row_count.sum())
         means = (rows - level * self._row_count) / np.maximum(self._row_count, 1)
         row, column = self._suspect_at
-        taken = (level + means).sum() - np.bincount(column, (level + means)[row], frame_dn.shape[1])
-        return level, means, (columns - taken) / np.maximum(self._column_count, 1), float(max(*highs, min(lows)))
+        shared = (level + means).sum() - np.bincount(column, (level + means)[row], frame_dn.shape[1])
+        return level, means, (columns - shared) / np.maximum(self._column_count, 1), float(max(*highs, min(lows)))
 
     def series(self) -> Series:
         """Return the statistics of the frames so far.
