@@ -52,7 +52,7 @@ class MapDifference:
 
     @property
     def grown(self) -> bool:
-        """Return whether the rms exceeds what is expected by more than these errors are known."""
+        """True if the rms exceeds its expectation by more than the errors are known."""
         return self.rms > (1 + _MIN_GROWTH) * self.expected
 
 

@@ -67,11 +67,11 @@ class NoiseCalibration:
     saturation_dn : float
         Value from which a pixel is saturated, as stated or found.
     saturation : Saturation
-        Where the flats saturate, and which of them are left out.
+        Saturation of the flats, and those that are left out.
     response : BentResponse, optional
         Bend of the response where the flats show one.
     goodness : tuple of SeriesGoodness
-        How well each series that was used follows the model.
+        Goodness of fit of each series that was used.
     warnings : tuple of str
         Problems of the frames.
     """

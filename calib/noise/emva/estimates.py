@@ -53,7 +53,7 @@ def estimate_all(
     response : Response, optional
         Photo response; None without flats.
     saturation : Saturation
-        Where the sensor saturates.
+        Saturation of the sensor.
     levels_hold, noise_holds : bool
         The dark levels lie on a straight line over exposure time; the noise of all series follows eq. (1).
     """

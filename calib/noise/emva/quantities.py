@@ -59,7 +59,7 @@ class Inputs:
     whys : dict of str
         Why the others have no value.
     covariance : array (quantity, quantity)
-        Of the values; scaled so that 1.96 standard errors are the half width of each interval.
+        Covariance of the values, scaled so that 1.96 standard errors are the half width of each interval.
     """
 
     values: dict[str, float]
@@ -108,7 +108,7 @@ def gather_inputs(
     covariance : tuple (names, array)
         Covariance of those of the first three that have values, possibly with others.
     full_well : bool
-        What saturates is the full well, not the converter.
+        The full well saturates, not the converter.
     charge_error : float
         Relative error of the charge of flats beside that of the gain: the bend of the response is not known exactly.
     """
@@ -144,7 +144,7 @@ def derived_quantities(inputs: Inputs, exposure_s: float) -> dict[str, Estimate]
     Parameters
     ----------
     inputs : Inputs
-        What they follow from.
+        Gain, noise, efficiency and capacity with their covariance.
     exposure_s : float
         Exposure of the dark noise.
 

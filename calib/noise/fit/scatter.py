@@ -231,7 +231,7 @@ def without_odd(light: Light, signal_dn: Array, variance_dn2: Array, bends: int)
     Parameters
     ----------
     light : Light
-        Of all flat series.
+        Light of all flat series.
     signal_dn, variance_dn2 : array (series,)
         Mean signal, and the variance that noise alone makes of it.
     bends : int

@@ -38,7 +38,7 @@ class Warmth:
     range_k : float
         Range of the temperatures of the darks.
     warnings : tuple of str
-        What the user should know.
+        Messages for the user.
     """
 
     doubling: Estimate | None = None

@@ -64,7 +64,7 @@ class FlatMoments:
     rounding2, exposure_s, level_scatter_dn2 : array (series,)
         As for the darks.
     light : Light
-        What is known of their light.
+        Light of the flats, as far as it is known.
     range_dn, bend_se : float
         Signal at the end of the range, and the standard error of the bend there before it is measured.
     """

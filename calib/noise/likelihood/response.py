@@ -233,7 +233,7 @@ class FittedLevels:
     Attributes
     ----------
     light : Light
-        Of all flat series.
+        Light of all flat series.
     signal_dn, variance_dn2 : array (series,)
         Mean signal, dark signal removed, and the variance of its error.
     full_dn : float

@@ -77,7 +77,7 @@ def pixel_levels(
     noise_dn2 : sequence of callables
         Return the noise of some rows of pixels (row, column) in each series, or one number for all.
     pattern : LinePattern
-        What rows and columns share in the offsets.
+        Pattern of rows and columns in the offsets.
     hot : array (row, column), bool
         Pixels whose dark signal the prior does not describe; only their own values determine it.
     """

@@ -62,7 +62,7 @@ class PixelReadNoise:
     read_noise_dn, se_dn : array (row, column)
         Posterior mean and standard deviation; without the error that all pixels share (see `read_noise_dn` of the fit).
     resolved : bool
-        Whether the pixels differ. If not, `se_dn` is the difference that would have gone unnoticed.
+        The pixels differ. If not, `se_dn` is the difference that would have gone unnoticed.
     """
 
     read_noise_dn: Map

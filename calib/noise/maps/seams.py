@@ -36,7 +36,7 @@ class Seam:
     se : float
         Standard error of the largest difference between regions.
     of_response : bool
-        Whether the response to light has told its size.
+        The response to light has told its size.
     """
 
     lines: str
@@ -72,7 +72,7 @@ def find_seams(values: NDArray[Any], weight: NDArray[Any], precision: float = 1.
     weight : array (row, column)
         Inverse variance of each value over `precision`; 0 for pixels that do not count.
     precision : float
-        What the weights are multiplied by.
+        Factor on the weights.
     """
     profiles = _profiles(values, weight, precision)
     return [seam for lines, profile in profiles.items() if (seam := _find_seam(*profile, lines))]

@@ -41,7 +41,7 @@ class Saturation:
     Attributes
     ----------
     limit : {"ADC", "full well", "not reached"}
-        What ends the range.
+        End of the range.
     level_dn : float, optional
         The end of the converter's range, or the mean of the noisiest series; None if no series reaches it.
     interval_dn : tuple of float, optional

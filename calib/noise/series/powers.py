@@ -24,7 +24,7 @@ class Moments:
     shape : tuple of int
         Rows and columns of a frame.
     higher : bool
-        Whether third and fourth powers are summed, too.
+        Sum third and fourth powers, too.
     """
 
     def __init__(self, shape: tuple[int, ...], *, higher: bool) -> None:
