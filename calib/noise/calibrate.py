@@ -168,8 +168,8 @@ def _histograms(fitted: SeriesFit, usable: Mask) -> tuple[Histogram, ...]:
         return ()
     counts = collect_counts(fitted.darks, usable)
     ends = sorted({int(np.argmin(counts.exposure_s)), int(np.argmax(counts.exposure_s))})
-    narrow = [j for j in ends if np.ptp(counts.values_dn[j]) < MAX_TABLE_WIDTH_DN]
-    return tuple(_histogram(counts, j, fitted) for j in narrow)
+    places = [j for j in ends if np.ptp(counts.values_dn[j]) < MAX_TABLE_WIDTH_DN]
+    return tuple(_histogram(counts, j, fitted) for j in places)
 
 
 def _histogram(counts: Counts, index: int, fitted: SeriesFit) -> Histogram:

@@ -100,7 +100,7 @@ def series_goodness(fitted: SeriesFit) -> tuple[SeriesGoodness, ...]:
     residuals: list[float | None] = [float(x) for x in moments.darks.mean_dn - line]
     residuals += _light_residuals(fit, moments)
     noise = [*fitted.dark_noise_dn2, *fitted.flat_noise_dn2]
-    freedom = np.concatenate(noise_freedom(moments))
+    freedom = noise_freedom(moments)
     within = np.concatenate([moments.darks.within_dn2, moments.flats.within_dn2])
     goodness = []
     for j, item in enumerate((*fitted.darks, *fitted.flats)):
@@ -176,8 +176,8 @@ def scatter_warnings(fitted: SeriesFit) -> list[str]:
             continue
         factor = float(np.median(charge_dn(values, signal[members]) / flats.light.amount[members]))
         conditions = fitted.flats[index].conditions
-        stated = conditions.photons == flats.light.amount[index]
-        kind, key = ("photons", "photons") if stated else ("s", "exposure_s")
+        by_photons = conditions.photons == flats.light.amount[index]
+        kind, key = ("photons", "photons") if by_photons else ("s", "exposure_s")
         warnings.append(
             f"the {conditions}: {flats.light.amount[index]:.5g} {kind} are stated, their level is that of "
             f"{float(charge_dn(values, signal[index])) / factor:.5g} {kind} by the other levels; they are left out of "

@@ -192,10 +192,10 @@ def _explaining(total: Array) -> Array:
     y, x = np.mgrid[-1 : 1 : _BLOCK_PX * 1j, -1 : 1 : _BLOCK_PX * 1j]
     centre = total[:, 1:-1, 1:-1]
     right, left, down, up = total[:, 1:-1, 2:], total[:, 1:-1, :-2], total[:, 2:, 1:-1], total[:, :-2, 1:-1]
-    one = np.ones_like(centre)
     mixed = total[:, 2:, 2:] - total[:, 2:, :-2] - total[:, :-2, 2:] + total[:, :-2, :-2]
     curvatures = (right - 2 * centre + left, down - 2 * centre + up, mixed)
-    terms = np.stack([one, one * x, one * y, right - left, down - up, *curvatures], axis=-1)
+    planes = np.broadcast_arrays(1.0, x, y, centre)[:3]
+    terms = np.stack([*planes, right - left, down - up, *curvatures], axis=-1)
     terms = terms.reshape(-1, _BLOCK_PX**2, _TERMS)
     return np.asarray(terms / (np.sqrt(np.mean(terms**2, axis=1, keepdims=True)) + 1e-9))
 
@@ -243,8 +243,8 @@ def estimate_view_noise(
     in_the_dark = float(least_variance_dn2(np.zeros(1))[0])
     line = _line(mean_dn, variance, counts, gain_dn, in_the_dark)
     generator = np.random.default_rng(1)
-    drawn = [curve([generator.choice(group, len(group)) for group in groups]) for _ in range(_DRAWS)]
-    lines = np.array([_line(mean_dn, variances, counts, gain_dn, in_the_dark) for variances in drawn])
+    draws = [curve([generator.choice(group, len(group)) for group in groups]) for _ in range(_DRAWS)]
+    lines = np.array([_line(mean_dn, variances, counts, gain_dn, in_the_dark) for variances in draws])
     gain, read = (_estimate(value, draws) for value, draws in zip(line.tolist(), lines.T, strict=True))
     return ViewNoise(gain, read, mean_dn, variance, int(counts.sum()))
 

@@ -225,14 +225,14 @@ def _from_flats(fitted: SeriesFit, gain: Estimate, response: Response | None, qu
     efficiency = Estimate(None, why=_NO_PHOTONS)
     if gain.value is not None:
         values, light = fitted.fit.values, fitted.moments.flats.light
-        stated = []
+        pairs = []
         for index, flat in enumerate(fitted.flats):
             charge = charge_dn(values, fitted.moments.flats.mean_dn[index] - values["offset_dn"])
             dark_dn = values.get("dark_signal_dn_per_s", 0.0) * flat.conditions.dark_time_s
             if flat.conditions.photons and index not in {odd for odd, _ in light.odd}:
-                stated.append((flat.conditions.photons, float((charge - dark_dn) / np.exp(values["log_gain"]))))
-        if stated:
-            photons, charges_e = np.array(stated).T
+                pairs.append((flat.conditions.photons, float((charge - dark_dn) / np.exp(values["log_gain"]))))
+        if pairs:
+            photons, charges_e = np.array(pairs).T
             slope = quantum_efficiency(photons, charges_e, fitted.fit.standard_error("log_gain"))
             efficiency = interval(*slope, quantile, positive=True)
     elif fitted.flats:

@@ -116,8 +116,8 @@ def _linearity(fitted: SeriesFit, saturation: Saturation) -> Estimate:
     def error_of(draw: Array) -> float | None:
         return levels.linearity(dict(zip(names, draw.tolist(), strict=True)))
 
-    drawn = np.random.default_rng(1288).multivariate_normal(bends, covariance, _DRAWS, method="svd")
-    errors = np.array([error for error in map(error_of, drawn) if error is not None])
+    draws = np.random.default_rng(1288).multivariate_normal(bends, covariance, _DRAWS, method="svd")
+    errors = np.array([error for error in map(error_of, draws) if error is not None])
     if errors.size < (1 - _MAX_IMPOSSIBLE) * _DRAWS:
         return Estimate(None, why=_POOR_RESPONSE)
     se = float(np.sqrt(np.mean((errors - value) ** 2)))

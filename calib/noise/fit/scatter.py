@@ -49,10 +49,11 @@ _MAX_ROUNDS, _SETTLED = 5, 0.02
 type Known = tuple[int, float]
 
 
-def noise_freedom(moments: Moments) -> tuple[Array, Array]:
-    """Return the degrees of freedom of the noise of each dark and each flat series."""
+def noise_freedom(moments: Moments) -> Array:
+    """Return the degrees of freedom of the noise of each series, darks first."""
     darks, flats = moments.darks, moments.flats
-    return (darks.frames - 1) * moments.freedom, (flats.frames - 1) * moments.freedom * flats.evenness
+    of_flats = (flats.frames - 1) * moments.freedom * flats.evenness
+    return np.concatenate([(darks.frames - 1) * moments.freedom, of_flats])
 
 
 def _dispersion(noise: Sequence[SeriesNoise], variances_dn2: Iterable[Array | float]) -> float:
@@ -130,7 +131,7 @@ def _noise_scatter(fit: NoiseFit, moments: Moments, excess: Excess) -> tuple[flo
     ])  # fmt: skip
     frames = np.concatenate([darks.frames, flats.frames])
     measured = np.concatenate([darks.within_dn2, flats.within_dn2]) / np.maximum(frames - 1, 1) / moments.freedom
-    freedom = np.concatenate(noise_freedom(moments))
+    freedom = noise_freedom(moments)
     wider = np.concatenate([np.full(darks.frames.size, excess.darks), np.full(flats.frames.size, excess.flats)])
     use = freedom > 0
     chance = 2 * wider[use] / freedom[use] + np.concatenate([darks.rounding2, flats.rounding2])[use]

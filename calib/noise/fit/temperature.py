@@ -80,8 +80,8 @@ def settle_temperature(series: Sequence[Series]) -> tuple[Sequence[Series], Warm
         factor = dark_factor(conditions.temperature_c, reference_c, doubling_k)
         return replace(conditions, dark_factor=factor)
 
-    settled = [replace(item, conditions=at_reference(item.conditions)) for item in series]
-    return settled, Warmth(doubling, range_k, (note,))
+    series = [replace(item, conditions=at_reference(item.conditions)) for item in series]
+    return series, Warmth(doubling, range_k, (note,))
 
 
 def with_doubling_error(fit: NoiseFit, moments: Moments, darks: Sequence[Series], warmth: Warmth) -> NoiseFit:

@@ -80,8 +80,8 @@ def _dark_rounding(series: Series, phase_dn: Array, frames: float, used: Mask) -
     for _ in range(3):  # the amplitude depends on the noise before rounding
         noise = max(variance - ROUNDING_DN2, 0.0)
         # Rounding also draws means towards whole numbers
-        drawn = np.exp(-2 * np.pi**2 * noise) / np.pi * np.sin(2 * np.pi * (phase_dn + level.mean()))
-        wave = np.exp(2j * np.pi * (phase_dn + drawn)).mean() * np.exp(2j * np.pi * level).mean()
+        shift = np.exp(-2 * np.pi**2 * noise) / np.pi * np.sin(2 * np.pi * (phase_dn + level.mean()))
+        wave = np.exp(2j * np.pi * (phase_dn + shift)).mean() * np.exp(2j * np.pi * level).mean()
         excess = -_amplitude(noise) * float(np.clip(wave.real * sharpening, -1.0, 1.0))
         variance = max(total - excess, ROUNDING_DN2)
     # What the pixels' means leave open: their noise, their number and the second harmonic

@@ -75,8 +75,8 @@ def check_flat_levels(darks: Sequence[Series], flats: Sequence[Series]) -> None:
     jitter_dn = max(float(np.ptp(item.levels_dn)) for item in darks)
     share = np.maximum(range_dn - _TIMES_FLICKER * jitter_dn, 0.0) / np.maximum(signal_dn, 1e-9)
     for index, item in enumerate(several):
-        others = np.delete(share, index)
-        limit = max(_MIN_RANGE, _TIMES_FLICKER * float(np.median(others))) if others.size > 1 else _LONE_RANGE
+        rest = np.delete(share, index)
+        limit = max(_MIN_RANGE, _TIMES_FLICKER * float(np.median(rest))) if rest.size > 1 else _LONE_RANGE
         if share[index] > limit:
             low, high = int(item.levels_dn.argmin()), int(item.levels_dn.argmax())
             raise BadFrame(
@@ -151,8 +151,8 @@ def _noisiest(flats: Sequence[Series], order: list[int]) -> tuple[int, bool]:
     regular = [float(flats[j].within_dn2.mean(where=~flats[j].suspect)) / (flats[j].frames - 1) for j in order]
     variance, se = np.array(regular), np.array(regular) * np.sqrt(2 / np.array(freedom))
     at = int(variance.argmax())
-    beyond, error = variance[at + 1 :], np.hypot(se[at], se[at + 1 :])
-    falls = (beyond < (1 - _MIN_FALL) * variance[at]) & (variance[at] - beyond > _MIN_SIGMAS * error)
+    brighter, error = variance[at + 1 :], np.hypot(se[at], se[at + 1 :])
+    falls = (brighter < (1 - _MIN_FALL) * variance[at]) & (variance[at] - brighter > _MIN_SIGMAS * error)
     return at, bool(falls.any())
 
 

@@ -348,11 +348,11 @@ def outlier(values: Array, min_excess: float, certain_excess: float) -> tuple[in
     from the scatter of the others, is below `MAX_CHANCE`.
     """
     largest = int(values.argmax())
-    others = np.delete(values, largest)
-    excess = float(values[largest] - others.mean())
+    rest = np.delete(values, largest)
+    excess = float(values[largest] - rest.mean())
     if excess > certain_excess:
         return largest, excess
-    if excess < min_excess or others.size < 2:
+    if excess < min_excess or rest.size < 2:
         return largest, 0.0
-    t = excess / max(float(others.std(ddof=1)) * np.sqrt(1 + 1 / others.size), 1e-12)
-    return largest, excess if stats.t.sf(t, others.size - 1) < MAX_CHANCE else 0.0
+    t = excess / max(float(rest.std(ddof=1)) * np.sqrt(1 + 1 / rest.size), 1e-12)
+    return largest, excess if stats.t.sf(t, rest.size - 1) < MAX_CHANCE else 0.0
