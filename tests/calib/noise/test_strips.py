@@ -10,7 +10,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from faintfield.calib.noise import Conditions, SeriesSums, calibrate
 from faintfield.calib.noise.strips import maps_by, release
-from tests.calib.noise.darkroom import dark_series, flat_series, specimen
+from tests.calib.noise.darkroom import specimen, with_flats
 
 SHAPE = (300, 400)
 
@@ -50,8 +50,7 @@ def test_maps_in_files_are_those_in_memory() -> None:
     for allocate in (np.empty, in_files):
         chip, rng = specimen(11, prnu=0.01, hot_fraction=0.003)
         with maps_by(allocate):
-            series = dark_series(chip, (0.1, 20.0), 6, rng)
-            series += [flat_series(chip, light, 6, rng, level=k) for k, light in enumerate((2000.0, 8000.0, 20000.0))]
+            series = with_flats(chip, rng, (2000.0, 8000.0, 20000.0), (0.1, 20.0), frames=6, dark_frames=6)
             release()
             results.append(calibrate(series, 65535.0))
             release()

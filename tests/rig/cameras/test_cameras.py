@@ -166,19 +166,14 @@ def test_micromanager_faults(demo: MicroManagerCamera, tmp_path: Path) -> None:
         MicroManagerCamera(MicroManagerSettings(configuration=str(broken))).open()
     with pytest.raises(CameraError, match=r"'Binning' of Camera cannot be 'seventeen'; choose from 1, 2, 4, 8$"):
         MicroManagerCamera(MicroManagerSettings(properties={"Binning": "seventeen"})).open()
+    with pytest.raises(CameraTimeout, match=r"within 1e-06 s; "):
+        MicroManagerCamera(MicroManagerSettings(answer_s=1e-6)).open()
     demo.open()
     core = demo._core  # noqa: SLF001 - there is no other way to pull the virtual cable
     core.unloadDevice("Camera")
     with pytest.raises(CameraError, match=r"failed at an exposure .*; check its cable"):
         demo.expose(0.01, 1)
     demo.close()
-
-
-@pytest.mark.deep
-def test_micromanager_timeout() -> None:
-    pytest.importorskip("pymmcore_plus", reason="pymmcore-plus is not installed here: its time-out is not tried")
-    with pytest.raises(CameraTimeout, match=r"within 1e-06 s; "):
-        MicroManagerCamera(MicroManagerSettings(answer_s=1e-6)).open()
 
 
 @pytest.mark.parametrize(

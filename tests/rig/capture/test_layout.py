@@ -18,8 +18,7 @@ from faintfield.rig.session.journal import Journal
 from faintfield.rig.session.session import taken_frames
 from faintfield.rig.session.verify import verify
 from faintfield.rig.simulation.lab import SimulatedCamera
-from tests.faults.capturing import FRAMES
-from tests.rig.capture.captures import Operator, assert_complete, capture
+from tests.faults.capturing import FRAMES, Operator, assert_complete, capture
 
 type Change = Callable[[Exposure], Exposure]
 

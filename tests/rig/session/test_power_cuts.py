@@ -26,7 +26,7 @@ from tests.faults.capturing import SMALL_RIG, capture_small
 
 
 class Disk:
-    """What is on disk below a folder, as far as it is flushed.
+    """Flushed content of the disk below a folder.
 
     Parameters
     ----------

@@ -13,7 +13,7 @@ from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.stages.drift import Drift, DriftWatch, recover
 from faintfield.rig.stages.gantry import Gantry
-from tests.rig.stages.benches import CONTROLLERS, Controller
+from tests.rig.stages.benches import CONTROLLERS, Controller, diagonal, firmware, keep_host_busy, on_homing
 
 
 def watched(bench: Bench, limit_mm: float = 0.5) -> tuple[Gantry, DriftWatch]:
@@ -31,7 +31,7 @@ def test_only_drift_beyond_the_limit_is_noticed(controller: Controller, axis: in
     assume(not 0.45 < abs(by_mm) < 0.55)
     bench = Bench(controller)
     stage, watch = watched(bench)
-    stage.move_to(*_middle(stage))
+    stage.move_to(*diagonal(stage, 200.0))
     watch.note("frame")
     bench.firmware.mechanics.axes[axis].slip_mm += by_mm
     if abs(by_mm) < 0.5:
@@ -71,27 +71,9 @@ def test_check_without_begin_is_refused(stage: Gantry) -> None:
     assert watch.unchecked == ("frame",)
 
 
-def on_homing(bench: Bench, act: Callable[[int], None]) -> None:
-    """Call `act` with the number of each homing from now on, as it begins."""
-    homings: list[bool] = []
-
-    def count(data: bytes) -> bytes:
-        if b"$H" in data or b"G28" in data:
-            homings.append(True)
-            act(len(homings))
-        return data
-
-    bench.wire.filters_to_controller.append(count)
-
-
 def delay_line(bench: Bench, for_s: float = 3.0) -> None:
     """Hold back answers for a while, from soon on."""
     bench.clock.after(0.3, lambda: bench.wire.hold_up(for_s))
-
-
-def keep_host_busy(bench: Bench, for_s: float = 3.0) -> None:
-    """Let the driver read nothing for a while, from soon on."""
-    bench.clock.after(0.3, lambda: setattr(bench, "host_busy_until_s", bench.clock.now_s() + for_s))
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)
@@ -104,7 +86,7 @@ def test_delay_in_timed_homing_falsifies_no_check(
     on_homing(bench, lambda homing: delay(bench) if homing == number else None)
     stage, watch = watched(bench)
     for drift_mm in (0.3, -0.3):
-        stage.move_to(*_middle(stage))
+        stage.move_to(*diagonal(stage, 200.0))
         bench.firmware.mechanics.axes[0].slip_mm += drift_mm
         watch.check()
     bench.firmware.mechanics.axes[0].slip_mm += 0.7
@@ -129,14 +111,14 @@ def test_busy_computer_is_no_drift(controller: Controller) -> None:
     bench = Bench(controller)
     stage, watch = watched(bench)
     watch.note("frame")
-    stage.move_to(*_middle(stage))
+    stage.move_to(*diagonal(stage, 200.0))
     on_homing(bench, lambda homing: keep_host_busy(bench) if homing == 1 else None)
     with pytest.raises(DriftUnknown, match=r"answers were delayed; 1 positions .* in doubt") as caught:
         watch.check()
     assert caught.value.suspect == watch.doubtful == ("frame",)
     assert stage.trusted
     watch.note("again")
-    stage.move_to(*_middle(stage))
+    stage.move_to(*diagonal(stage, 200.0))
     assert watch.check().passed
 
 
@@ -147,7 +129,7 @@ def test_no_delay_hides_a_drift(controller: Controller, drift_mm: float, late_s:
     bench = Bench(controller)
     stage, watch = watched(bench)
     watch.note("frame")
-    stage.move_to(*_middle(stage))
+    stage.move_to(*diagonal(stage, 200.0))
     bench.firmware.mechanics.axes[0].slip_mm += drift_mm
 
     def read_late(data: bytes) -> bytes:
@@ -185,8 +167,7 @@ def test_homing_time_independent_of_distance_is_refused(bench: Bench, unhomed: G
 def test_recovery_homes_only_when_agreed(bench: Bench) -> None:
     stage, watch = watched(bench)
     watch.note("frame")
-    assert isinstance(bench.firmware, SimulatedGrbl)
-    bench.firmware.alarm(3)
+    firmware(bench, SimulatedGrbl).alarm(3)
     with pytest.raises(StageAlarm):
         stage.position()
     before = bench.true_position()
@@ -207,8 +188,3 @@ def test_recovery_that_keeps_the_position_asks_nothing(bench: Bench) -> None:
         stage.position()
     recover(stage, lambda question: pytest.fail("asked"), watch)
     assert watch.unchecked == ("frame",)
-
-
-def _middle(stage: Gantry) -> tuple[float, float]:
-    travel = stage.travel()
-    return 0.5 * sum(travel.x_mm), 0.5 * sum(travel.y_mm)

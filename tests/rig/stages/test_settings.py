@@ -1,4 +1,4 @@
-"""What the settings of a controller mean, computed by hand from the firmware's documentation."""
+"""Meaning of the settings of a controller, computed by hand from the firmware's documentation."""
 
 import pytest
 
