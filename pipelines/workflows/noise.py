@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from faintfield.calib.noise.room import maps_by
+from faintfield.calib.noise.strips import maps_by
 from faintfield.pipelines.calibration.noise import calibrate_sensor, noise_maps, noise_record
 from faintfield.pipelines.calibration.noise_comparison import CHANCE, MapChange, NoiseComparison, compare_noise
 from faintfield.pipelines.console import inform, working

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from faintfield.calib.noise import calibrate
-from faintfield.calib.noise.fitting import NoiseLikelihood
-from faintfield.calib.noise.likelihood.exact import Bent, _flat_part, _Maximum
+from faintfield.calib.noise.fit.series_fit import NoiseLikelihood
+from faintfield.calib.noise.likelihood.exact import _flat_part, _Maximum
 from faintfield.calib.noise.likelihood.marginal import (
     DARK_LOG_WEIGHTS,
     DARK_NODES,
@@ -18,6 +18,7 @@ from faintfield.calib.noise.likelihood.marginal import (
     MarginalLikelihood,
     mass_function,
 )
+from faintfield.calib.noise.likelihood.maximum import Bend
 from faintfield.calib.noise.likelihood.moments import DarkMoments, FlatMoments, Moments
 from tests.calib.noise.darkroom import EXPOSURES_S, TRUTH, dark_series, expose, specimen
 from tests.calib.noise.likelihood.slopes import slopes
@@ -40,10 +41,10 @@ def brute_tail(u: NDArray[np.float64], charge: float, gain: float, read: float, 
 def test_mass_function_is_that_of_rounded_sums(gain: float, read: float, charge: float, exact: bool) -> None:
     u = np.arange(-200.0, 900.0) + 0.3
     masses = mass_function(u, 2.0, charge, exact=exact, spread=False)
-    table = masses(np.log([gain, read, charge / 2.0, 1.0]))
+    (log_mass, _), _ = masses(np.log([gain, read, charge / 2.0, 1.0]))
     expected = np.diff(brute_tail(np.append(u - 0.5, u[-1] + 0.5), charge, gain, read, exact=exact))
-    np.testing.assert_allclose(np.exp(table.log_mass[:, 0]), np.maximum(expected, 1e-14), rtol=1e-6, atol=1e-12)
-    assert np.exp(table.log_mass).sum() == pytest.approx(1, abs=1e-6)
+    np.testing.assert_allclose(np.exp(log_mass[:, 0]), np.maximum(expected, 1e-14), rtol=1e-6, atol=1e-12)
+    assert np.exp(log_mass).sum() == pytest.approx(1, abs=1e-6)
 
 
 @pytest.mark.parametrize("exact", [True, False])
@@ -51,11 +52,8 @@ def test_slopes_are_those_of_small_differences(exact: bool) -> None:
     u = np.linspace(-4, 40, 89)
     masses = mass_function(u, 3.0, 20.0, exact=exact, spread=True)
     at = np.array([np.log(2.0), np.log(0.6), np.log(2.0), 0.15])
-    table = masses(at)
-    for slope, difference, logarithm in (
-        (table.mass_slope, slopes(lambda x: masses(x).log_mass, at), table.log_mass),
-        (table.tail_slope, slopes(lambda x: masses(x).log_tail, at), table.log_tail),
-    ):
+    differences = slopes(lambda x: masses(x)[0], at)
+    for logarithm, slope, difference in zip(*masses(at), differences, strict=True):
         likely = logarithm > -14
         np.testing.assert_allclose(slope[:, likely], difference[likely].T, atol=1e-3)
         assert likely.mean() > 0.3
@@ -129,10 +127,10 @@ def test_covariance_passes_on_by_slopes_of_parameters() -> None:
 
 
 def test_likelihood_of_flats_has_slopes_and_information() -> None:
-    at, straight = np.array([np.log(2.0), np.log(1.4), np.log(0.2), 0.0, 100.0, np.log(3.0)]), Bent({}, np.eye(0))
+    at, straight = np.array([np.log(2.0), np.log(1.4), np.log(0.2), 0.0, 100.0, np.log(3.0)]), Bend({}, np.eye(0))
     frames, mean_dn, within_dn2 = np.array([4.0, 3.0]), np.array([2100.0, 9100.0]), np.array([9e6, 3e7])
-    evenness, no_darks = np.array([0.95, 0.9]), DarkMoments(*[np.zeros(0)] * 6)
-    flats = FlatMoments(frames, mean_dn, within_dn2, evenness)
+    evenness, no_darks = np.array([0.95, 0.9]), DarkMoments(*[np.zeros(0)] * 7)
+    flats = FlatMoments(frames, mean_dn, within_dn2, evenness, np.zeros(2))
     degrees = (frames - 1) * 1000.0 * evenness
 
     def by_hand(x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -30,14 +30,16 @@ DARKS = DarkMoments(
     within_dn2=np.array([41_000.0, 32_000.0, 60_000.0, 0.0]),
     level_scatter_dn2=np.array([0.6, 0.4, 1.1, 0.0]),
     scatter_dn2=_SCATTER.T @ _SCATTER,
+    rounding2=np.zeros(4),
 )
 FLATS = FlatMoments(
     frames=np.array([4.0, 3.0]),
     mean_dn=np.array([2100.0, 9100.0]),
     within_dn2=np.array([9e6, 3e7]),
     evenness=np.array([0.95, 0.9]),
+    rounding2=np.zeros(2),
 )
-NO_FLATS = FlatMoments(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0))
+NO_FLATS = FlatMoments(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0))
 
 HERE = {
     "offset_dn": 100.0, "log_read_dn2": np.log(8.0), "dsnu_dn2": 7.0, "jitter_dn2": 0.1,

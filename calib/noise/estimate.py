@@ -1,8 +1,8 @@
-"""Estimates with intervals from a value and its standard error."""
+"""A measured value with its standard error and interval, or the reason why there is none."""
+
+from dataclasses import dataclass
 
 import numpy as np
-
-from faintfield.calib.noise.result import Estimate
 
 _NO_SPREAD = "the values are not much likelier with a spread, so that none was fitted; record more darks"
 
@@ -11,6 +11,28 @@ _HIDDEN_SIGMA = 3.2
 
 # Largest exponent of an interval's end over its value; nothing beyond is of use.
 _MAX_EXPONENT = 50.0
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A measured value, or the reason why there is none.
+
+    Attributes
+    ----------
+    value : float, optional
+        None if the frames do not determine it.
+    se : float, optional
+        Standard error.
+    ci95 : tuple of float, optional
+        95 % confidence interval.
+    why : str, optional
+        Why there is no value, and what to record to get one.
+    """
+
+    value: float | None
+    se: float | None = None
+    ci95: tuple[float, float] | None = None
+    why: str | None = None
 
 
 def interval(value: float, se: float, quantile: float, *, positive: bool = False) -> Estimate:

@@ -9,34 +9,23 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
-from faintfield.calib.noise.likelihood.exact import Bent, fit_exact
+from faintfield.calib.noise.fit.scatter import fit_with_excess, without_odd
+from faintfield.calib.noise.likelihood.exact import censored_start, fit_exact, gaussian_start
 from faintfield.calib.noise.likelihood.gaussian import dark_variances_dn2, flat_variances_dn2
 from faintfield.calib.noise.likelihood.marginal import Counts
 from faintfield.calib.noise.likelihood.maximum import NoiseFit
 from faintfield.calib.noise.likelihood.moments import Moments, gather_moments
 from faintfield.calib.noise.likelihood.response import (
-    BENDS,
     MEASURED_BEND_SE,
     UNKNOWN_BEND_SE,
-    bend_range_dn,
     choose_bends,
 )
-from faintfield.calib.noise.likelihood.starts import censored_start, gaussian_start
-from faintfield.calib.noise.misfit.odd_light import without_odd
-from faintfield.calib.noise.misfit.scatter import fit_with_excess
 from faintfield.calib.noise.series.statistics import Series, any_suspect, sample_index
+from faintfield.calib.noise.strips import Mask
 
 # Read noise, in electrons and in DN, below which single electrons or the rounding shape the distribution of values.
 _MIN_GAUSSIAN_READ_E, _MIN_GAUSSIAN_READ_DN = 1.0, 0.5
-
-# Read noise in DN below which the Gaussian cannot tell the noise from the rounding, unless the
-# phases of the pixels average out.
-MIN_ROUNDED_READ_DN = 0.35
-
-# Largest error that rounding may make of the noise of a series of darks with so little read noise.
-_MAX_ROUNDING_ERROR = 0.05
 
 # Largest noise that pixels share, as a fraction of the read noise variance, for the exact likelihood; more blurs single
 # electrons.
@@ -48,6 +37,8 @@ _MAX_FRACTION_AT_FLOOR = 2e-3
 # Largest range of the values of a series, in DN; for wider tables of masses the Gaussian is good enough.
 MAX_TABLE_WIDTH_DN = 2000
 
+# Largest range that counts, over the brightest flat, since 16 bits may hold 12; no converter has fewer than 8.
+_RANGE_OVER_BRIGHTEST, _MIN_RANGE_DN = 2.0, 255.0
 
 # Largest scatter of the levels of flats about the response, as a fraction; a worse light tells nothing about it.
 MAX_LIGHT_ERROR = 0.05
@@ -87,7 +78,7 @@ class SeriesFit:
     likelihood: NoiseLikelihood
     fit: NoiseFit
     bend: NoiseFit | None
-    used: NDArray[np.bool_]
+    used: Mask
 
     @property
     def dark_noise_dn2(self) -> list[float]:
@@ -99,28 +90,9 @@ class SeriesFit:
         """Pixel noise of the flat series."""
         return flat_variances_dn2(self.fit.values, self.moments.flats.mean_dn)
 
-    @property
-    def light_unknown(self) -> bool:
-        """Return whether nothing but an allowance stands for the bend of the response."""
-        return self.moments.flats.bend_se == UNKNOWN_BEND_SE
-
-    @property
-    def rounding_hides_noise(self) -> bool:
-        """Return whether the read noise is too small for the Gaussian, and the drift too large for the values."""
-        rounding2 = self.moments.darks.rounding2
-        if self.likelihood is not NoiseLikelihood.GAUSSIAN or rounding2 is None:
-            return False
-        read_dn = float(np.exp(0.5 * self.fit.values["log_read_dn2"]))
-        return read_dn < MIN_ROUNDED_READ_DN and float(rounding2.max()) > _MAX_ROUNDING_ERROR**2
-
-    @property
-    def profiles_dn2(self) -> float:
-        """Variance that the fixed patterns of rows and columns add to the offsets of the pixels."""
-        return float(self.darks[0].row_dn.var() + self.darks[0].column_dn.var())
-
 
 def fit_series(
-    darks: Sequence[Series], flats: Sequence[Series], usable: NDArray[np.bool_], saturation_dn: float = np.inf
+    darks: Sequence[Series], flats: Sequence[Series], usable: Mask, saturation_dn: float = np.inf
 ) -> SeriesFit:
     """Fit with the simplest likelihood that the frames allow.
 
@@ -152,21 +124,21 @@ def fit_series(
         start = gaussian_start(fit) if exact else censored_start(counts)
         # The Gaussian fit tells whether pixels differ in dark current, unless values are cut off.
         spread = not exact or fit.values.get("dcnu_dn2_per_s2", 0.0) > 3 * fit.standard_error("dcnu_dn2_per_s2")
-        fit = fit_exact(counts, start, moments, bent_by(gaussian), exact=exact, try_spread=spread)
+        fit = fit_exact(counts, start, moments, gaussian.bend, exact=exact, try_spread=spread)
         if exact:
-            fit = grown_like(gaussian, fit)
+            # The scatter between series grows these errors by the same factors.
+            pairs = zip(gaussian.values, np.diag(gaussian.plain_covariance), np.diag(gaussian.covariance), strict=True)
+            factor = {name: max(after / before, 1.0) if before > 0 else 1.0 for name, before, after in pairs}
+            grow = np.sqrt([factor.get(name, 1.0) for name in fit.values])
+            fit = replace(fit, covariance=fit.covariance * np.outer(grow, grow))
     if flats or likelihood is NoiseLikelihood.GAUSSIAN:
-        rounding2 = moments.darks.rounding2
-        fit = with_rounding(fit, 0.0 if rounding2 is None else float(np.sqrt(rounding2.max())))
+        # What rounding may make of the noise of all darks, it makes of the gain, too.
+        at = list(fit.values).index("log_read_dn2")
+        concerns = np.array([name in ("log_read_dn2", "log_gain") for name in fit.values])
+        follows = np.where(concerns, fit.covariance[at] / fit.covariance[at, at], 0.0)
+        error = float(np.sqrt(moments.darks.rounding2.max()))
+        fit = replace(fit, covariance=fit.covariance + error**2 * np.outer(follows, follows))
     return SeriesFit(darks, flats, moments, likelihood, fit, bend, used)
-
-
-def with_rounding(fit: NoiseFit, error: float) -> NoiseFit:
-    """Return a fit with the relative error that rounding may make of the noise of all darks, and so of the gain."""
-    at = list(fit.values).index("log_read_dn2")
-    concerns = np.array([name in ("log_read_dn2", "log_gain") for name in fit.values])
-    follows = np.where(concerns, fit.covariance[at] / fit.covariance[at, at], 0.0)
-    return replace(fit, covariance=fit.covariance + error**2 * np.outer(follows, follows))
 
 
 def _fit_gaussian(
@@ -182,7 +154,8 @@ def _fit_gaussian(
         return fit, None, moments
     offset_dn = float(moments.darks.mean_dn.min())
     signal = moments.flats.mean_dn - offset_dn
-    range_dn = bend_range_dn(float(signal.max()), saturation_dn - offset_dn)
+    # The end of the range, near the brightest flat at most.
+    range_dn = min(saturation_dn - offset_dn, max(_RANGE_OVER_BRIGHTEST * float(signal.max()), _MIN_RANGE_DN))
     light = moments.flats.light
     chance = moments.flats.within_dn2 / np.maximum(moments.flats.frames - 1, 1) / moments.freedom
     level_dn2 = (chance / moments.pixels + moments.darks.level_scatter_dn2.mean()) / moments.flats.frames
@@ -206,23 +179,7 @@ def _fit_gaussian(
     return fit, free, grown
 
 
-def grown_like(gaussian: NoiseFit, fit: NoiseFit) -> NoiseFit:
-    """Return a fit of single values, its errors grown by the factors by which scatter grows those of the Gaussian."""
-    before, after = np.diag(gaussian.plain_covariance), np.diag(gaussian.covariance)
-    known = list(gaussian.values)
-    factor = {name: max(after[i] / before[i], 1.0) if before[i] > 0 else 1.0 for i, name in enumerate(known)}
-    grow = np.sqrt([factor.get(name, 1.0) for name in fit.values])
-    return replace(fit, covariance=fit.covariance * np.outer(grow, grow))
-
-
-def bent_by(gaussian: NoiseFit) -> Bent:
-    """Return the bend of the response in a Gaussian fit."""
-    at = [index for index, name in enumerate(gaussian.values) if name in BENDS]
-    values = {name: gaussian.values[name] for name in gaussian.values if name in BENDS}
-    return Bent(values, gaussian.covariance[np.ix_(at, at)])
-
-
-def collect_counts(darks: Sequence[Series], used: NDArray[np.bool_]) -> Counts:
+def collect_counts(darks: Sequence[Series], used: Mask) -> Counts:
     """Return the sampled values of the pixels in use, with their floor if they are cut off."""
     keep = used.ravel()[sample_index(used.shape)]
     values = tuple(series.sample_dn[:, keep] for series in darks)

@@ -7,26 +7,29 @@ known to 10 %, the dark current if its error does not matter in comparison with 
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
+from faintfield.calib.noise.emva.light_estimates import light_estimates, quantum_efficiency, why_noise_denies
 from faintfield.calib.noise.emva.nonuniformity import nonuniformity, temporal_noise
-from faintfield.calib.noise.fitting import MIN_ROUNDED_READ_DN, SeriesFit
-from faintfield.calib.noise.intervals import interval, root
-from faintfield.calib.noise.light_estimates import of_light, why_noise_denies
+from faintfield.calib.noise.estimate import Estimate, interval, root
+from faintfield.calib.noise.fit.series_fit import NoiseLikelihood, SeriesFit
 from faintfield.calib.noise.likelihood.gaussian import dark_variances_dn2, main_quantities
 from faintfield.calib.noise.likelihood.maximum import NoiseFit
 from faintfield.calib.noise.likelihood.moments import Moments
 from faintfield.calib.noise.likelihood.response import charge_dn
 from faintfield.calib.noise.maps.photo_response import Response
-from faintfield.calib.noise.maps.pixels import quantum_efficiency
-from faintfield.calib.noise.result import Estimate
-from faintfield.calib.noise.series.saturation import Saturation
-from faintfield.calib.noise.series.statistics import Series
-from faintfield.calib.noise.strips import map_of
+from faintfield.calib.noise.series.flats import Saturation
+from faintfield.calib.noise.strips import Array, map_of
 
 # Largest relative standard error of the gain, without which no quantity in electrons has a value.
 MAX_RELATIVE_SE = 0.1
+
+# Read noise in DN below which the Gaussian cannot tell the noise from the rounding, unless the phases of the
+# pixels average out.
+_MIN_ROUNDED_READ_DN = 0.35
+
+# Largest error that rounding may make of the noise of a series of darks with so little read noise.
+_MAX_ROUNDING_ERROR = 0.05
 
 _FLATS_REMEDY = "record at least 2 flats at half of saturation, or darks long enough for tens of dark electrons"
 _ONE_EXPOSURE = "all darks have one exposure; record darks of at least 2 exposures, better 4 up to 60 s"
@@ -40,7 +43,7 @@ _NO_FLATS = "there are no flats; record at least 2, evenly lit, at half of satur
 
 def estimate_all(
     fitted: SeriesFit, response: Response | None, saturation: Saturation, *, levels_hold: bool, noise_holds: bool
-) -> tuple[dict[str, Estimate], tuple[tuple[str, ...], NDArray[np.float64]]]:
+) -> tuple[dict[str, Estimate], tuple[tuple[str, ...], Array]]:
     """Return all quantities, and the covariance of offset, gain, read noise and dark current.
 
     Parameters
@@ -50,35 +53,35 @@ def estimate_all(
     response : Response, optional
         Photo response; None without flats.
     saturation : Saturation
-        Where the sensor saturates.
+        Saturation of the sensor.
     levels_hold, noise_holds : bool
         The dark levels lie on a straight line over exposure time; the noise of all series follows eq. (1).
     """
-    fit = fitted.fit
-    quantile, levels_quantile = float(stats.norm.ppf(0.975)), _levels_quantile(fit, fitted.moments)
+    fit, moments = fitted.fit, fitted.moments
+    quantile, levels_quantile = float(stats.norm.ppf(0.975)), _levels_quantile(fit, moments)
+    why_rounded = _why_rounded(fitted)
+    holds = levels_hold and noise_holds
     why_no_gain = (
-        _why_rounded(fitted)
-        or why_noise_denies(fitted)
-        or _why_no_gain(fit, fitted.moments, from_darks=not fitted.flats, holds=levels_hold and noise_holds)
+        why_rounded or why_noise_denies(fitted) or _why_no_gain(fit, moments, from_darks=not fitted.flats, holds=holds)
     )
-    why_no_current = _why_no_current(fit, fitted.moments, why_no_gain, levels_quantile, levels_hold=levels_hold)
-    whys = {
-        "offset_dn": None,
-        "gain_dn_per_e": why_no_gain,
-        "read_noise_e": why_no_gain,
-        "dark_current_e_per_s": why_no_current,
-    }
+    whys = {"offset_dn": None, "gain_dn_per_e": why_no_gain, "read_noise_e": why_no_gain}
+    whys["dark_current_e_per_s"] = _why_no_current(fit, moments, why_no_gain, levels_quantile, levels_hold=levels_hold)
     estimates, covariance = _in_electrons(fit, whys, quantile if fitted.flats else levels_quantile, levels_quantile)
     gain = estimates["gain_dn_per_e"]
-    estimates |= _in_dn(fitted, quantile, levels_quantile) | _spreads(fitted, gain, quantile)
-    estimates |= _shared_noise(fitted, quantile) | _profiles(fitted)
-    estimates |= _from_flats(fitted, gain, response, quantile)
-    return estimates | of_light(fitted, saturation, gain, estimates["quantum_efficiency"]), covariance
+    estimates |= _in_dn(fit, quantile, levels_quantile) | _spreads(fitted, gain, quantile)
+    if why_rounded is not None:
+        estimates |= dict.fromkeys(("read_noise_dn", "dsnu_dn"), Estimate(None, why=why_rounded))
+    # The fixed patterns of rows and columns: EMVA 1288's DSNU.row and DSNU.col.
+    dark, used = max(fitted.darks, key=lambda dark: dark.frames), fitted.used
+    spreads = nonuniformity(map_of(dark.mean_of, used.shape, np.float64), used, temporal_noise(dark, used))
+    estimates |= {"dsnu_row_dn": spreads.row, "dsnu_column_dn": spreads.column}
+    estimates |= _shared_noise(fitted, quantile) | _from_flats(fitted, gain, response, quantile)
+    return estimates | light_estimates(fitted, saturation, gain, estimates["quantum_efficiency"]), covariance
 
 
 def _in_electrons(
     fit: NoiseFit, whys: dict[str, str | None], gain_quantile: float, levels_quantile: float
-) -> tuple[dict[str, Estimate], tuple[tuple[str, ...], NDArray[np.float64]]]:
+) -> tuple[dict[str, Estimate], tuple[tuple[str, ...], Array]]:
     """Return the four main quantities, and the covariance of those without a reason against them."""
     quantities = main_quantities(fit.values)
     known = tuple(name for name, why in whys.items() if why is None)
@@ -105,7 +108,6 @@ def _levels_quantile(fit: NoiseFit, moments: Moments) -> float:
 
 
 def _why_no_gain(fit: NoiseFit, moments: Moments, *, from_darks: bool, holds: bool) -> str | None:
-    """Return why the frames do not determine gain and read noise in electrons, None if they do."""
     if "log_gain" not in fit.values:
         return f"{_why_no_growth(moments)}, or flats"
     relative = fit.standard_error("log_gain")
@@ -121,26 +123,24 @@ def _why_no_gain(fit: NoiseFit, moments: Moments, *, from_darks: bool, holds: bo
 
 
 def _why_rounded(fitted: SeriesFit) -> str | None:
-    """Return why rounding to whole DN hides the noise of the darks, None if it does not."""
-    if not fitted.rounding_hides_noise:
+    read_dn, rounding2 = float(np.exp(0.5 * fitted.fit.values["log_read_dn2"])), fitted.moments.darks.rounding2
+    shown = read_dn >= _MIN_ROUNDED_READ_DN or float(rounding2.max()) <= _MAX_ROUNDING_ERROR**2
+    if shown or fitted.likelihood is not NoiseLikelihood.GAUSSIAN:
         return None
-    read_dn = float(np.exp(0.5 * fitted.fit.values["log_read_dn2"]))
     return (
-        f"the read noise is about {read_dn:.2g} DN (limit {MIN_ROUNDED_READ_DN:g} DN), so little that rounding to "
+        f"the read noise is about {read_dn:.2g} DN (limit {_MIN_ROUNDED_READ_DN:g} DN), so little that rounding to "
         "whole DN hides it, and the level of the darks moves too much for the likelihood of whole values; record at a "
         "higher gain or with more bits, the camera settled"
     )
 
 
 def _why_no_growth(moments: Moments) -> str:
-    """Return why the darks do not determine the growth of noise and pattern with exposure time."""
     return _ONE_EXPOSURE if np.unique(moments.darks.exposure_s).size < 2 else _ONE_REPEATED
 
 
 def _why_no_current(
     fit: NoiseFit, moments: Moments, why_no_gain: str | None, quantile: float, *, levels_hold: bool
 ) -> str | None:
-    """Return why the frames do not determine the dark current, None if they do."""
     if "dark_signal_dn_per_s" not in fit.values:
         return _ONE_EXPOSURE
     if why_no_gain is not None:
@@ -167,35 +167,25 @@ def _why_no_current(
     return None
 
 
-def _in_dn(fitted: SeriesFit, quantile: float, levels_quantile: float) -> dict[str, Estimate]:
-    """Return the quantities that need no gain."""
-    fit = fitted.fit
+def _in_dn(fit: NoiseFit, quantile: float, levels_quantile: float) -> dict[str, Estimate]:
     read_dn = float(np.exp(0.5 * fit.values["log_read_dn2"]))
-    half = max(quantile, fit.quantile(_unit(fit, "log_read_dn2")))
-    read = interval(read_dn, 0.5 * read_dn * fit.standard_error("log_read_dn2"), half, positive=True)
-    if (why := _why_rounded(fitted)) is not None:
-        read = Estimate(None, why=why)
+    half, se = max(quantile, fit.quantile_of("log_read_dn2")), 0.5 * read_dn * fit.standard_error("log_read_dn2")
     signal = Estimate(None, why=_ONE_EXPOSURE)
     if "dark_signal_dn_per_s" in fit.values:
-        se = fit.standard_error("dark_signal_dn_per_s")
-        half = max(levels_quantile, fit.quantile(_unit(fit, "dark_signal_dn_per_s")))
-        signal = interval(fit.values["dark_signal_dn_per_s"], se, half)
-    return {"read_noise_dn": read, "dark_signal_dn_per_s": signal}
+        signal = _parameter(fit, "dark_signal_dn_per_s", levels_quantile)
+    return {"read_noise_dn": interval(read_dn, se, half, positive=True), "dark_signal_dn_per_s": signal}
 
 
-def _unit(fit: NoiseFit, name: str) -> NDArray[np.float64]:
-    """Return the gradient of one parameter."""
-    return np.array([1.0 if parameter == name else 0.0 for parameter in fit.values])
+def _parameter(fit: NoiseFit, name: str, quantile: float) -> Estimate:
+    return interval(fit.values[name], fit.standard_error(name), max(quantile, fit.quantile_of(name)))
 
 
 def _spreads(fitted: SeriesFit, gain: Estimate, quantile: float) -> dict[str, Estimate]:
-    """Return the spreads over the pixels: DSNU and DCNU."""
     fit = fitted.fit
     dsnu2, se = fit.values["dsnu_dn2"], fit.standard_error("dsnu_dn2")
-    why = _why_rounded(fitted)
-    spreads = {"dsnu_dn": root(dsnu2, se, quantile) if why is None else Estimate(None, why=why)}
+    spreads = {"dsnu_dn": root(dsnu2, se, quantile)}
     if gain.value is None:
-        return spreads | {name: Estimate(None, why=gain.why) for name in ("dsnu_e", "dcnu_e_per_s")}
+        return spreads | dict.fromkeys(("dsnu_e", "dcnu_e_per_s"), Estimate(None, why=gain.why))
     spreads["dsnu_e"] = root(dsnu2, se, quantile, 1 / gain.value)
     spreads["dcnu_e_per_s"] = Estimate(None, why=_why_no_growth(fitted.moments))
     if (dcnu2 := fit.values.get("dcnu_dn2_per_s2")) is not None:
@@ -204,7 +194,6 @@ def _spreads(fitted: SeriesFit, gain: Estimate, quantile: float) -> dict[str, Es
 
 
 def _shared_noise(fitted: SeriesFit, quantile: float) -> dict[str, Estimate]:
-    """Return the noise that all pixels of a frame, a row or a column share."""
     fit, darks, pixels = fitted.fit, fitted.darks, fitted.moments.pixels
     if "jitter_dn2" not in fit.values:
         unknown = Estimate(None, why="the likelihood of single values has no part for it; it needs Gaussian darks")
@@ -228,42 +217,24 @@ def _shared_noise(fitted: SeriesFit, quantile: float) -> dict[str, Estimate]:
     }
 
 
-def _profiles(fitted: SeriesFit) -> dict[str, Estimate]:
-    """Return the fixed patterns of rows and columns: EMVA 1288's DSNU.row and DSNU.col, in DN."""
-    dark = max(fitted.darks, key=lambda dark: dark.frames)
-    parts = nonuniformity(
-        map_of(dark.mean_of, fitted.used.shape, np.float64), fitted.used, temporal_noise(dark, fitted.used)
-    )
-    return {"dsnu_row_dn": parts.row, "dsnu_column_dn": parts.column}
-
-
 def _from_flats(fitted: SeriesFit, gain: Estimate, response: Response | None, quantile: float) -> dict[str, Estimate]:
-    """Return the quantities that only flats determine."""
-    prnu = Estimate(None, why=_NO_FLATS)
-    if response is not None:
-        prnu = response.prnu_estimate(quantile)
+    prnu = Estimate(None, why=_NO_FLATS) if response is None else response.prnu_estimate(quantile)
     nonlinearity = Estimate(None, why="flats of at least 3 light levels are needed")
-    if (bend := fitted.bend) is not None:
-        se = bend.standard_error("nonlinearity_per_dn")
-        half = max(quantile, bend.quantile(_unit(bend, "nonlinearity_per_dn")))
-        nonlinearity = interval(bend.values["nonlinearity_per_dn"], se, half)
+    if fitted.bend is not None:
+        nonlinearity = _parameter(fitted.bend, "nonlinearity_per_dn", quantile)
     efficiency = Estimate(None, why=_NO_PHOTONS)
     if gain.value is not None:
-        odd = {index for index, _ in fitted.moments.flats.light.odd}
-        means_dn = fitted.moments.flats.mean_dn
-        even = [(flat, mean) for j, (flat, mean) in enumerate(zip(fitted.flats, means_dn, strict=True)) if j not in odd]
-        charges = [_light_e(fitted.fit, flat, mean) for flat, mean in even]
-        found = quantum_efficiency([flat for flat, _ in even], charges, fitted.fit.standard_error("log_gain"))
-        if found is not None:
-            efficiency = interval(*found, quantile, positive=True)
+        values, light = fitted.fit.values, fitted.moments.flats.light
+        pairs = []
+        for index, flat in enumerate(fitted.flats):
+            charge = charge_dn(values, fitted.moments.flats.mean_dn[index] - values["offset_dn"])
+            dark_dn = values.get("dark_signal_dn_per_s", 0.0) * flat.conditions.dark_time_s
+            if flat.conditions.photons and index not in {odd for odd, _ in light.odd}:
+                pairs.append((flat.conditions.photons, float((charge - dark_dn) / np.exp(values["log_gain"]))))
+        if pairs:
+            photons, charges_e = np.array(pairs).T
+            slope = quantum_efficiency(photons, charges_e, fitted.fit.standard_error("log_gain"))
+            efficiency = interval(*slope, quantile, positive=True)
     elif fitted.flats:
         efficiency = Estimate(None, why=gain.why)
     return {"prnu": prnu, "nonlinearity_per_dn": nonlinearity, "quantum_efficiency": efficiency}
-
-
-def _light_e(fit: NoiseFit, flat: Series, mean_dn: float) -> float:
-    """Return the electrons per pixel from light in a flat series."""
-    values = fit.values
-    charge = charge_dn(values, mean_dn - values["offset_dn"])
-    dark_dn = values.get("dark_signal_dn_per_s", 0.0) * flat.conditions.dark_time_s
-    return float((charge - dark_dn) / np.exp(values["log_gain"]))

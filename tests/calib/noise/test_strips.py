@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import DTypeLike, NDArray
 
 from faintfield.calib.noise import Conditions, SeriesSums, calibrate
-from faintfield.calib.noise.room import maps_by, release
+from faintfield.calib.noise.strips import maps_by, release
 from tests.calib.noise.darkroom import specimen, with_flats
 
 SHAPE = (300, 400)
