@@ -87,7 +87,8 @@ class StageWorkspace(Struct, frozen=True):
         for point in path:
             if not self.travel_mm.holds(point, _ROUNDING_MM):
                 raise OutsideTravel(
-                    f"position {point} is outside the travel {self.travel_mm}; choose one inside, or move the grid's origin"
+                    f"position {point} is outside the travel {self.travel_mm}; choose one inside, or move the "
+                    "grid's origin"
                 )
         for start, end in pairwise(path):
             for box in self.keep_out:

@@ -107,7 +107,7 @@ def find_saturation(darks: Sequence[Series], flats: Sequence[Series], saturation
     # From dim to bright; a lone frame shows no noise.
     order = [j for j in np.argsort([flat.levels_dn.mean() for flat in flats]).tolist() if flats[j].frames > 1]
     noisiest, falls = _noisiest(flats, order)
-    if falls and clipped[noisiest:].max(initial=0.0) <= _MAX_CLIPPED_SHARE:
+    if falls and clipped[order[noisiest:]].max(initial=0.0) <= _MAX_CLIPPED_SHARE:
         saturation = _full_well(darks, flats, order, noisiest)
     else:
         saturation = _converter_end(flats, clipped, ceiling)

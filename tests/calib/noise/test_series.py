@@ -140,11 +140,14 @@ WELL_E = [500.0, 1000.0, 2000.0, 3000.0, 4000.0, 4500.0, 5000.0, 5500.0, 6000.0]
 
 def test_levels_at_the_converters_end_are_dropped() -> None:
     """A charge of 7600 e lies 5 standard deviations below the end, which nobody states, and 8020 e one."""
-    saturation = find_saturation(DARKS, flats_of([1000.0, 4000.0, 7600.0, 8020.0, 8300.0, 9000.0]), np.inf)
+    flats = flats_of([1000.0, 4000.0, 7600.0, 8020.0, 8300.0, 9000.0])
+    saturation = find_saturation(DARKS, flats, np.inf)
     assert (saturation.limit, saturation.level_dn) == ("ADC", 4095.0)
     assert levels(saturation.kept) == [0, 1, 2]
     assert levels(series for series, _ in saturation.left_out) == [3, 4, 5]
     assert "stand at 4095 DN, the end of the range" in saturation.left_out[0][1]
+    brightest_first = find_saturation(DARKS, [*flats[4:], *flats[:3]], np.inf)
+    assert (brightest_first.limit, levels(brightest_first.kept)) == ("ADC", [0, 1, 2])
 
 
 def test_full_well_shows_in_falling_noise() -> None:
