@@ -102,15 +102,17 @@ def plan(
     rose_k
         Standard deviations by which a visible feature stands out of its surroundings (Rose's criterion).
     """
+    from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE
+    from faintfield.pipelines.formats.results.noise import NOISE_FILE
     from faintfield.pipelines.formats.rig_file import read_rig
-    from faintfield.pipelines.planning.known import StatedNoise, known_lens, known_pace, known_sensor
+    from faintfield.pipelines.planning.known import StatedNoise, calibration_file, known_lens, known_pace, known_sensor
     from faintfield.pipelines.planning.light import GivenLight
     from faintfield.pipelines.planning.predict import Predictor, Question, grids_of, scene_view
 
     settings = read_rig(rig)
     stated = StatedNoise(read_noise_e, dark_current_e_per_s, quantum_efficiency)
-    sensor = known_sensor(settings, rig, noise, stated)
-    lens = known_lens(settings, rig, sensor, geometry, fx_px)
+    sensor = known_sensor(settings, calibration_file(noise, NOISE_FILE, rig.parent), stated)
+    lens = known_lens(settings, sensor, calibration_file(geometry, GEOMETRY_FILE, rig.parent), fx_px)
     exposures_s = [1e-3 * exposure_ms for exposure_ms in exposures_ms or []]
     exposure_s, view = scene_view(settings, exposures_s)
     frame_exposure_s = None if frame_exposure_ms is None else 1e-3 * frame_exposure_ms

@@ -9,8 +9,9 @@ import asyncio
 import secrets
 import socket
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from importlib.resources import files
 from json import dumps
 from typing import Any
@@ -56,24 +57,22 @@ _HEADERS = {
 
 
 class _PressRequest(msgspec.Struct, forbid_unknown_fields=True):
-    """Message from the page when a button is pressed."""
-
     word: str
     prompt: int | None = None
 
 
 @contextmanager
 def serve_page(
-    panel: CapturePanel, taken: TakenFrames | None = None, planes: PlanesClient | None = None
+    panel: CapturePanel, frames: TakenFrames | None = None, planes: PlanesClient | None = None
 ) -> Iterator[str]:
     """Serve the page of a capture while the block runs; yield its address, which no log records.
 
     Parameters
     ----------
     panel : CapturePanel
-        What the capture asks and shows.
-    taken : TakenFrames, optional
-        The frames of its session, shown when a node is clicked.
+        Prompts and state of the capture.
+    frames : TakenFrames, optional
+        Frames of its session, shown when a node is clicked.
     planes : PlanesClient, optional
         Its live planes.
     """
@@ -82,7 +81,7 @@ def serve_page(
     listener = socket.create_server((_HOST, 0))
     server = uvicorn.Server(
         uvicorn.Config(
-            _Door(_pages(panel, taken, planes), token),
+            _TokenMiddleware(_pages(panel, frames, planes), token),
             http=_BoundedConnection,
             h11_max_incomplete_event_size=_MAX_HEADER_BYTES,
             backlog=_MAX_ARRIVALS,
@@ -107,7 +106,7 @@ def serve_page(
 
 
 def _run(server: uvicorn.Server, listener: socket.socket) -> None:
-    """Run the server; its failure is told, and does not end the capture."""
+    """Run the server; its failure is printed, and does not end the capture."""
 
     async def serve() -> None:
         # What fails in a connection concerns nobody else, and asyncio would print its traceback
@@ -142,7 +141,7 @@ class _BoundedConnection(H11Protocol):
         super().connection_lost(exc)
 
 
-class _Door:
+class _TokenMiddleware:
     """Passes a request on if it gives the token, and comes from this page; tells others nothing.
 
     Attributes
@@ -175,8 +174,8 @@ def _is_own(headers: Headers) -> bool:
     return host.partition(":")[0] == _HOST and headers.get("origin") in (None, f"http://{host}")
 
 
-def _pages(panel: CapturePanel, taken: TakenFrames | None, planes: PlanesClient | None) -> Router:
-    """Return what is served behind the token."""
+def _pages(panel: CapturePanel, frames: TakenFrames | None, planes: PlanesClient | None) -> Router:
+    """Return the addresses behind the token."""
     html = files("faintfield.pipelines.live").joinpath("capture.html").read_text(encoding="utf-8")
 
     async def index(_: Request) -> Response:
@@ -199,11 +198,10 @@ def _pages(panel: CapturePanel, taken: TakenFrames | None, planes: PlanesClient 
 
     async def node(request: Request) -> Response:
         status, row, column = panel.status, request.path_params["row"], request.path_params["column"]
-        if taken is None or status is None:
+        if frames is None or status is None:
             return Response(status_code=404)
-        return Response(
-            dumps(msgspec.to_builtins(taken.at(status.step - 1, (row, column)))), media_type="application/json"
-        )
+        content = msgspec.to_builtins(frames.at(status.step - 1, (row, column)))
+        return Response(dumps(content), media_type="application/json")
 
     async def press(request: Request) -> Response:
         try:
@@ -240,21 +238,8 @@ async def _body(request: Request) -> bytes:
     return body
 
 
-def _kept[T](make: Callable[[ShownFrame], T]) -> Callable[[ShownFrame], T]:
-    """Let `make` keep what it made of the last frame: the page asks several times a second."""
-    last: tuple[ShownFrame, T] | None = None
-
-    def make_once(shown: ShownFrame) -> T:
-        nonlocal last
-        present = last
-        if present is None or present[0] is not shown:
-            present = last = (shown, make(shown))
-        return present[1]
-
-    return make_once
-
-
-@_kept
+# Picture and numbers of the last frame are kept: the page asks for them several times a second.
+@lru_cache(maxsize=1)
 def _png(shown: ShownFrame) -> bytes:
     """Return the picture of a frame in red, as a PNG file."""
     grey = display_levels(shown.pixels, _PICTURE_PX)
@@ -262,7 +247,7 @@ def _png(shown: ShownFrame) -> bytes:
     return encoded(np.dstack([grey, zero, zero]), ".png")
 
 
-@_kept
+@lru_cache(maxsize=1)
 def _frame(shown: ShownFrame) -> dict[str, Any]:
     """Return name, values and histogram of a frame as a JSON object."""
     counts, edges = np.histogram(shown.pixels, bins=_HISTOGRAM_BINS)
@@ -276,17 +261,16 @@ def _frame(shown: ShownFrame) -> dict[str, Any]:
 
 def _planes(planes: PlanesClient) -> dict[str, Any]:
     """Return the state of live planes as a JSON object."""
-    status = planes.status()
     return {
-        "ended": planes.ended(),
-        "offered": planes.offered(),
+        "ended": planes.failure(),
+        "offered": planes.frame_count(),
         "silence_s": round(planes.silence_s()),
-        "status": None if status is None else msgspec.to_builtins(status),
+        "status": msgspec.to_builtins(planes.status),
     }
 
 
 def _state(panel: CapturePanel) -> dict[str, Any]:
-    """Return what the page shows, except the picture, as a JSON object."""
+    """Return the content of the page, except the picture, as a JSON object."""
     asked, status, shown = panel.asked, panel.status, panel.shown
     words = REQUESTS if asked is None else asked.prompt.answers
     return {

@@ -7,7 +7,7 @@ queue; keys, clicks and Ctrl-C all write to it.
 import itertools
 from collections.abc import Callable, Mapping
 from queue import Empty, SimpleQueue
-from typing import NamedTuple, get_args
+from typing import get_args
 
 from msgspec import Struct
 
@@ -18,13 +18,6 @@ from faintfield.rig.plan import PlannedFrame
 REQUESTS: tuple[OperatorRequest, ...] = get_args(OperatorRequest.__value__)
 
 
-class ButtonPress(NamedTuple):
-    """A pressed button or key: its word, and the number of the prompt that it answers, if any."""
-
-    word: str
-    prompt: int | None
-
-
 class OpenPrompt(Struct, frozen=True):
     """A prompt that waits for its answer; `number` distinguishes it from earlier ones."""
 
@@ -32,8 +25,8 @@ class OpenPrompt(Struct, frozen=True):
     prompt: Prompt
 
 
-class ShownFrame(Struct, frozen=True):
-    """The frame on display, with its measured values by name."""
+class ShownFrame(Struct, frozen=True, eq=False):
+    """The frame on display, with its measured values by name; each is equal to itself alone."""
 
     frame: PlannedFrame
     pixels: Pixels
@@ -62,12 +55,13 @@ class CapturePanel:
         self.shown: ShownFrame | None = None
         self.on_change: list[Callable[[], None]] = []
         self.unattended = unattended
-        self._pressed: SimpleQueue[ButtonPress] = SimpleQueue()
+        # The word of each button or key, and the number of the prompt that it answers, if any
+        self._pressed: SimpleQueue[tuple[str, int | None]] = SimpleQueue()
         self._numbers = itertools.count(1)
 
     def press(self, word: str, prompt: int | None = None) -> None:
         """Press a button, from any thread or a signal handler."""
-        self._pressed.put(ButtonPress(word, prompt))
+        self._pressed.put((word, prompt))
 
     def ask(self, prompt: Prompt) -> Answer:
         """Show `prompt` and return the first answer to it."""
@@ -76,22 +70,22 @@ class CapturePanel:
         self.asked = OpenPrompt(next(self._numbers), prompt)
         self._changed()
         while True:
-            pressed = self._pressed.get()
-            if pressed.word in prompt.answers and pressed.prompt in (None, self.asked.number):
+            word, number = self._pressed.get()
+            if word in prompt.answers and number in (None, self.asked.number):
                 self.asked = None
                 self._changed()
-                return pressed.word
+                return word
 
     def take_request(self) -> OperatorRequest | None:
         """Return the latest request since the last call, None if there is none."""
         latest: OperatorRequest | None = None
         while True:
             try:
-                pressed = self._pressed.get_nowait()
+                word, number = self._pressed.get_nowait()
             except Empty:
                 return latest
-            if pressed.word in REQUESTS and pressed.prompt is None:
-                latest = pressed.word
+            if word in REQUESTS and number is None:
+                latest = word
 
     def show_status(self, status: Status) -> None:
         """Show the state of the capture."""
@@ -104,6 +98,5 @@ class CapturePanel:
         self._changed()
 
     def _changed(self) -> None:
-        """Inform the views."""
         for callback in self.on_change:
             callback()

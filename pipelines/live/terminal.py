@@ -94,9 +94,8 @@ def prompt_lines(prompt: Prompt) -> list[str]:
     return ["", prompt.title, *(f"  {line}" for line in (*prompt.lines, answers))]
 
 
-def _key_line(words: Iterable[str], gap: str) -> str:
-    """Return each key with its label."""
-    return gap.join(f"[{_KEYS[word]}] {LABELS[word]}" for word in words)
+def _key_line(answers: Iterable[str], gap: str) -> str:
+    return gap.join(f"[{_KEYS[answer]}] {LABELS[answer]}" for answer in answers)
 
 
 def status_line(status: Status) -> str:

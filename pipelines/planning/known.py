@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -11,9 +12,8 @@ from numpy.typing import NDArray
 from faintfield.calib.noise_model import NoiseModel
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.reading import is_file, is_folder
-from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, CameraPoses, read_geometry
+from faintfield.pipelines.formats.results.geometry import CameraPoses, read_geometry
 from faintfield.pipelines.formats.results.noise import (
-    NOISE_FILE,
     NOISE_MAPS,
     NoiseRecord,
     read_fitted_noise,
@@ -86,7 +86,8 @@ class Sensor:
         return fitted.model, fitted.unusable
 
 
-class StatedNoise(msgspec.Struct, frozen=True):
+@dataclass(frozen=True)
+class StatedNoise:
     """Numbers that options state in place of a calibration's."""
 
     read_noise_e: float | None = None
@@ -94,40 +95,29 @@ class StatedNoise(msgspec.Struct, frozen=True):
     quantum_efficiency: float | None = None
 
 
-def known_sensor(settings: RigSettings, rig: Path, noise: Path | None, stated: StatedNoise) -> Sensor:
-    """Return what is known of the sensor: stated, else measured (`noise`, or beside the rig.toml), else simulated.
+def known_sensor(settings: RigSettings, noise: Path | None, stated: StatedNoise) -> Sensor:
+    """Return what is known of the sensor: stated, else measured (`noise`, a noise.json), else simulated.
 
     Raises
     ------
     MissingFile, BadValue
         noise.json cannot be read.
     """
-    path = _file_of(noise, rig, NOISE_FILE)
-    if path is not None:
-        sensor = _measured_sensor(path)
+    if noise is not None:
+        sensor = _measured_sensor(noise)
     elif isinstance(settings.camera, SimulatedSettings):
         sensor = _simulated_sensor(settings.camera)
     else:
         unknown = Measured(None, why=_NOT_MEASURED)
         sensor = Sensor("no calibration", unknown, unknown, unknown, unknown)
-    numbers = msgspec.structs.asdict(stated)
-    given = {name: Measured(value) for name, value in numbers.items() if value is not None}
-    if not given:
-        return sensor
-    return replace(
-        sensor,
-        source=f"options and {sensor.source}",
-        read_noise_e=given.get("read_noise_e", sensor.read_noise_e),
-        dark_current_e_per_s=given.get("dark_current_e_per_s", sensor.dark_current_e_per_s),
-        quantum_efficiency=given.get("quantum_efficiency", sensor.quantum_efficiency),
-    )
+    numbers: dict[str, Any] = {name: Measured(value) for name, value in vars(stated).items() if value is not None}
+    return replace(sensor, source=f"options and {sensor.source}", **numbers) if numbers else sensor
 
 
 def _measured_sensor(path: Path) -> Sensor:
-    """Return the sensor of a noise.json."""
     record = read_noise(path)
     efficiency = record.quantum_efficiency
-    if not isinstance(efficiency, Measured):  # it may be written with or without its error
+    if not isinstance(efficiency, Measured):  # a record holds it with or without its error
         efficiency = Measured(efficiency, why="not stated" if efficiency is None else None)
     return Sensor(
         str(path),
@@ -141,24 +131,12 @@ def _measured_sensor(path: Path) -> Sensor:
 
 
 def _simulated_sensor(settings: SimulatedSettings) -> Sensor:
-    """Return the sensor of a simulated camera."""
-    made = _simulated_experiment(settings).sensor
-    model = NoiseModel(
-        made.offset_dn,
-        made.gain_dn_per_e,
-        made.read_noise_e,
-        made.dark_current_e_per_s,
-        made.quantum_efficiency,
-        made.saturation_dn,
-    )
-    return Sensor(
-        "the simulated camera",
-        Measured(made.read_noise_e),
-        Measured(made.dark_current_e_per_s),
-        Measured(made.gain_dn_per_e),
-        Measured(made.quantum_efficiency),
-        model=model,
-    )
+    sensor = _simulated_experiment(settings).sensor
+    names = ("read_noise_e", "dark_current_e_per_s", "gain_dn_per_e", "quantum_efficiency")
+    numbers = {name: getattr(sensor, name) for name in names}
+    model = NoiseModel(sensor.offset_dn, saturation_dn=sensor.saturation_dn, **numbers)
+    measured: dict[str, Any] = {name: Measured(value) for name, value in numbers.items()}
+    return Sensor("the simulated camera", **measured, model=model)
 
 
 @dataclass(frozen=True)
@@ -214,25 +192,22 @@ class KnownLens:
         return float(response[rows, columns].mean())
 
 
-def known_lens(
-    settings: RigSettings, rig: Path, sensor: Sensor, geometry: Path | None, fx_px: float | None
-) -> KnownLens:
-    """Return what is known of the lens: stated, else measured (`geometry`, or beside the rig.toml), else simulated.
+def known_lens(settings: RigSettings, sensor: Sensor, geometry: Path | None, fx_px: float | None) -> KnownLens:
+    """Return what is known of the lens: stated, else measured (`geometry`, a geometry.json), else simulated.
 
     Raises
     ------
     MissingFile, BadValue
         geometry.json or the maps beside noise.json cannot be read.
     """
-    path = _file_of(geometry, rig, GEOMETRY_FILE)
     simulated = (
         _simulated_experiment(settings.camera).optics if isinstance(settings.camera, SimulatedSettings) else None
     )
     size_px = sensor.record.size_px if sensor.record is not None else None
     centre_px = None
     f_px = Measured(None, why="no focal length; give --fx-px, or the result of `faintfield geometry` as --geometry")
-    if path is not None:
-        lens = read_geometry(path, CameraPoses).camera_lens()
+    if geometry is not None:
+        lens = read_geometry(geometry, CameraPoses).camera_lens()
         size_px, centre_px, f_px = lens.size_px, (lens.cx_px, lens.cy_px), Measured(lens.fx_px)
     elif simulated is not None:
         size_px, centre_px, f_px = simulated.size_px, (simulated.cx_px, simulated.cy_px), Measured(simulated.fx_px)
@@ -307,9 +282,8 @@ def plan_over(settings: RigSettings, grid: Grid, exposure_s: float | None, frame
     return CapturePlan.of(grid, steps, approach_mm=settings.stage.approach_mm, frame_bytes=0)
 
 
-def _file_of(given: Path | None, rig: Path, name: str) -> Path | None:
-    """Return the file of a calibration: as given, or in the folder given, or beside the rig.toml if it is there."""
-    if given is not None:
-        return given / name if is_folder(given) else given
-    beside = rig.parent / name
-    return beside if is_file(beside) else None
+def calibration_file(path: Path | None, name: str, *folders: Path) -> Path | None:
+    """Return the file of a calibration: `path` or the file in that folder; else the first that lies in `folders`."""
+    if path is not None:
+        return path / name if is_folder(path) else path
+    return next((folder / name for folder in folders if is_file(folder / name)), None)
