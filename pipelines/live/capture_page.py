@@ -21,18 +21,17 @@ import numpy as np
 import uvicorn
 from starlette.datastructures import Headers
 from starlette.requests import Request
-from starlette.responses import HTMLResponse, JSONResponse, Response
+from starlette.responses import HTMLResponse, Response
 from starlette.routing import Route, Router
 from starlette.types import Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from faintfield.pipelines.console import conceal, inform
 from faintfield.pipelines.formats.image_files import encoded
-from faintfield.pipelines.live.panel import REQUESTS, CapturePanel, ShownFrame
+from faintfield.pipelines.live.panel import REQUESTS, CapturePanel, SessionFrames, ShownFrame
 from faintfield.pipelines.live.planes_client import PlanesClient
-from faintfield.pipelines.live.taken import TakenFrames
 from faintfield.pipelines.live.terminal import LABELS, display_levels
-from faintfield.rig.capture.guide import format_duration
+from faintfield.rig.capture.guide import Answer, OperatorRequest, format_duration
 
 _HOST = "127.0.0.1"
 # Width of the frame's picture in pixels.
@@ -57,13 +56,13 @@ _HEADERS = {
 
 
 class _PressRequest(msgspec.Struct, forbid_unknown_fields=True):
-    word: str
+    word: Answer | OperatorRequest
     prompt: int | None = None
 
 
 @contextmanager
 def serve_page(
-    panel: CapturePanel, frames: TakenFrames | None = None, planes: PlanesClient | None = None
+    panel: CapturePanel, frames: SessionFrames | None = None, planes: PlanesClient | None = None
 ) -> Iterator[str]:
     """Serve the page of a capture while the block runs; yield its address, which no log records.
 
@@ -71,7 +70,7 @@ def serve_page(
     ----------
     panel : CapturePanel
         Prompts and state of the capture.
-    frames : TakenFrames, optional
+    frames : SessionFrames, optional
         Frames of its session, shown when a node is clicked.
     planes : PlanesClient, optional
         Its live planes.
@@ -174,7 +173,7 @@ def _is_own(headers: Headers) -> bool:
     return host.partition(":")[0] == _HOST and headers.get("origin") in (None, f"http://{host}")
 
 
-def _pages(panel: CapturePanel, frames: TakenFrames | None, planes: PlanesClient | None) -> Router:
+def _pages(panel: CapturePanel, frames: SessionFrames | None, planes: PlanesClient | None) -> Router:
     """Return the addresses behind the token."""
     html = files("faintfield.pipelines.live").joinpath("capture.html").read_text(encoding="utf-8")
 
@@ -182,36 +181,28 @@ def _pages(panel: CapturePanel, frames: TakenFrames | None, planes: PlanesClient
         return HTMLResponse(html)
 
     async def state(_: Request) -> Response:
-        # Escaped, because the name of a file may not be UTF-8
-        content = _state(panel) | {"planes": None if planes is None else _planes(planes)}
-        return Response(dumps(content), media_type="application/json")
+        return _json(_state(panel) | {"planes": None if planes is None else _planes(planes)})
 
     async def picture(_: Request) -> Response:
         shown = panel.shown
-        if shown is None:
-            return Response(status_code=404)
-        return Response(_png(shown), media_type="image/png")
+        return _image(None if shown is None else _png(shown))
 
     async def live_picture(request: Request) -> Response:
-        content = None if planes is None else planes.picture(request.path_params["name"])
-        return Response(status_code=404) if content is None else Response(content, media_type="image/png")
+        return _image(None if planes is None else planes.picture(request.path_params["name"]))
 
     async def node(request: Request) -> Response:
         status, row, column = panel.status, request.path_params["row"], request.path_params["column"]
         if frames is None or status is None:
             return Response(status_code=404)
-        content = msgspec.to_builtins(frames.at(status.step - 1, (row, column)))
-        return Response(dumps(content), media_type="application/json")
+        return _json(msgspec.to_builtins(frames.at(status.step - 1, (row, column))))
 
     async def press(request: Request) -> Response:
         try:
             pressed = msgspec.json.decode(await _body(request), type=_PressRequest)
         except (msgspec.DecodeError, UnicodeDecodeError):
-            return JSONResponse({"error": "not a press of a button"}, status_code=400)
-        if pressed.word not in LABELS:
-            return JSONResponse({"error": "no such button"}, status_code=400)
+            return _json({"error": "not a press of a button"}, status_code=400)
         panel.press(pressed.word, pressed.prompt)
-        return JSONResponse({})
+        return _json({})
 
     return Router(
         [
@@ -224,6 +215,15 @@ def _pages(panel: CapturePanel, frames: TakenFrames | None, planes: PlanesClient
         ],
         redirect_slashes=False,
     )
+
+
+def _json(content: object, status_code: int = 200) -> Response:
+    # Escaped, because the name of a file may not be UTF-8
+    return Response(dumps(content), status_code, media_type="application/json")
+
+
+def _image(png: bytes | None) -> Response:
+    return Response(status_code=404) if png is None else Response(png, media_type="image/png")
 
 
 async def _body(request: Request) -> bytes:

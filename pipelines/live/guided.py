@@ -13,10 +13,9 @@ from faintfield.pipelines.console import console, inform, progress
 from faintfield.pipelines.errors import InputError, UnknownFormat
 from faintfield.pipelines.formats.files import require_room
 from faintfield.pipelines.formats.frames import read_frame
-from faintfield.pipelines.live.panel import CapturePanel
+from faintfield.pipelines.live.panel import CapturePanel, SessionFrames
 from faintfield.pipelines.live.planes_client import live_planes
 from faintfield.pipelines.live.planes_messages import LiveOrder
-from faintfield.pipelines.live.taken import TakenFrames
 from faintfield.pipelines.live.terminal import TerminalView
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.capture.guide import format_duration
@@ -71,7 +70,7 @@ def capture_session(
         if before:
             inform(f"{folder}: {before} of {len(session.frames)} frames are there; going on")
         if page:
-            _open_page(panel, stack, TakenFrames(session), planes)
+            _open_page(panel, stack, SessionFrames(session), planes)
         stack.enter_context(TerminalView(panel).show())
         stack.enter_context(_stop_on_interrupt(panel))
         Capture(session, open_rig(settings, session.journal, read_pixels), panel, read_pixels).run()
@@ -94,7 +93,7 @@ def _plan_session(settings: RigSettings, folder: Path) -> FrozenPlan:
     return FrozenPlan(rig.plan, settings)
 
 
-def _open_page(panel: CapturePanel, stack: ExitStack, frames: TakenFrames, order: LiveOrder | None) -> None:
+def _open_page(panel: CapturePanel, stack: ExitStack, frames: SessionFrames, order: LiveOrder | None) -> None:
     """Serve the page until the stack is closed; if that fails, go on where prompts can be answered otherwise."""
     planes = None if order is None else stack.enter_context(live_planes(order, frames.of_dark_scene))
     if planes is not None:

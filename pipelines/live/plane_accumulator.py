@@ -49,14 +49,7 @@ class _Refined(NamedTuple):
 class CompleteViews:
     """Images of the nodes that have all of their frames, one after another in memory, which solvers read as they are.
 
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns of an image.
-    nodes : int
-        Number of nodes; memory is taken as they are complete.
-    frames_per_view : int
-        Number of frames that a node has when it is complete.
+    Memory is taken as nodes are complete.
     """
 
     def __init__(self, shape: tuple[int, int], nodes: int, frames_per_view: int) -> None:

@@ -76,16 +76,12 @@ class LiveStatus(Struct, frozen=True):
 
     Parameters
     ----------
-    doing : str
-        Present work of their process.
+    doing, pmlem : str
+        Present work, and progress of PMLEM or the reason for leaving it out.
     frames, nodes, planned_nodes : int
-        Frames added up so far, nodes that they are of, and all nodes of the dark scene.
+        Frames added up so far, their nodes, and all nodes of the dark scene.
     poses, noise : str
-        Which are used, and where they are from.
-    pmlem : str
-        Up to how many nodes PMLEM has come, or why it is left out.
-    unit : str
-        Unit of the pictures.
+        Their kinds and sources.
     bins : int
         Width in pixels of the bins that are added up before anything else.
     planes : tuple of PlaneStatus

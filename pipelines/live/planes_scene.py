@@ -18,7 +18,6 @@ from faintfield.pipelines.live.planes_messages import LiveOrder
 from faintfield.pipelines.planning.known import (
     KnownLens,
     Sensor,
-    StatedNoise,
     calibration_file,
     known_lens,
     known_sensor,
@@ -48,10 +47,8 @@ class LiveScene:
         Width in pixels of the bins that are added up.
     view_of : dict of (int, int) to int
         Index of each node's view.
-    poses, noise : str
-        Their sources, in words.
-    unit : str
-        Unit of the light: electrons, or DN where the noise is not known.
+    poses, noise, unit : str
+        Sources of both in words, and the unit of the light: DN where the noise is not known.
     knows_noise : bool
         True if there is a noise model, without which PMLEM has no likelihood.
     """
@@ -80,7 +77,7 @@ def live_scene(order: LiveOrder, frozen: FrozenPlan, frame: Frame) -> LiveScene:
     size_px = (width, height)
     folders = order.session, order.rig.parent
     geometry = calibration_file(order.geometry, GEOMETRY_FILE, *folders)
-    sensor = known_sensor(frozen.rig, calibration_file(order.noise, NOISE_FILE, *folders), StatedNoise())
+    sensor = known_sensor(frozen.rig, calibration_file(order.noise, NOISE_FILE, *folders))
     known = known_lens(frozen.rig, sensor, geometry, order.fx_px)
     lens, lens_source = _lens(geometry, known, size_px, "as given" if order.fx_px else "of the simulated camera")
     fitted = _noise(sensor, known, size_px)

@@ -1,32 +1,83 @@
-"""The drawings of the report by EMVA 1288: transfer of light, SNR, dark current, and how pixels differ."""
+"""The drawings of the report by EMVA 1288: transfer of light, SNR, dark current, and differences of pixels."""
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.calib.noise import Series
+from faintfield.calib.noise.emva.nonuniformity import accumulated_histogram, high_pass, spectrogram
 from faintfield.calib.noise.emva.quantities import snr
 from faintfield.calib.noise.likelihood.response import known_light
 from faintfield.calib.noise.likelihood.rounding import ROUNDING_DN2
-from faintfield.pipelines.calibration.noise_emva import EmvaMeasurement
-from faintfield.pipelines.pages.emva_drawing import MEASURED, MODEL, SECOND, Drawing, drawn
-from faintfield.pipelines.pages.emva_images import image_drawings
-from faintfield.pipelines.pages.page import INK
-from faintfield.pipelines.pages.symbols import mathtext
+from faintfield.pipelines.calibration.noise_emva import EmvaMeasurement, MeanImage
+from faintfield.pipelines.pages.page import INK, blank_drawing, ink, math_symbols, svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+# Measured, model, and a second series; distinct without colour vision, and on black as on white.
+MEASURED, MODEL, SECOND = "#0072b2", "#d55e00", "#009e73"
+
+# Logarithmic axes over less than this factor have even ticks, not powers of ten.
+_FINE_RANGE = 10.0
+
 _NO_FLATS = "there are no flats"
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """One drawing as SVG, or, in `missing`, the reason why there is none."""
+
+    title: str
+    caption: str
+    picture: str = ""
+    missing: str | None = None
+
+
+def drawings(measured: EmvaMeasurement) -> list[Drawing]:
+    """Return the drawings of one phase, in the order of the standard's report."""
+    return [
+        _photon_transfer(measured),
+        _sensitivity(measured),
+        _linearity(measured),
+        _snr(measured),
+        _dark_signal(measured),
+        *_image_drawings(measured),
+    ]
+
+
+def _draw(title: str, caption: str, draw: "Callable[[Axes], None]") -> Drawing:
+    """Return a drawing of one pair of axes."""
+    figure, axes = blank_drawing(5.6, 3.4)
+    draw(axes)
+    _reduce_ticks(axes)
+    ink(axes)
+    axes.set(xlabel=math_symbols(axes.get_xlabel()), ylabel=math_symbols(axes.get_ylabel()))
+    if axes.get_legend_handles_labels()[0]:
+        legend = axes.legend(frameon=False, labelcolor=INK, fontsize=9)
+        for text in legend.get_texts():
+            text.set_text(math_symbols(text.get_text()))
+    return Drawing(title, caption, svg(figure))
+
+
+def _reduce_ticks(axes: "Axes") -> None:
+    """Give logarithmic axes few ticks, with plain numbers: ticks are what takes time in a drawing."""
+    from matplotlib.ticker import LogLocator, MaxNLocator
+
+    axes.minorticks_off()
+    for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
+        if axis.get_scale() == "log":
+            axis.set_major_locator(MaxNLocator(6) if high < _FINE_RANGE * low else LogLocator())
+            axis.set_major_formatter("{x:g}")
 
 
 @dataclass(frozen=True)
 class Levels:
     """Mean and variance of the flats or darks of a measurement, arrays (series,), dark ones first by brightness.
 
-    `signal_dn` is above the dark of zero exposure; `kept` tells which series are within the range of the sensor.
+    `signal_dn` is above the dark of zero exposure; `kept` marks the series within the range of the sensor.
     """
 
     signal_dn: NDArray[np.float64]
@@ -48,7 +99,12 @@ def levels_of(measured: EmvaMeasurement, kind: str) -> Levels:
     pixels = int(used.sum())
     share = max(pixels - sum(used.shape) + 1, 1) / max(pixels, 1)
     freedom = np.array([max((item.frames - 1) * pixels * share, 1) for item in series])
-    variance = np.array([_variance(item, used, share) for item in series])
+    variance = np.array(
+        [
+            float(item.within_dn2.mean(where=used)) / ((item.frames - 1) * share) if item.frames > 1 else np.nan
+            for item in series
+        ]
+    )
     return Levels(
         signal_dn=np.array([item.levels_dn.mean() - offset for item in series]),
         variance_dn2=variance,
@@ -57,23 +113,6 @@ def levels_of(measured: EmvaMeasurement, kind: str) -> Levels:
         photons=np.array([item.conditions.photons or np.nan for item in series]),
         kept=np.array([kind == "dark" or id(item) in kept for item in series], bool),
     )
-
-
-def _variance(one: Series, used: NDArray[np.bool_], share: float) -> float:
-    """Return the temporal variance of a pixel."""
-    return float(one.within_dn2.mean(where=used)) / ((one.frames - 1) * share) if one.frames > 1 else float("nan")
-
-
-def drawings(measured: EmvaMeasurement) -> list[Drawing]:
-    """Return the drawings of one phase, in the order of the standard's report."""
-    return [
-        _photon_transfer(measured),
-        _sensitivity(measured),
-        _linearity(measured),
-        _snr(measured),
-        _dark_signal(measured),
-        *image_drawings(measured),
-    ]
 
 
 def _photon_transfer(measured: EmvaMeasurement) -> Drawing:
@@ -100,7 +139,7 @@ def _photon_transfer(measured: EmvaMeasurement) -> Drawing:
         axes.set_ylim(bottom=0)
 
     caption = "Its slope at the origin is the gain K. The dark is that of zero exposure."
-    return drawn(title, caption, draw)
+    return _draw(title, caption, draw)
 
 
 def _draw_model_variance(axes: "Axes", measured: EmvaMeasurement, brightest_dn: float, gain: float) -> None:
@@ -135,7 +174,6 @@ def _light(measured: EmvaMeasurement, flats: Levels) -> tuple[NDArray[np.float64
 
 
 def _sensitivity(measured: EmvaMeasurement) -> Drawing:
-    """Draw the signal against photons or exposure."""
     title, flats = "Sensitivity", levels_of(measured, "flat")
     light = _light(measured, flats)
     if light is None:
@@ -155,7 +193,7 @@ def _sensitivity(measured: EmvaMeasurement) -> Drawing:
         axes.set_xlim(left=0)
         axes.set_ylim(bottom=0)
 
-    return drawn(title, "The slope at the origin is the responsivity R.", draw)
+    return _draw(title, "The slope at the origin is the responsivity R.", draw)
 
 
 def _linearity(measured: EmvaMeasurement) -> Drawing:
@@ -185,7 +223,7 @@ def _linearity(measured: EmvaMeasurement) -> Drawing:
         "of relative deviations, within 5 to 95 % of saturation (of the brightest flat, if none is saturated). LE in "
         "the table is the mean of those of the fitted response, which has no errors of single levels."
     )
-    return drawn(title, caption, draw)
+    return _draw(title, caption, draw)
 
 
 def _snr(measured: EmvaMeasurement) -> Drawing:
@@ -221,16 +259,20 @@ def _snr(measured: EmvaMeasurement) -> Drawing:
                 side = {"ha": "right", "xytext": (-3, 3)} if label == "sat" else {"ha": "left", "xytext": (3, 3)}
                 place = (at * per_e, 0.3)
                 axes.annotate(
-                    mathtext(f"{name[:3]}.{label}"), place, textcoords="offset points", color=INK, fontsize=9, **side
+                    math_symbols(f"{name[:3]}.{label}"),
+                    place,
+                    textcoords="offset points",
+                    color=INK,
+                    fontsize=9,
+                    **side,
                 )
         axes.set(xscale="log", yscale="log", xlabel=name, ylabel="SNR")
         axes.set_ylim(bottom=0.3)
 
-    return drawn(title, "Where SNR = 1 is the absolute sensitivity threshold μ_p.min.", draw)
+    return _draw(title, "Where SNR = 1 is the absolute sensitivity threshold μ_p.min.", draw)
 
 
 def _dark_signal(measured: EmvaMeasurement) -> Drawing:
-    """Draw the dark signal against the exposure."""
     title, darks = "Dark current", levels_of(measured, "dark")
     if np.unique(darks.exposure_s).size < 2:
         return Drawing(title, "", missing="all darks have one exposure")
@@ -243,4 +285,64 @@ def _dark_signal(measured: EmvaMeasurement) -> Drawing:
             axes.plot(ends, slope * ends, color=MODEL, label="K μ_I t")
         axes.set(xlabel="exposure (s)", ylabel="μ_y.dark − μ_y.dark(0) (DN)")
 
-    return drawn(title, "The slope over K is the dark current μ_I.", draw)
+    return _draw(title, "The slope over K is the dark current μ_I.", draw)
+
+
+def _image_drawings(measured: EmvaMeasurement) -> Iterator[Drawing]:
+    """Yield the spectrograms and histograms of one phase of the mosaic."""
+    images = (
+        (measured.dark, "DSNU", "dsnu_total_e", "DN", 1.0),
+        (measured.bright, "PRNU", "prnu_total", "%", 100.0),
+    )
+    for kind, draw in (("spectrograms", _spectrograms), ("accumulated histogram", _histogram)):
+        for image, quantity, name, unit, factor in images:
+            title = f"{quantity} {kind}"
+            if image:
+                yield draw(measured, title, image, unit, factor)
+            else:
+                yield Drawing(title, "", missing=measured.estimates[name].why or "there is no image")
+
+
+def _spectrograms(measured: EmvaMeasurement, title: str, image: MeanImage, unit: str, factor: float) -> Drawing:
+    """Draw the horizontal and the vertical spectrogram, as amplitudes."""
+    spectra = [spectrogram(image.values, measured.used, axis) for axis in (1, 0)]
+
+    def draw(axes: "Axes") -> None:
+        for spectrum, colour, label in zip(spectra, (MEASURED, SECOND), ("horizontal", "vertical"), strict=True):
+            axes.semilogy(spectrum.frequency, factor * np.sqrt(spectrum.power), lw=0.9, color=colour, label=label)
+        white = factor * float(np.sqrt(np.mean([spectrum.white for spectrum in spectra])))
+        axes.axhline(white, color=MODEL, lw=1, label="white part")
+        left = factor * np.sqrt(image.noise.pixel)
+        axes.axhline(left, color=MODEL, lw=1, ls="--", label="temporal noise left in the mean")
+        axes.set(xlabel="spatial frequency (cycles/pixel)", ylabel=f"amplitude ({unit})", xlim=(0, 0.5))
+        low, high = axes.get_ylim()
+        axes.set_ylim(low, high * (high / low) ** 0.5)  # room for the legend
+
+    return _draw(title, _caption(image) + " White noise is level at its standard deviation; a peak is a pattern.", draw)
+
+
+def _histogram(measured: EmvaMeasurement, title: str, image: MeanImage, unit: str, factor: float) -> Drawing:
+    """Draw one accumulated histogram, of all pixels: here outliers are what counts."""
+    from scipy.special import erfc
+
+    every, is_flat = np.ones_like(measured.used), image.series.conditions.kind == "flat"
+    histogram = accumulated_histogram(high_pass(image.values, every) if is_flat else image.values, every)
+
+    def draw(axes: "Axes") -> None:
+        deviation = factor * histogram.deviation
+        percent = 100 * erfc(histogram.deviation / (np.sqrt(2) * max(histogram.sigma, 1e-12)))
+        axes.semilogy(deviation, histogram.percent, color=MEASURED, drawstyle="steps-pre", label="all pixels")
+        axes.semilogy(deviation, percent, color=MODEL, ls="--", label="normal law")
+        axes.set(xlabel=f"absolute deviation from the mean ({unit})", ylabel="pixels beyond (%)")
+        axes.set_ylim(50 / measured.used.size, 200)
+        axes.set_xlim(left=0)
+
+    filtered = " Less its mean over 5 × 5 pixels." if is_flat else ""
+    return _draw(title, _caption(image) + filtered + " Unusable pixels are included: they are its tail.", draw)
+
+
+def _caption(image: MeanImage) -> str:
+    conditions = image.series.conditions
+    if conditions.kind == "dark":
+        return f"Mean of {image.series.frames} darks of {conditions.exposure_s:g} s."
+    return f"Mean of {image.series.frames} flats of {image.signal_dn:.4g} DN, dark and vignetting taken out."

@@ -5,18 +5,15 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.noise_model import NoiseModel
-from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.reading import is_file, is_folder
 from faintfield.pipelines.formats.results.geometry import CameraPoses, read_geometry
 from faintfield.pipelines.formats.results.noise import (
     NOISE_MAPS,
     NoiseRecord,
-    read_fitted_noise,
     read_maps,
     read_noise,
 )
@@ -24,7 +21,6 @@ from faintfield.pipelines.formats.results.noise_fit import Measured
 from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import RigError
-from faintfield.rig.plan import CapturePlan, Grid
 from faintfield.rig.settings import RigSettings
 from faintfield.rig.simulation.lab import lab_experiment
 from faintfield.rig.stages.protocol import MotionLimits
@@ -34,7 +30,6 @@ from faintfield.rig.stages.workspace import StageWorkspace
 _NEAR_PX = 4
 
 _NOT_MEASURED = "no noise calibration; give the result of `faintfield noise` as --noise, or --read-noise-e"
-
 
 # Its objects take a while to draw.
 _simulated_experiment = lru_cache(maxsize=1)(lab_experiment)
@@ -47,13 +42,11 @@ class Sensor:
     Attributes
     ----------
     source : str
-        Where it is from, in words.
+        Its source, in words.
     read_noise_e, dark_current_e_per_s, gain_dn_per_e, quantum_efficiency : Measured
         The paper's quantities, and the gain.
-    record : NoiseRecord, optional
-        The calibration that it is from.
-    path : Path, optional
-        Its file.
+    record, path : NoiseRecord and Path, optional
+        The calibration that it is from, and its file.
     model : NoiseModel, optional
         That of a simulated camera.
     """
@@ -67,36 +60,11 @@ class Sensor:
     path: Path | None = None
     model: NoiseModel | None = None
 
-    def of_frame(self, size_px: tuple[int, int], what: str) -> tuple[NoiseModel, NDArray[np.bool_]]:
-        """Return the noise model of a frame's pixels, and which of them are unusable (row, column).
 
-        Raises
-        ------
-        InputError
-            Offset and gain are not known, or are those of another camera.
-        """
-        if self.model is not None:
-            return self.model, np.zeros(size_px[::-1], bool)
-        if self.path is None:
-            raise BadValue(
-                f"{what}: its DN tell no electrons, as there is no noise calibration; give the result of `faintfield "
-                "noise` as --noise, or the light as --light-e"
-            )
-        fitted = read_fitted_noise(self.path, size_px)
-        return fitted.model, fitted.unusable
+def known_sensor(settings: RigSettings, noise: Path | None, **options: float | None) -> Sensor:
+    """Return what is known of the sensor: `options`, else measured (`noise`, a noise.json), else simulated.
 
-
-@dataclass(frozen=True)
-class StatedNoise:
-    """Numbers that options state in place of a calibration's."""
-
-    read_noise_e: float | None = None
-    dark_current_e_per_s: float | None = None
-    quantum_efficiency: float | None = None
-
-
-def known_sensor(settings: RigSettings, noise: Path | None, stated: StatedNoise) -> Sensor:
-    """Return what is known of the sensor: stated, else measured (`noise`, a noise.json), else simulated.
+    `options` are named as attributes of `Sensor`.
 
     Raises
     ------
@@ -110,7 +78,7 @@ def known_sensor(settings: RigSettings, noise: Path | None, stated: StatedNoise)
     else:
         unknown = Measured(None, why=_NOT_MEASURED)
         sensor = Sensor("no calibration", unknown, unknown, unknown, unknown)
-    numbers: dict[str, Any] = {name: Measured(value) for name, value in vars(stated).items() if value is not None}
+    numbers: dict[str, Any] = {name: Measured(value) for name, value in options.items() if value is not None}
     return replace(sensor, source=f"options and {sensor.source}", **numbers) if numbers else sensor
 
 
@@ -172,24 +140,21 @@ class KnownLens:
         depth_mm : float, optional
             Depth of the plane.
         """
-        found = np.ones(len(centres_mm))
+        responses = np.ones(len(centres_mm))
         if depth_mm is None or self.f_px.value is None or self.size_px is None or self.centre_px is None:
-            return found
+            return responses
         places = np.rint(np.array(self.centre_px) - self.f_px.value / depth_mm * centres_mm).astype(int)
-        found[((places < 0) | (places >= self.size_px)).any(axis=1)] = 0
+        responses[((places < 0) | (places >= self.size_px)).any(axis=1)] = 0
         if self.response is not None:
-            axis = self._near(*np.rint(self.centre_px).astype(int).tolist())
-            for view in np.flatnonzero(found):
-                found[view] = self._near(*places[view].tolist()) / axis
-        return found
+            axis = _mean_around(self.response, *np.rint(self.centre_px).astype(int).tolist())
+            for view in np.flatnonzero(responses):
+                responses[view] = _mean_around(self.response, *places[view].tolist()) / axis
+        return responses
 
-    def _near(self, column: int, row: int) -> float:
-        """Return the mean response around a pixel."""
-        response = self.response
-        if response is None:
-            return 1.0
-        rows, columns = (slice(max(at - _NEAR_PX, 0), at + _NEAR_PX + 1) for at in (row, column))
-        return float(response[rows, columns].mean())
+
+def _mean_around(response: NDArray[np.floating], column: int, row: int) -> float:
+    rows, columns = (slice(max(middle - _NEAR_PX, 0), middle + _NEAR_PX + 1) for middle in (row, column))
+    return float(response[rows, columns].mean())
 
 
 def known_lens(settings: RigSettings, sensor: Sensor, geometry: Path | None, fx_px: float | None) -> KnownLens:
@@ -200,9 +165,8 @@ def known_lens(settings: RigSettings, sensor: Sensor, geometry: Path | None, fx_
     MissingFile, BadValue
         geometry.json or the maps beside noise.json cannot be read.
     """
-    simulated = (
-        _simulated_experiment(settings.camera).optics if isinstance(settings.camera, SimulatedSettings) else None
-    )
+    camera = settings.camera
+    simulated = _simulated_experiment(camera).optics if isinstance(camera, SimulatedSettings) else None
     size_px = sensor.record.size_px if sensor.record is not None else None
     centre_px = None
     f_px = Measured(None, why="no focal length; give --fx-px, or the result of `faintfield geometry` as --geometry")
@@ -230,12 +194,10 @@ class KnownPace:
 
     Attributes
     ----------
-    motion, feed_mm_per_s : MotionLimits, float
-        Of the stage.
+    motion, feed_mm_per_s, workspace : MotionLimits, float, StageWorkspace
+        Limits, feed and allowed positions of the stage.
     readout_s : float
-        Of the camera.
-    workspace : StageWorkspace
-        Positions that are allowed.
+        Readout of the camera.
     """
 
     motion: MotionLimits
@@ -259,27 +221,6 @@ def known_pace(settings: RigSettings) -> KnownPace | str:
             rig.stage.close()
     except RigError as failure:
         return str(failure)
-
-
-def plan_over(settings: RigSettings, grid: Grid, exposure_s: float | None, frames: int | None) -> CapturePlan:
-    """Return the plan of a capture over another grid, with other frames of the dark scene and the noise reference.
-
-    Parameters
-    ----------
-    settings : RigSettings
-        Content of the rig.toml.
-    grid : Grid
-        The nodes.
-    exposure_s, frames : float and int, optional
-        Exposure and number of frames at a node, of the dark scene, and of the noise reference, which must be alike;
-        by default those of the rig.toml.
-    """
-    changes = {} if exposure_s is None or frames is None else {"exposure_s": (exposure_s,), "frames_per_node": frames}
-    steps = [
-        msgspec.structs.replace(step, **changes) if step.kind in ("dark_scene", "noise_reference") else step
-        for step in settings.steps()
-    ]
-    return CapturePlan.of(grid, steps, approach_mm=settings.stage.approach_mm, frame_bytes=0)
 
 
 def calibration_file(path: Path | None, name: str, *folders: Path) -> Path | None:

@@ -23,10 +23,9 @@ from faintfield.pipelines import cli
 from faintfield.pipelines.formats.results.geometry import LensRecord
 from faintfield.pipelines.live.capture_page import serve_page
 from faintfield.pipelines.live.guided import read_pixels
-from faintfield.pipelines.live.panel import CapturePanel
+from faintfield.pipelines.live.panel import CapturePanel, SessionFrames
 from faintfield.pipelines.live.planes_client import PlanesClient, live_planes
 from faintfield.pipelines.live.planes_messages import LiveOrder, LiveStatus
-from faintfield.pipelines.live.taken import TakenFrames
 from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.capture.loop import Capture
 from faintfield.rig.capture.survey import survey
@@ -105,7 +104,7 @@ class Running:
         self._thread = threading.Thread(target=capture, daemon=True)
         self._thread.start()
         assert begun.wait(HANG_S)
-        self.taken = TakenFrames(opened[0])
+        self.taken = SessionFrames(opened[0])
         client = self._stack.enter_context(live_planes(self._order, self.taken.of_dark_scene))
         assert client is not None
         self.client: PlanesClient = client
