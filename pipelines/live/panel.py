@@ -83,13 +83,12 @@ class CapturePanel:
     def take_request(self) -> OperatorRequest | None:
         """Return the latest request since the last call, None if there is none."""
         latest: OperatorRequest | None = None
-        while True:
-            try:
+        with suppress(Empty):
+            while True:
                 word, number = self._pressed.get_nowait()
-            except Empty:
-                return latest
-            if word in REQUESTS and number is None:
-                latest = word
+                if word in REQUESTS and number is None:
+                    latest = word
+        return latest
 
     def show_status(self, status: Status) -> None:
         """Show the state of the capture."""
@@ -107,7 +106,7 @@ class CapturePanel:
 
 
 class FrameSummary(Struct, frozen=True):
-    """A frame that was taken: its name, where the stage was in mm, when its file was written (s since 1970)."""
+    """A frame that was taken: its name, position of the stage in mm, and time of writing in s since 1970."""
 
     name: str
     position_mm: tuple[float, float]
@@ -117,13 +116,7 @@ class FrameSummary(Struct, frozen=True):
 
 
 class SessionFrames:
-    """The valid frames of an open session.
-
-    Parameters
-    ----------
-    session : Session
-        The session; its capture goes on in another thread.
-    """
+    """The valid frames of an open session, whose capture goes on in another thread."""
 
     def __init__(self, session: Session) -> None:
         self._session = session

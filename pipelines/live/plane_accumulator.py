@@ -97,16 +97,7 @@ class _Frame:
 
 
 class PlaneAccumulator:
-    """Planes at some depths, from the frames that are there.
-
-    Parameters
-    ----------
-    scene : LiveScene
-        The views, and what is known of them.
-    folder : Path
-        Folder of the frames' files.
-    depths_mm : sequence of float
-        Depths of the planes.
+    """Planes of a scene at some depths, from the frames in a folder that are there.
 
     Attributes
     ----------

@@ -5,6 +5,7 @@ receives, and the session is not touched.
 """
 
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -16,14 +17,7 @@ from multiprocessing.connection import Connection
 from signal import Signals
 
 from faintfield.pipelines.console import inform
-from faintfield.pipelines.live.planes_messages import (
-    LiveFrame,
-    LiveNews,
-    LiveOrder,
-    LivePicture,
-    LiveStatus,
-    plane_of,
-)
+from faintfield.pipelines.live.planes_messages import LiveFrame, LiveNews, LiveOrder, LiveStatus
 
 # One thread for everything, and no modules from the current folder, which may be a stranger's.
 _ENVIRONMENT = {
@@ -44,7 +38,7 @@ class PlanesClient:
     Parameters
     ----------
     order : LiveOrder
-        What to compute.
+        The request.
     frames : callable
         Returns all valid frames of the dark scene; called in another thread.
 
@@ -120,9 +114,9 @@ class PlanesClient:
 
     def picture(self, name: str) -> bytes | None:
         """Return a picture as PNG, None if there is none of that name; its plane is computed first from now on."""
-        plane = plane_of(name)
-        if plane is not None and plane != self._depth:
-            self._depth = plane
+        match = re.match(r"plane_(\d{3})_", name)
+        if match is not None and int(match[1]) != self._depth:
+            self._depth = int(match[1])
             self._changed.set()
         return self._pictures.get(name)
 
@@ -142,12 +136,13 @@ class PlanesClient:
     def _receive(self, line: Connection) -> None:
         with suppress(EOFError, OSError):  # the process has ended
             while True:
-                message: LivePicture | LiveStatus = line.recv()
+                message: LiveStatus | tuple[str, bytes] = line.recv()
                 self._heard_s = time.monotonic()
-                if isinstance(message, LivePicture):
-                    self._pictures[message.name] = message.png
-                else:
+                if isinstance(message, LiveStatus):
                     self.status = message
+                else:
+                    name, png = message
+                    self._pictures[name] = png
 
 
 @contextmanager

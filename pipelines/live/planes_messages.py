@@ -1,6 +1,5 @@
-"""Messages between the capture and the process of live planes."""
+"""Messages between the capture and the process of live planes, whose pictures are pairs of a name and a PNG."""
 
-import re
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -107,26 +106,3 @@ class LiveStatus(Struct, frozen=True):
     with_picture: tuple[tuple[int, int], ...] = ()
     problems: tuple[str, ...] = ()
     seconds_per_plane: float = 0.0
-
-
-class LivePicture(Struct, frozen=True):
-    """A picture as PNG, by the name under which the page asks for it."""
-
-    name: str
-    png: bytes
-
-
-def plane_picture(plane: int, kind: PictureKind) -> str:
-    """Return the name of a plane's picture."""
-    return f"plane_{plane:03d}_{kind}.png"
-
-
-def node_picture(node: tuple[int, int]) -> str:
-    """Return the name of the picture of a node's latest frame."""
-    return f"node_r{node[0]}_c{node[1]}.png"
-
-
-def plane_of(name: str) -> int | None:
-    """Return the index of the plane that a picture shows, None if it shows a node."""
-    match = re.match(r"plane_(\d{3})_", name)
-    return None if match is None else int(match[1])

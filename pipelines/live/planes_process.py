@@ -1,7 +1,7 @@
 """The process of live planes: receives which frames there are, and sends pictures and its state.
 
-It is started by `pipelines.live.planes_client`, reads frames and calibrations, and writes nothing. It ends with the
-capture. Several frames that wait are taken newest first; PMLEM runs when none does.
+It is started by `pipelines.live.planes_client`, reads frames and calibrations, and ends with the capture. Several
+frames that wait are taken newest first; PMLEM runs when none does.
 """
 
 import sys
@@ -22,13 +22,10 @@ from faintfield.pipelines.live.planes_messages import (
     LiveFrame,
     LiveNews,
     LiveOrder,
-    LivePicture,
     LiveStatus,
     PictureKind,
     PictureStatus,
     PlaneStatus,
-    node_picture,
-    plane_picture,
 )
 from faintfield.pipelines.live.planes_scene import LiveScene, dark_frames, live_scene
 from faintfield.pipelines.live.terminal import display_levels
@@ -49,15 +46,7 @@ _FAILURES = (InputError, RigError, ReconstructionError)
 
 
 class LivePlanes:
-    """Planes of a session that is being captured, with their pictures.
-
-    Parameters
-    ----------
-    order : LiveOrder
-        The request.
-    line : Connection
-        Brings news, of which only the newest counts; takes pictures and states.
-    """
+    """Planes of a session that is being captured; `line` brings news and takes pictures and states."""
 
     def __init__(self, order: LiveOrder, line: Connection) -> None:
         self._order, self._line = order, line
@@ -108,7 +97,7 @@ class LivePlanes:
             "reading frames",
             poses=scene.poses,
             noise=scene.noise,
-            unit=scene.unit,
+            unit="e⁻/px" if scene.knows_noise else "DN/px",
             bins=scene.bins,
             planned_nodes=len({frame.stop.node for frame in dark_frames(frozen.plan)}),
             pmlem=_pmlem_status(scene, self._planes),
@@ -147,7 +136,8 @@ class LivePlanes:
             return
         self._adding_s += time.perf_counter() - start_s
         self._added += len(order)
-        self._send_picture(node_picture(frame.node), display_levels(electrons, _FRAME_WIDTH_PX))
+        row, column = frame.node
+        self._send_picture(f"node_r{row}_c{column}.png", display_levels(electrons, _FRAME_WIDTH_PX))
         self._with_picture[frame.node] = None
         self._mark_stale(planes, "view", "mean")
         self._draw(planes, self._shown, "view")
@@ -180,7 +170,8 @@ class LivePlanes:
             return
         plane, covered, nodes = picture
         black, white = stretch(plane, covered)
-        self._send_picture(plane_picture(index, kind), grey_levels(np.where(covered, plane, black), white, black))
+        levels = grey_levels(np.where(covered, plane, black), white, black)
+        self._send_picture(f"plane_{index:03d}_{kind}.png", levels)
         pictures = self._status.planes[index].pictures
         version = pictures[kind].version + 1 if kind in pictures else 1
         self._report_plane(index, pictures=pictures | {kind: PictureStatus(version, nodes, black, white)})
@@ -217,7 +208,7 @@ class LivePlanes:
         self._line.send(self._status)
 
     def _send_picture(self, name: str, levels: NDArray[np.uint8]) -> None:
-        self._line.send(LivePicture(name, encoded(levels, ".png")))
+        self._line.send((name, encoded(levels, ".png")))
 
 
 def _pmlem_status(scene: LiveScene, planes: PlaneAccumulator) -> str:

@@ -15,13 +15,7 @@ from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSe
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, with_measured_geometry
 from faintfield.pipelines.formats.sets.session_set import nominal_view, relative_to_axis
 from faintfield.pipelines.live.planes_messages import LiveOrder
-from faintfield.pipelines.planning.known import (
-    KnownLens,
-    Sensor,
-    calibration_file,
-    known_lens,
-    known_sensor,
-)
+from faintfield.pipelines.planning.known import KnownLens, Sensor, calibration_file, known_lens, known_sensor
 from faintfield.pipelines.reconstruction.channels import ChannelLayout
 from faintfield.rig.plan import CapturePlan, PlannedFrame, planned_frames
 from faintfield.rig.session.session import FrozenPlan
@@ -41,16 +35,14 @@ class LiveScene:
     ----------
     elemental_set : ElementalSet
         A view per node; the names of its images mean nothing.
-    layout : ChannelLayout
-        The pixels that count: all of them, or the green ones of frames in RGB.
-    bins : int
-        Width in pixels of the bins that are added up.
+    layout, bins : ChannelLayout, int
+        The pixels that count, of RGB the green ones, and the width in pixels of the bins that are added up.
     view_of : dict of (int, int) to int
         Index of each node's view.
-    poses, noise, unit : str
-        Sources of both in words, and the unit of the light: DN where the noise is not known.
+    poses, noise : str
+        Their sources, in words.
     knows_noise : bool
-        True if there is a noise model, without which PMLEM has no likelihood.
+        True if there is a noise model, without which light is in DN and PMLEM has no likelihood.
     """
 
     elemental_set: ElementalSet
@@ -59,7 +51,6 @@ class LiveScene:
     view_of: dict[Node, int]
     poses: str
     noise: str
-    unit: str
     knows_noise: bool
 
 
@@ -85,7 +76,6 @@ def live_scene(order: LiveOrder, frozen: FrozenPlan, frame: Frame) -> LiveScene:
     planned = _planned_set(order.session, frozen.plan, lens, fitted)
     elemental_set, poses = _with_poses(planned, geometry, lens_source)
     plane_of_colour = 1 if frame.pixels_dn.ndim == 3 else None
-    knows_noise = sensor.path is not None or sensor.model is not None
     return LiveScene(
         elemental_set,
         ChannelLayout("grey", plane_of_colour, (Lattice((0, 0), (1, 1), (height, width)),)),
@@ -93,8 +83,7 @@ def live_scene(order: LiveOrder, frozen: FrozenPlan, frame: Frame) -> LiveScene:
         {view.node: index for index, view in enumerate(elemental_set.settings.view) if view.node is not None},
         poses,
         sensor.source,
-        "e⁻/px" if knows_noise else "DN/px",
-        knows_noise,
+        sensor.path is not None or sensor.model is not None,
     )
 
 

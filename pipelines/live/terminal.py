@@ -36,13 +36,7 @@ _BARS = " ▁▂▃▄▅▆▇█"
 
 
 class TerminalView:
-    """Shows a panel in the terminal; without a terminal, prints a line for each step and warning.
-
-    Parameters
-    ----------
-    panel : CapturePanel
-        The panel to show.
-    """
+    """View of a panel in the terminal; without a terminal, a line for each step and warning."""
 
     def __init__(self, panel: CapturePanel) -> None:
         self._panel = panel

@@ -98,7 +98,7 @@ def table_of(measured: EmvaMeasurement) -> list[tuple[str, list[Line]]]:
         lines = [_line(known[key], row, factor, explained) for key, *row, factor in rows]
         for key, symbol, words, _, _ in rows:
             if key in _RATIOS and known[key].value is not None:
-                for unit, scale in (("dB", _decibels), ("bit", np.log2)):
+                for unit, scale in (("dB", lambda ratio: 20 * np.log10(ratio)), ("bit", np.log2)):
                     lines.append(_line(_mapped(known[key], scale), (symbol, words, unit), 1.0, explained))
         groups.append((title, lines))
     return groups
@@ -121,10 +121,6 @@ def _mapped(known: Estimate, function: Callable[[float], float]) -> Estimate:
         return known
     low, high = sorted(float(function(end)) for end in known.ci95)
     return Estimate(float(function(known.value)), None, (low, high))
-
-
-def _decibels(ratio: float) -> float:
-    return float(20 * np.log10(ratio))
 
 
 def _line(known: Estimate, row: Sequence[str], factor: float, explained: dict[str, str]) -> Line:

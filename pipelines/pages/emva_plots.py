@@ -38,14 +38,9 @@ class Drawing:
 
 def drawings(measured: EmvaMeasurement) -> list[Drawing]:
     """Return the drawings of one phase, in the order of the standard's report."""
-    return [
-        _photon_transfer(measured),
-        _sensitivity(measured),
-        _linearity(measured),
-        _snr(measured),
-        _dark_signal(measured),
-        *_image_drawings(measured),
-    ]
+    flats = levels_of(measured, "flat")
+    by_light = [draw(measured, flats) for draw in (_photon_transfer, _sensitivity, _linearity, _snr)]
+    return [*by_light, _dark_signal(measured), *_image_drawings(measured)]
 
 
 def _draw(title: str, caption: str, draw: "Callable[[Axes], None]") -> Drawing:
@@ -115,39 +110,33 @@ def levels_of(measured: EmvaMeasurement, kind: str) -> Levels:
     )
 
 
-def _photon_transfer(measured: EmvaMeasurement) -> Drawing:
+def _photon_transfer(measured: EmvaMeasurement, flats: Levels) -> Drawing:
     """Draw the variance less that of the dark against the signal, with the line of the gain."""
-    title, flats = "Photon transfer", levels_of(measured, "flat")
+    title = "Photon transfer"
     if not flats.signal_dn.size:
         return Drawing(title, "", missing=_NO_FLATS)
     estimates = measured.calibration.estimates
     gain, read_dn = estimates["gain_dn_per_e"].value, estimates["read_noise_dn"].value or 0.0
 
     def draw(axes: "Axes") -> None:
-        for these, colour, mark, label in (
-            (flats.kept, MEASURED, "o", "flats, ± 2 s.e."),
-            (~flats.kept, SECOND, "x", "left out"),
-        ):
-            if these.any():
-                excess = flats.variance_dn2[these] - read_dn**2 - ROUNDING_DN2
-                error = 2 * flats.error_dn2[these]
-                axes.errorbar(flats.signal_dn[these], excess, error, fmt=mark, ms=4, color=colour, label=label)
-        if gain is not None:
-            _draw_model_variance(axes, measured, float(np.max(flats.signal_dn, initial=1.0)), gain)
+        series = (flats.kept, MEASURED, "o", "flats, ± 2 s.e."), (~flats.kept, SECOND, "x", "left out")
+        for mask, colour, mark, label in series:
+            if mask.any():
+                excess = flats.variance_dn2[mask] - read_dn**2 - ROUNDING_DN2
+                error = 2 * flats.error_dn2[mask]
+                axes.errorbar(flats.signal_dn[mask], excess, error, fmt=mark, ms=4, color=colour, label=label)
+        if gain is not None:  # the variance that the gain and the bend of the response predict
+            level, offset = measured.calibration.saturation.level_dn, estimates["offset_dn"].value or 0.0
+            brightest = float(np.max(flats.signal_dn, initial=1.0))
+            signal = np.linspace(0, brightest if level is None else min(brightest, level - offset), 200)
+            variance = gain * _charge_dn(measured, signal) * _slope(measured, signal) ** 2
+            axes.plot(signal, variance, color=MODEL, label="model")
         axes.set(xlabel="μ_y − μ_y.dark (DN)", ylabel="σ_y² − σ_y.dark² (DN²)")
         axes.set_xlim(left=0)
         axes.set_ylim(bottom=0)
 
     caption = "Its slope at the origin is the gain K. The dark is that of zero exposure."
     return _draw(title, caption, draw)
-
-
-def _draw_model_variance(axes: "Axes", measured: EmvaMeasurement, brightest_dn: float, gain: float) -> None:
-    """Draw the variance that the gain and the bend of the response predict."""
-    level = measured.calibration.saturation.level_dn
-    offset = measured.calibration.estimates["offset_dn"].value or 0.0
-    signal = np.linspace(0, brightest_dn if level is None else min(brightest_dn, level - offset), 200)
-    axes.plot(signal, gain * _charge_dn(measured, signal) * _slope(measured, signal) ** 2, color=MODEL, label="model")
 
 
 def _charge_dn(measured: EmvaMeasurement, signal_dn: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -173,8 +162,8 @@ def _light(measured: EmvaMeasurement, flats: Levels) -> tuple[NDArray[np.float64
     return None
 
 
-def _sensitivity(measured: EmvaMeasurement) -> Drawing:
-    title, flats = "Sensitivity", levels_of(measured, "flat")
+def _sensitivity(measured: EmvaMeasurement, flats: Levels) -> Drawing:
+    title = "Sensitivity"
     light = _light(measured, flats)
     if light is None:
         why = "neither photons nor several exposures of one light are stated" if flats.signal_dn.size else _NO_FLATS
@@ -196,10 +185,9 @@ def _sensitivity(measured: EmvaMeasurement) -> Drawing:
     return _draw(title, "The slope at the origin is the responsivity R.", draw)
 
 
-def _linearity(measured: EmvaMeasurement) -> Drawing:
+def _linearity(measured: EmvaMeasurement, flats: Levels) -> Drawing:
     """Draw the relative deviation of the signal from the straight line of EMVA 1288."""
-    title, flats = "Deviation from linearity", levels_of(measured, "flat")
-    light = _light(measured, flats)
+    title, light = "Deviation from linearity", _light(measured, flats)
     level = measured.calibration.saturation.level_dn
     if light is None or not flats.kept.any():
         return Drawing(title, "", missing="the light of the flats is not known" if flats.signal_dn.size else _NO_FLATS)
@@ -226,9 +214,9 @@ def _linearity(measured: EmvaMeasurement) -> Drawing:
     return _draw(title, caption, draw)
 
 
-def _snr(measured: EmvaMeasurement) -> Drawing:
+def _snr(measured: EmvaMeasurement, flats: Levels) -> Drawing:
     """Draw the SNR against photons, or electrons where the photons are not known."""
-    title, flats = "Signal-to-noise ratio", levels_of(measured, "flat")
+    title = "Signal-to-noise ratio"
     gain, noise = measured.calibration.estimates["gain_dn_per_e"], measured.estimates["dark_noise_e"]
     if gain.value is None or noise.value is None:
         return Drawing(title, "", missing=gain.why)
@@ -236,36 +224,29 @@ def _snr(measured: EmvaMeasurement) -> Drawing:
     efficiency = measured.calibration.estimates["quantum_efficiency"].value
     name, per_e = ("μ_p (photons/pixel)", 1 / efficiency) if efficiency else ("μ_e (e⁻/pixel)", 1.0)
     capacity = measured.calibration.estimates["saturation_e"].value
-    seen = flats.kept & np.isfinite(flats.variance_dn2) & (flats.signal_dn > 0)
-    signal = flats.signal_dn[seen]
+    measurable = flats.kept & np.isfinite(flats.variance_dn2) & (flats.signal_dn > 0)
+    signal = flats.signal_dn[measurable]
     charge = _charge_dn(measured, signal) / k
     top = capacity or 2 * float(charge.max(initial=1e3))
 
     def draw(axes: "Axes") -> None:
         grid = np.geomspace(0.5, top, 300)
-        dsnu, prnu = (measured.estimates[f"{name}"].value for name in ("dsnu_total_e", "prnu_total"))
+        dsnu, prnu = (measured.estimates[key].value for key in ("dsnu_total_e", "prnu_total"))
         axes.plot(grid * per_e, snr(grid, k, sigma_e), color=MODEL, label="linear model")
         if dsnu is not None and prnu is not None:
             total = snr(grid, k, sigma_e, dsnu, prnu)
             axes.plot(grid * per_e, total, color=MODEL, ls="--", label="total, DSNU and PRNU included")
         axes.plot(grid * per_e, np.sqrt(grid * per_e), color=SECOND, ls=":", label="ideal sensor")
         # Errors of the signal are those of the light behind it: the slope of the response carries them over.
-        ratio = charge * k * _slope(measured, signal) / np.sqrt(flats.variance_dn2[seen])
+        ratio = charge * k * _slope(measured, signal) / np.sqrt(flats.variance_dn2[measurable])
         axes.plot(charge * per_e, ratio, "o", ms=4, color=MEASURED, label="flats")
         axes.axhline(1, color=INK, lw=0.6)
-        for at, label in ((measured.estimates["threshold_e"].value, "min"), (capacity, "sat")):
-            if at is not None:
-                axes.axvline(at * per_e, color=INK, lw=0.6, ls="-.")
+        for limit_e, label in ((measured.estimates["threshold_e"].value, "min"), (capacity, "sat")):
+            if limit_e is not None:
+                axes.axvline(limit_e * per_e, color=INK, lw=0.6, ls="-.")
                 side = {"ha": "right", "xytext": (-3, 3)} if label == "sat" else {"ha": "left", "xytext": (3, 3)}
-                place = (at * per_e, 0.3)
-                axes.annotate(
-                    math_symbols(f"{name[:3]}.{label}"),
-                    place,
-                    textcoords="offset points",
-                    color=INK,
-                    fontsize=9,
-                    **side,
-                )
+                text, place = math_symbols(f"{name[:3]}.{label}"), (limit_e * per_e, 0.3)
+                axes.annotate(text, place, textcoords="offset points", color=INK, fontsize=9, **side)
         axes.set(xscale="log", yscale="log", xlabel=name, ylabel="SNR")
         axes.set_ylim(bottom=0.3)
 
@@ -290,10 +271,7 @@ def _dark_signal(measured: EmvaMeasurement) -> Drawing:
 
 def _image_drawings(measured: EmvaMeasurement) -> Iterator[Drawing]:
     """Yield the spectrograms and histograms of one phase of the mosaic."""
-    images = (
-        (measured.dark, "DSNU", "dsnu_total_e", "DN", 1.0),
-        (measured.bright, "PRNU", "prnu_total", "%", 100.0),
-    )
+    images = ((measured.dark, "DSNU", "dsnu_total_e", "DN", 1.0), (measured.bright, "PRNU", "prnu_total", "%", 100.0))
     for kind, draw in (("spectrograms", _spectrograms), ("accumulated histogram", _histogram)):
         for image, quantity, name, unit, factor in images:
             title = f"{quantity} {kind}"

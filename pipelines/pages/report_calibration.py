@@ -47,18 +47,12 @@ class Section[Record, Line]:
 
     Attributes
     ----------
-    where, sha256 : str
-        Address and hash of its file.
-    used : bool
-        True if the planes were made with it.
+    where, used : str, bool
+        Address of its file, and True if the planes were made with it.
     pages : list of (str, str or None)
         Addresses of its own pages, each with the page as a data URI if it is a picture.
-    made : Provenance, optional
-        Its origin, if its file states it.
-    unusable : dict of str to int
-        Number of unusable pixels by kind, of a noise calibration.
-    drawing, maps : str and list of str
-        Drawings of the nodes, of a geometry.
+    unusable, drawing, maps
+        Number of unusable pixels by kind, of a noise calibration; drawings of the nodes, of a geometry.
     """
 
     where: str

@@ -3,18 +3,13 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import cycle
-from typing import Any, NamedTuple, TypedDict
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.pipelines.formats.image_files import encoded, grey_levels, shrunk, white_level
-from faintfield.pipelines.formats.results.records import (
-    JOINT_METHODS,
-    Certificate,
-    FocusCurve,
-    ReconstructionRecord,
-)
+from faintfield.pipelines.formats.results.records import JOINT_METHODS, Certificate, FocusCurve, ReconstructionRecord
 from faintfield.pipelines.formats.units import StatedUnits
 from faintfield.pipelines.pages.page import INK, blank_drawing, data_uri, format_depths, ink, svg
 from faintfield.pipelines.pages.report_planes import Plane, best_column, column_titles, place_name
@@ -62,21 +57,6 @@ class Proposed(NamedTuple):
     moved: str
 
 
-class Slide(TypedDict):
-    """One picture of the sliders, which the page's script takes from the viewer, and the samples across the plane."""
-
-    depth: float
-    words: str
-    samples: int
-
-
-class SliderColumn(TypedDict):
-    """The planes of one column, the nearest first."""
-
-    title: str
-    planes: list[Slide]
-
-
 @dataclass(frozen=True, kw_only=True)
 class PlaneSections:
     """Part of the page about the planes, by default without any; the names are those of the template.
@@ -105,7 +85,7 @@ class PlaneSections:
     certificates: list[tuple[str, Certificate]] = field(default_factory=list)
     columns: list[str] = field(default_factory=list)
     rows: list[Row] = field(default_factory=list)
-    slider: list[SliderColumn] | None = None
+    slider: list[dict[str, Any]] | None = None
     slider_column: int = 0
     slider_depth: int = 0
     slider_picture: str | None = None
@@ -131,6 +111,7 @@ def plane_sections(planes: list[Plane], results: Iterable[ReconstructionRecord])
     shown_depths = _shown_depths(sorted({plane.depth_mm for plane in planes if not plane.name}), focus)
     shown = [plane for plane in planes if plane.name or plane.depth_mm in shown_depths]
     of_best = [plane for plane in planes if plane.column == best]
+    records = [(plane.label, record) for plane in of_best for record in plane.records]
     several = len(places) > 1 or len(columns) > 1
     slider_depth = _first_depth([depth for depth, _ in places], focus)
     first_slide = _in_order(planes, best)[: slider_depth + 1][-1]
@@ -138,17 +119,13 @@ def plane_sections(planes: list[Plane], results: Iterable[ReconstructionRecord])
     return PlaneSections(
         best=of_best[0],
         best_title=titles[best],
-        left_out=next(
-            (record.occlusion_left_out for plane in of_best for record in plane.records if record.occlusion_left_out),
-            None,
-        ),
+        left_out=next((record.occlusion_left_out for _, record in records if record.occlusion_left_out), None),
         blurred=len(places) > 1 and of_best[0].method not in JOINT_METHODS,
         best_planes=[(row.words, cell) for row in best_rows for cell in row.cells if cell],
         weight_curves=_weight_curves(of_best),
         certificates=[
-            (plane.label, record.certificate)
-            for plane in of_best
-            for record in plane.records
+            (label, record.certificate)
+            for label, record in records
             if record.certificate and record.certificate.is_bound
         ],
         columns=list(titles.values()),
@@ -212,9 +189,9 @@ def _sigmas(planes: list[Plane], titles: dict[str, str]) -> Sigmas | None:
     if not maps:
         return None
     white = max(white_level(sigma) for _, sigma in maps)
+    pictures = [_picture(sigma, white, _GRID_WIDTH_PX, ".png") for _, sigma in maps]
     return Sigmas(
-        white,
-        [(title, float(np.median(sigma)), _picture(sigma, white, _GRID_WIDTH_PX, ".png")) for title, sigma in maps],
+        white, [(name, float(np.median(sigma)), uri) for (name, sigma), uri in zip(maps, pictures, strict=True)]
     )
 
 
@@ -231,7 +208,8 @@ def _proposals(planes: list[Plane], titles: dict[str, str], white: float) -> lis
     return proposals
 
 
-def _slider(planes: list[Plane], titles: dict[str, str]) -> list[SliderColumn]:
+def _slider(planes: list[Plane], titles: dict[str, str]) -> list[dict[str, Any]]:
+    """Return the planes of each column, the nearest first, whose pictures the page's script takes from the viewer."""
     return [
         {
             "title": title,
@@ -265,29 +243,21 @@ def _focus_curve(focus: FocusCurve, units: StatedUnits) -> str:
     """Return the focus curve as SVG that takes its colour from the page."""
     figure, axes = blank_drawing(6.0, 2.6, "constrained")
     axes.plot(focus.depth_mm, focus.detail_e2, "o-", color="#2b8cbe", markersize=3, linewidth=1.5)
-    top = max(focus.detail_e2)
     for depth in focus.sharp_mm:
         axes.axvline(depth, color="#d95f02", linewidth=1, linestyle="--")
-        axes.annotate(
-            f"{depth:.0f} mm" if units.depth == "mm" else units.numbers_text([depth]).replace("-", "−"),
-            (depth, top),
-            xytext=(4, -2),
-            textcoords="offset points",
-            color="#d95f02",
-            va="top",
-        )
+        text = f"{depth:.0f} mm" if units.depth == "mm" else units.numbers_text([depth]).replace("-", "−")
+        peak = (depth, max(focus.detail_e2))
+        axes.annotate(text, peak, (4, -2), textcoords="offset points", color="#d95f02", va="top")
     squared = {"electrons": "e⁻²", "dn": "DN²", "relative": "white²"}[units.light]
-    axes.set(
-        xlabel=f"{units.quantity} ({units.length or 'relative'})",
-        ylabel=f"detail both halves\nof the views agree on ({squared})",
-    )
+    axes.set(xlabel=f"{units.quantity} ({units.length or 'relative'})")
+    axes.set(ylabel=f"detail both halves\nof the views agree on ({squared})")
     axes.ticklabel_format(axis="y", scilimits=(-3, 3))
     ink(axes)
     return svg(figure)
 
 
 def _weight_curves(planes: Sequence[Plane]) -> str | None:
-    """Return how well each penalty weight predicts the held-out views, as SVG; None if none were held out."""
+    """Return the prediction of the held-out views by each penalty weight as SVG; None if none were held out."""
     records = {
         (_line_name(plane), record.channel): record
         for plane in planes

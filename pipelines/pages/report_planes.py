@@ -28,14 +28,13 @@ from faintfield.pipelines.pages.page import format_depths
 # Order of the columns.
 _POSES_IN_ORDER: tuple[Poses, ...] = ("measured", "nominal", "true", "stated")
 
-# The poses and the method that a report leads with: the first of these that there are.
+# The poses that a report leads with: the first of these that there are.
 PREFERRED_POSES: tuple[Poses, ...] = ("measured", "stated", "nominal", "true")
-_PREFERRED_METHODS: tuple[Method, ...] = ("occlusion", "joint", "pmlem", "pmlem-osl", "mlem", "backprojection")
 
 # Order of the poses in the comparison of errors.
 _COMPARED_POSES: tuple[Poses, ...] = ("nominal", "measured", "true")
 
-# Names of the methods, in the order of the columns.
+# Names of the methods, in the order of the columns; a report leads with the last that there is.
 METHOD_NAMES: dict[Method, str] = {
     "backprojection": "back-projection",
     "mlem": "MLEM",
@@ -157,7 +156,8 @@ def column_titles(planes: list[Plane]) -> dict[str, str]:
 
 def best_column(planes: list[Plane]) -> str:
     """Return the column that a report leads with: the best method with the best poses."""
-    best = min(planes, key=lambda plane: (PREFERRED_POSES.index(plane.poses), _PREFERRED_METHODS.index(plane.method)))
+    methods = list(METHOD_NAMES)
+    best = min(planes, key=lambda plane: (PREFERRED_POSES.index(plane.poses), -methods.index(plane.method)))
     return best.column
 
 
@@ -176,11 +176,9 @@ class ErrorSections:
 
     Attributes
     ----------
-    metrics : list of (str, PlaneErrors)
-        The errors of each plane, after the title of its method.
-    geometry_off : GeometryErrors, optional
-        The errors of the measured poses.
-    pose_kinds, by_poses : list of Poses, list of ((float, str, str), dict)
+    metrics, geometry_off
+        Errors of each plane, after the title of its method, and of the measured poses.
+    pose_kinds, by_poses
         Poses in the order of the comparison, and the errors (bright) by poses, after depth, object and method.
     """
 

@@ -74,12 +74,8 @@ class SetSection:
 def set_sections(overviews: list[Path]) -> list[SetSection]:
     """Return the part of the page about each set, sets with noise first; sets with equal pictures are one set.
 
-    A set may have been reconstructed with several kinds of poses; its overview is that of the preferred ones.
-
-    Parameters
-    ----------
-    overviews : list of Path
-        Every overview.json.
+    A set may have been reconstructed with several kinds of poses; of every overview.json, that of the preferred ones
+    is shown.
     """
     distinct: dict[tuple[bytes, ...], tuple[Path, Overview]] = {}
     for path in overviews:

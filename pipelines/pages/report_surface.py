@@ -114,21 +114,16 @@ def _figures(folder: Path, surface: SurfaceRecord, units: StatedUnits) -> list[F
     film = _embedded(folder / surface.film) if surface.film and Path(surface.film).suffix in _FILMS else None
     circling = "From viewpoints between the nodes; the middle depth stands still, what is nearer moves most"
     measured = "in the unit of the poses, whose length is not known" if unit == "relative" else f"in {unit}"
+    right = f"Probability that the {quantity} is right within {_tolerance(surface)}"
+    light = "1 = white" if units.light == "relative" else units.light_symbol
+    noise = "Standard deviation of the light of each sample by noise, if its depth is right"
     known = f"Where each sample is, {measured}; hatched where that is not known"
     entries: list[tuple[str | UnsetType, str, str]] = [
         (surface.picture, "Sharp everywhere.", "One picture from all views, as the reference camera would see it"),
         (surface.depth, f"{quantity.capitalize()}, {unit}.", known),
-        (
-            surface.depth_confidence,
-            "How sure.",
-            f"Probability that the {quantity} is right within {_tolerance(surface)}",
-        ),
+        (surface.depth_confidence, "How sure.", right),
         (surface.depth_sigma, f"σ of the {quantity}, {unit}.", "Standard deviation, if the right surface was found"),
-        (
-            surface.picture_sigma,
-            f"σ of the picture, {'1 = white' if units.light == 'relative' else units.light_symbol}.",
-            "Standard deviation of the light of each sample by noise, if its depth is right",
-        ),
+        (surface.picture_sigma, f"σ of the picture, {light}.", noise),
         (surface.visibility, "Seen by.", "Number of views in which nothing hides the sample"),
         (surface.picture_proposal, "Proposal.", "What the prior proposed"),
         (surface.picture_moved, "Moved, σ.", "Picture less proposal, in standard deviations of the noise"),

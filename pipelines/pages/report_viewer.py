@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NotRequired, TypedDict
+from typing import Any, Literal, NotRequired, TypedDict
 
 import cv2
 import numpy as np
@@ -38,6 +38,9 @@ _MEDIAN_DIFFERENCE = 0.6745 * np.sqrt(2)
 
 type Kind = Literal["light", "sigma", "view", "bright"]
 
+# Black, white and name of the pictures of each kind when the page opens.
+type Scales = dict[Kind, dict[str, float | str]]
+
 
 @dataclass(frozen=True)
 class Fineness:
@@ -54,15 +57,8 @@ class Fineness:
 
 
 # Tried in turn until the numbers fit into their budget.
-_FINENESSES = (
-    Fineness(0, 0),
-    Fineness(1 / 16, 2**-13),
-    Fineness(1 / 8, 2**-12),
-    Fineness(1 / 4, 2**-11),
-    Fineness(1 / 3, 2**-10),
-    Fineness(1 / 2, 2**-9),
-    Fineness(1 / 2, 2**-8),
-)
+_SHARES = ((0, 0), (1 / 16, 2**-13), (1 / 8, 2**-12), (1 / 4, 2**-11), (1 / 3, 2**-10), (1 / 2, 2**-9), (1 / 2, 2**-8))
+_FINENESSES = tuple(Fineness(*shares) for shares in _SHARES)
 
 
 class ViewerPicture(TypedDict):
@@ -86,32 +82,8 @@ class ViewerPicture(TypedDict):
     element: NotRequired[str]
 
 
-class Scale(TypedDict):
-    """Black and white of the pictures of one kind when the page opens."""
-
-    black: float
-    white: float
-    name: str
-
-
-class Viewer(TypedDict):
-    """Data of the viewer; JSON for the page's script.
-
-    `first` are the indices of the two pictures that it opens with, `length` is the unit of lengths on the planes, and
-    `binned` says whether any plane is.
-    """
-
-    pictures: list[ViewerPicture]
-    scales: dict[Kind, Scale]
-    places: list[str]
-    quantity: str
-    length: str
-    binned: bool
-    first: tuple[int, int]
-
-
-def viewer_of(planes: list[Plane], shown: PlaneSections, the_set: SetSection | None) -> Viewer | None:
-    """Return the data of the viewer, None without planes.
+def viewer_of(planes: list[Plane], shown: PlaneSections, the_set: SetSection | None) -> dict[str, Any] | None:
+    """Return the data of the viewer as JSON for the page's script, None without planes.
 
     Parameters
     ----------
@@ -126,7 +98,7 @@ def viewer_of(planes: list[Plane], shown: PlaneSections, the_set: SetSection | N
         return None
     units = planes[0].units
     places = {plane.place: plane.label for plane in sorted(planes, key=lambda plane: plane.place)}
-    scales: dict[Kind, Scale] = {"light": {"black": 0.0, "white": shown.white, "name": "planes"}}
+    scales: Scales = {"light": {"black": 0.0, "white": shown.white, "name": "planes"}}
     views = _views(the_set, scales) if the_set else []
     numbers = _plane_pictures(planes, list(places), units)
     if shown.sigmas:
@@ -169,7 +141,7 @@ def _first(
     return 0 if second else min(1, len(pictures) - 1), second
 
 
-def _views(the_set: SetSection, scales: dict[Kind, Scale]) -> list[ViewerPicture]:
+def _views(the_set: SetSection, scales: Scales) -> list[ViewerPicture]:
     """Return the views that the page shows anyway, whose grey levels the script reads from there."""
     views: list[ViewerPicture] = []
     if the_set.pictures["view"] and the_set.overview.grey_scale_dn is not UNSET:

@@ -42,7 +42,7 @@ class StagedObject:
     light : float32 array (view, row, column)
         Light of the views, relative to that of a white object.
     region : bool array (row, column)
-        Where the reference view shows the object.
+        Mask of the object in the reference view.
     window : (slice, slice)
         Rows and columns of the reference view that the plane's samples overlay: the object and a margin.
     bright, texture : float array (row, column)

@@ -2,7 +2,6 @@
 
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from faintfield.pipelines.formats.results.records import PlaneRecord
 from faintfield.pipelines.paper.figure4 import PAPERS_AXIS, SNRS
 from faintfield.pipelines.paper.figure_methods import METHODS, OURS
 from faintfield.pipelines.paper.figure_records import CurvePoint
@@ -28,17 +28,11 @@ _STYLE: Any = {
 }
 
 
-@dataclass(frozen=True)
-class ShownPlane:
-    """A plane (row, column) in electrons, and its scale in mm."""
-
-    pixels: NDArray[Any]
-    depth_mm: float
-    pitch_mm: float
-    origin_mm: tuple[float, float]
+# Pixels (row, column) in electrons, and the record.
+type DrawnPlane = tuple[NDArray[Any], PlaneRecord]
 
 
-def draw_figure2(integral: NDArray[Any], planes: Sequence[ShownPlane]) -> bytes:
+def draw_figure2(integral: NDArray[Any], planes: Sequence[DrawnPlane]) -> bytes:
     """Return figure 2 as PNG: the bright integral image, and back-projections on one grey scale."""
     with rc_context(_STYLE):
         figure = Figure(figsize=(10.5, 3.1), layout="constrained")
@@ -51,7 +45,7 @@ def draw_figure2(integral: NDArray[Any], planes: Sequence[ShownPlane]) -> bytes:
 
 
 def draw_figure3(
-    dark: NDArray[Any], reference: NDArray[Any], scale_dn: tuple[float, float], snr: float, planes: Sequence[ShownPlane]
+    dark: NDArray[Any], reference: NDArray[Any], scale_dn: tuple[float, float], snr: float, planes: Sequence[DrawnPlane]
 ) -> bytes:
     """Return figure 3 as PNG: one dark view and the noise reference on one scale, and the planes on another."""
     with rc_context(_STYLE):
@@ -68,14 +62,14 @@ def draw_figure3(
         return _png(figure)
 
 
-def _draw_planes(figure: Figure, axes: Sequence[Axes], planes: Sequence[ShownPlane], letters: str, what: str) -> None:
+def _draw_planes(figure: Figure, axes: Sequence[Axes], planes: Sequence[DrawnPlane], letters: str, what: str) -> None:
     """Draw planes on one grey scale, with axes in millimetres."""
-    white = max(float(np.quantile(plane.pixels, 0.998)) for plane in planes)
-    for panel, plane, letter in zip(axes, planes, letters, strict=True):
-        rows, columns = plane.pixels.shape[:2]
+    white = max(float(np.quantile(pixels, 0.998)) for pixels, _ in planes)
+    for panel, (pixels, plane), letter in zip(axes, planes, letters, strict=True):
+        rows, columns = pixels.shape[:2]
         left, top = (start - plane.pitch_mm / 2 for start in plane.origin_mm)
         extent = (left, left + columns * plane.pitch_mm, top + rows * plane.pitch_mm, top)
-        image = panel.imshow(plane.pixels, cmap="gray", vmin=0, vmax=white, extent=extent, interpolation="none")
+        image = panel.imshow(pixels, cmap="gray", vmin=0, vmax=white, extent=extent, interpolation="none")
         panel.set(title=f"({letter}) {what} at {plane.depth_mm:g} mm", xlabel="x (mm)", ylabel="y, downwards (mm)")
     figure.colorbar(image, ax=list(axes), shrink=0.85, label="expected e⁻ per pixel")
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from faintfield.pipelines.choices import FigureNumber
 from faintfield.pipelines.console import inform
@@ -20,7 +21,7 @@ from faintfield.pipelines.formats.sets.ground_truth import read_truth, texture_a
 from faintfield.pipelines.pages.page import data_uri, template
 from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.paper.figure4 import PAPERS_AXIS, is_monotone, mean_curves, measure_errors, over_best
-from faintfield.pipelines.paper.figure_drawings import ShownPlane, draw_figure2, draw_figure3, draw_figure4
+from faintfield.pipelines.paper.figure_drawings import DrawnPlane, draw_figure2, draw_figure3, draw_figure4
 from faintfield.pipelines.paper.figure_methods import BEST, METHODS, OURS
 from faintfield.pipelines.paper.figure_records import (
     DarkPlaneRow,
@@ -101,13 +102,13 @@ def _figure2(out: Path, _: FigureOptions) -> Figure2:
     outcome = _reconstruct(out / _SCENE / NOISE_FREE, out / _BRIGHT, "backprojection")
     planes = _read_planes(out / _BRIGHT, outcome.planes)
     integral = read_frame(out / _BRIGHT / INTEGRAL_IMAGE).pixels_dn
-    rows = [row for plane in planes for row in _detail_rows(out / _SCENE, plane)]
+    rows = [row for pixels, plane in planes for row in _detail_rows(out / _SCENE, pixels, plane.depth_mm)]
     numbers = Figure2(rows)
     _write(out, 2, draw_figure2(integral, planes), rows, numbers)
     return numbers
 
 
-def _detail_rows(scene: Path, plane: ShownPlane) -> list[DetailRow]:
+def _detail_rows(scene: Path, pixels: NDArray[np.float32], depth_mm: float) -> list[DetailRow]:
     """Return the share of each object's detail that a plane shows.
 
     Detail d is what a small blur removes. The share is `<d_plane · d_object> / <d_object²>` over the region where the
@@ -118,9 +119,9 @@ def _detail_rows(scene: Path, plane: ShownPlane) -> list[DetailRow]:
     rows = []
     for known in truth.planes:
         texture, region = texture_and_region(scene, known)
-        of_plane, of_object = ((image - blurred(image, _DETAIL_BLUR))[region] for image in (plane.pixels, texture))
+        of_plane, of_object = ((image - blurred(image, _DETAIL_BLUR))[region] for image in (pixels, texture))
         share = float(np.sum(of_plane * of_object) / np.sum(np.square(of_object)))
-        rows.append(DetailRow(plane.depth_mm, known.name, known.depth_mm, share))
+        rows.append(DetailRow(depth_mm, known.name, known.depth_mm, share))
     return rows
 
 
@@ -169,11 +170,8 @@ def _reconstruct(set_path: Path, out: Path, method: Method) -> Outcome:
     return outcome
 
 
-def _read_planes(folder: Path, records: Sequence[PlaneRecord]) -> list[ShownPlane]:
-    return [
-        ShownPlane(read_frame(folder / plane.file).pixels_dn, plane.depth_mm, plane.pitch_mm, plane.origin_mm)
-        for plane in records
-    ]
+def _read_planes(folder: Path, records: Sequence[PlaneRecord]) -> list[DrawnPlane]:
+    return [(read_frame(folder / plane.file).pixels_dn, plane) for plane in records]
 
 
 def _write(out: Path, number: int, picture: bytes, rows: Sequence[Row], numbers: Any) -> None:

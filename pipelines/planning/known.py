@@ -11,12 +11,7 @@ from numpy.typing import NDArray
 from faintfield.calib.noise_model import NoiseModel
 from faintfield.pipelines.formats.reading import is_file, is_folder
 from faintfield.pipelines.formats.results.geometry import CameraPoses, read_geometry
-from faintfield.pipelines.formats.results.noise import (
-    NOISE_MAPS,
-    NoiseRecord,
-    read_maps,
-    read_noise,
-)
+from faintfield.pipelines.formats.results.noise import NOISE_MAPS, NoiseRecord, read_maps, read_noise
 from faintfield.pipelines.formats.results.noise_fit import Measured
 from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.devices import open_rig
@@ -37,18 +32,16 @@ _simulated_experiment = lru_cache(maxsize=1)(lab_experiment)
 
 @dataclass(frozen=True)
 class Sensor:
-    """Known noise.
+    """Knowledge of the noise.
 
     Attributes
     ----------
     source : str
         Its source, in words.
-    read_noise_e, dark_current_e_per_s, gain_dn_per_e, quantum_efficiency : Measured
-        The paper's quantities, and the gain.
     record, path : NoiseRecord and Path, optional
         The calibration that it is from, and its file.
     model : NoiseModel, optional
-        That of a simulated camera.
+        Noise model of a simulated camera.
     """
 
     source: str
@@ -88,13 +81,7 @@ def _measured_sensor(path: Path) -> Sensor:
     if not isinstance(efficiency, Measured):  # a record holds it with or without its error
         efficiency = Measured(efficiency, why="not stated" if efficiency is None else None)
     return Sensor(
-        str(path),
-        record.read_noise_e,
-        record.dark_current_e_per_s,
-        record.gain_dn_per_e,
-        efficiency,
-        record,
-        path,
+        str(path), record.read_noise_e, record.dark_current_e_per_s, record.gain_dn_per_e, efficiency, record, path
     )
 
 
@@ -109,7 +96,7 @@ def _simulated_sensor(settings: SimulatedSettings) -> Sensor:
 
 @dataclass(frozen=True)
 class KnownLens:
-    """Known lens.
+    """Knowledge of the lens.
 
     Attributes
     ----------
@@ -118,7 +105,7 @@ class KnownLens:
     size_px : (int, int), optional
         Width and height of a frame.
     centre_px : (float, float), optional
-        Where the axis meets the detector.
+        Point where the axis meets the detector.
     response : array (row, column), optional
         Relative response, vignetting included.
     """
@@ -131,7 +118,7 @@ class KnownLens:
     def responses(self, centres_mm: NDArray[np.float64], depth_mm: float | None) -> NDArray[np.float64]:
         """Return the response of each view (view,) where it sees the middle of the reference view; 0 if it does not.
 
-        What is not known takes nothing away: all views then see it, or see it equally well.
+        Without a depth, a lens or a response all views see it, or see it equally well.
 
         Parameters
         ----------
@@ -170,11 +157,9 @@ def known_lens(settings: RigSettings, sensor: Sensor, geometry: Path | None, fx_
     size_px = sensor.record.size_px if sensor.record is not None else None
     centre_px = None
     f_px = Measured(None, why="no focal length; give --fx-px, or the result of `faintfield geometry` as --geometry")
-    if geometry is not None:
-        lens = read_geometry(geometry, CameraPoses).camera_lens()
+    lens = simulated if geometry is None else read_geometry(geometry, CameraPoses).camera_lens()
+    if lens is not None:
         size_px, centre_px, f_px = lens.size_px, (lens.cx_px, lens.cy_px), Measured(lens.fx_px)
-    elif simulated is not None:
-        size_px, centre_px, f_px = simulated.size_px, (simulated.cx_px, simulated.cy_px), Measured(simulated.fx_px)
     if fx_px is not None:
         f_px = Measured(fx_px)
     if centre_px is None and size_px is not None:
@@ -190,15 +175,7 @@ def known_lens(settings: RigSettings, sensor: Sensor, geometry: Path | None, fx_
 
 @dataclass(frozen=True)
 class KnownPace:
-    """Speeds of stage and camera, and the travel of the stage.
-
-    Attributes
-    ----------
-    motion, feed_mm_per_s, workspace : MotionLimits, float, StageWorkspace
-        Limits, feed and allowed positions of the stage.
-    readout_s : float
-        Readout of the camera.
-    """
+    """Limits, feed and allowed positions of the stage, and the readout of the camera."""
 
     motion: MotionLimits
     feed_mm_per_s: float

@@ -37,10 +37,8 @@ class LightOptions:
     ----------
     e, e_per_s : float, optional
         Electrons per pixel in one frame, or in a second.
-    flat, test_frame : Path, optional
-        A frame of even light, and one of the scene.
-    exposure_s : float, optional
-        That of the frame; by default what its file states.
+    flat, test_frame, exposure_s : Path and float, optional
+        A frame of even light, or one of the scene, and its exposure; by default that which its file states.
     region_px : (int, int, int, int), optional
         Left column, upper row, width and height of the object in the frame; by default the middle of a flat, or all
         of a test frame.
@@ -66,7 +64,7 @@ class LightOptions:
         Raises
         ------
         WrongUsage
-            None or several are options.
+            None or several are given.
         InputError
             The frame cannot be used, or shows no light.
         """

@@ -38,7 +38,11 @@ from faintfield.rig.stages.protocol import Point
 # Longest table; more rows are a typing error.
 _MAX_ROWS = 500
 
+_NO_BLUR = "nothing measures the lens's blur, none is assumed; --blur-px states it"
 _NO_DEPTH = "no depth; give --depth-mm, or depth_mm under [scene] of the rig.toml"
+
+
+type Array = NDArray[np.float64]
 
 
 class View(NamedTuple):
@@ -176,6 +180,7 @@ class Predictor:
         centres_mm, response = self._views(grid, depth_mm)
         depth = Measured(depth_mm) if depth_mm is not None else Measured(None, why=_NO_DEPTH)
         scale = _with(lambda z, f: z / f, depth, self.lens.f_px)
+        blur = Measured(self.question.blur_px, why=_NO_BLUR if self.question.blur_px is None else None)
         aperture_mm = grid.pitch_mm * (max(grid.rows, grid.columns) - 1)
         step = Measured(None, why="one node has no aperture")
         if aperture_mm > 0:
@@ -186,21 +191,13 @@ class Predictor:
             seen_by_all_mm=self._seen_by_all_mm(grid, scale.value),
             sigma_e=self._sigma(view, response),
             mm_per_px=scale,
-            blur_mm=_with(lambda blur, mm: blur * mm, self._blur(), scale),
+            blur_mm=_with(lambda blur, mm: blur * mm, blur, scale),
             depth_step_mm=step,
-            features=[
-                self._feature(view, centres_mm, response, side_px, depth, scale) for side_px in self.question.sides_px
-            ],
+            features=[self._feature(view, centres_mm, response, side_px, depth) for side_px in self.question.sides_px],
         )
 
     def _feature(
-        self,
-        view: View,
-        centres_mm: NDArray[np.float64],
-        response: NDArray[np.float64],
-        side_px: float,
-        depth: Measured,
-        scale: Measured,
+        self, view: View, centres_mm: Array, response: Array, side_px: float, depth: Measured
     ) -> FeaturePrediction:
         contrast = self._contrast(view, response, side_px)
         unknown = next((quantity for quantity in (depth, self.lens.f_px) if quantity.value is None), None)
@@ -209,39 +206,37 @@ class Predictor:
         if unknown is None and contrast.value is not None and contrast.value > 1:
             unknown = Measured(None, why="even a black square is not visible")
 
-        def depth_sigma(light_e: float, information: NDArray[np.float64]) -> float:
+        def depth_sigma(light_e: float, information: Array) -> float:
             black = {"side_px": side_px, "difference_e": light_e, "blur_px": self.question.blur_px or 0.0}
             return depth_sigma_mm(depth.value or 0.0, self.lens.f_px.value or 0.0, centres_mm, information, **black)
 
         return FeaturePrediction(
             side_px=side_px,
-            side_mm=_with(lambda mm: side_px * mm, scale),
+            side_mm=_with(lambda z, f: side_px * (z / f), depth, self.lens.f_px),
             smallest_contrast=contrast,
             depth_sigma_mm=unknown or self._from_information(view, response, depth_sigma),
         )
 
-    def _contrast(self, view: View, response: NDArray[np.float64], side_px: float) -> Measured:
+    def _contrast(self, view: View, response: Array, side_px: float) -> Measured:
         """Return the contrast from which a square is visible."""
         k, blur_px = self.question.rose_k, self.question.blur_px or 0.0
 
-        def contrast(light_e: float, information: NDArray[np.float64]) -> float:
+        def contrast(light_e: float, information: Array) -> float:
             return smallest_contrast(side_px, light_e, float(information.sum()), k=k, blur_px=blur_px)
 
         return self._from_information(view, response, contrast)
 
-    def _sigma(self, view: View, response: NDArray[np.float64], exposure_s: float | None = None) -> Measured:
+    def _sigma(self, view: View, response: Array, exposure_s: float | None = None) -> Measured:
         """Return σ of a sample in electrons of a view, or of an exposure."""
         count = int(np.count_nonzero(response))
         unit = 1.0 if exposure_s is None else exposure_s / view.exposure_s
 
-        def sigma(_: float, information: NDArray[np.float64]) -> float:
+        def sigma(_: float, information: Array) -> float:
             return unit * sample_sigma_e(float(information.sum()), count)
 
         return self._from_information(view, response, sigma)
 
-    def _from_information(
-        self, view: View, response: NDArray[np.float64], compute: Callable[[float, NDArray[np.float64]], float]
-    ) -> Measured:
+    def _from_information(self, view: View, response: Array, compute: Callable[[float, Array], float]) -> Measured:
         """Return a number computed from the light in electrons and the information of each view about a sample."""
 
         def of_view(light_e: float, dark_e: float, noise_e: float) -> float:
@@ -249,7 +244,7 @@ class Predictor:
 
         return self._from_light(view, of_view)
 
-    def _views(self, grid: Grid, depth_mm: float | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _views(self, grid: Grid, depth_mm: float | None) -> tuple[Array, Array]:
         """Return the cameras' places (view, 2) relative to the reference camera, and the response of each view."""
         nodes = np.array(grid_nodes(grid.rows, grid.columns)) - centre_node(grid.rows, grid.columns)
         centres_mm = grid.pitch_mm * nodes[:, ::-1].astype(float)
@@ -263,11 +258,6 @@ class Predictor:
         wide = width * mm_per_px - (grid.columns - 1) * grid.pitch_mm
         high = height * mm_per_px - (grid.rows - 1) * grid.pitch_mm
         return max(wide, 0.0), max(high, 0.0)
-
-    def _blur(self) -> Measured:
-        if self.question.blur_px is not None:
-            return Measured(self.question.blur_px)
-        return Measured(None, why="nothing measures the lens's blur, none is assumed; --blur-px states it")
 
     def _alternatives(self, exposure_s: float, view: View) -> list[Alternative]:
         question, grid = self.question, self.settings.grid

@@ -130,7 +130,7 @@ def test_missing_noise_gives_dn_but_lens_is_needed(session: Path, tmp_path: Path
     with pytest.raises(MissingFile, match=r"no lens is known, and live planes need one; run .* --geometry or --fx-px"):
         live_scene(order, frozen, frame)
     scene = live_scene(msgspec.structs.replace(order, fx_px=410.0), frozen, frame)
-    assert (scene.unit, scene.knows_noise, scene.elemental_set.lens.fx_px) == ("DN/px", False, 410.0)
+    assert (scene.knows_noise, scene.elemental_set.lens.fx_px) == (False, 410.0)
     planes = PlaneAccumulator(scene, session / "frames", [_DEPTH_MM])
     planes.add(frames_of(session)[8], [0])
     found = planes.picture(0, "view")
