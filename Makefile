@@ -12,7 +12,7 @@ MODULES ?= recon calib rig/session rig/capture rig/stages
 SHELL := bash
 # Without stored byte code, each command that a test starts compiles all sources again.
 unexport PYTHONDONTWRITEBYTECODE
-TIMEFORMAT = %R s elapsed, %U s + %S s of CPU (budget: 180 s, 330 s in all; CONTRIBUTING.md)
+TIMEFORMAT = %R s elapsed, %U s + %S s of CPU (budget of all quick tests: 180 s, 330 s of CPU; CONTRIBUTING.md)
 
 .PHONY: demo test deep lint bench mutants results lock clean help
 
@@ -25,11 +25,11 @@ demo: $(VENV)/compiled ## the whole experiment, simulated; the last line is the 
 test: $(VENV)/compiled-float64 ## the quick tests, on two cores
 	@TIMEFORMAT='$(TIMEFORMAT)'; time $(PYTEST)
 
-test-%: $(VENV)/compiled-float64 ## those of one package: make test-rig, -calib, -recon, -pipelines
+test-%: $(VENV)/compiled-float64 ## those of one folder: make test-rig, -calib, -recon, -pipelines, -end_to_end, -faults
 	@TIMEFORMAT='$(TIMEFORMAT)'; time $(PYTEST) tests/$*
 
-deep: $(VENV)/compiled-float64 ## damaged files, kills, faults, full demo, mutants, installs: an hour, before a release; goes on where it stopped
-	.ci/deep
+deep: $(VENV)/compiled-float64 ## damaged files, kills, full demo, mutants, installs: an hour, before a release; one of them: STAGES=mutants
+	.ci/deep $(STAGES)
 
 lint: $(VENV)/installed ## style, types and import contracts
 	$(BIN)/ruff check .

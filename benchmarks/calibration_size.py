@@ -12,7 +12,7 @@ import numpy as np
 from faintfield.calib.board import Board
 from faintfield.calib.detection import detect_boards
 from faintfield.calib.noise import Conditions, Series, calibrate, measure_series
-from faintfield.calib.noise.room import maps_by
+from faintfield.calib.noise.strips import maps_by
 from faintfield.pipelines.formats.large_arrays import maps_in_files
 
 _SEED, _LIGHT_E = 1288, (1000.0, 4000.0, 16000.0)

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.pipelines.paper.figure4 import SNRS, StagedObject, stage_object
-from faintfield.pipelines.reconstruction.planes import solve
-from faintfield.pipelines.reconstruction.solutions import PriorName, Settings
+from faintfield.pipelines.reconstruction.planes.solutions import PriorName, Settings
+from faintfield.pipelines.reconstruction.planes.solve import solve
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.metrics import signal_scale_for_snr
 from faintfield.recon.solver.initialization import back_projection

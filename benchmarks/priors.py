@@ -21,8 +21,8 @@ from benchmarks.bm3d_peer import Bm3d
 from benchmarks.prior_faults import BANDS, Residual, dark_samples, residuals_of_fields, specks
 from benchmarks.prior_pictures import ShownPlane, draw
 from faintfield.pipelines.paper.figure4 import SNRS, StagedObject, stage_object
-from faintfield.pipelines.reconstruction.planes import solve
-from faintfield.pipelines.reconstruction.solutions import PriorName, Settings, Solution
+from faintfield.pipelines.reconstruction.planes.solutions import PriorName, Settings, Solution
+from faintfield.pipelines.reconstruction.planes.solve import solve
 from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.solver.initialization import back_projection
 from faintfield.rig.simulation.objects import sailing_boat, shaded_ball, toy_airplane, toy_truck

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from faintfield.calib.noise import Conditions, NoiseCalibration, Series, calibrate, measure_series
 from faintfield.calib.noise_model import NoiseModel
-from faintfield.pipelines.reconstruction.planes import solve
-from faintfield.pipelines.reconstruction.solutions import Settings
+from faintfield.pipelines.reconstruction.planes.solutions import Settings
+from faintfield.pipelines.reconstruction.planes.solve import solve
 from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.metrics import signal_scale_for_snr
 from faintfield.recon.operator.grid import PlaneGrid

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from faintfield.pipelines.formats.sets.elemental_set import load_set
-from faintfield.pipelines.reconstruction.luminance import default_bins, luminance
-from faintfield.pipelines.reconstruction.surface_depths import between_pixels, nodes_of
+from faintfield.pipelines.reconstruction.depth.luminance import default_bins, luminance
+from faintfield.pipelines.reconstruction.depth.search import between_pixels, nodes_of
 from faintfield.recon.surface.confidence import COEFFICIENTS, RIGHT_WITHIN, SURE, features
 from faintfield.recon.surface.estimate import first_depths, halves, next_depths
 from faintfield.recon.surface.evidence import DepthEvidence

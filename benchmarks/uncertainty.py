@@ -21,8 +21,8 @@ import skimage.data
 from numpy.typing import NDArray
 
 from faintfield.calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray
-from faintfield.pipelines.reconstruction.planes import solve
-from faintfield.pipelines.reconstruction.solutions import PriorName, Settings
+from faintfield.pipelines.reconstruction.planes.solutions import PriorName, Settings
+from faintfield.pipelines.reconstruction.planes.solve import solve
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.metrics import signal_scale_for_snr
 from faintfield.recon.operator.grid import PlaneGrid

@@ -32,10 +32,8 @@ from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.grblhal import SimulatedGrblHal
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.simulation.lab import SimulatedCamera, SimulatedLab
-from faintfield.rig.stages.drivers import make_stage
-from faintfield.rig.stages.gantry import Gantry
-from faintfield.rig.stages.micromanager.controller import MicroManagerController
-from faintfield.rig.stages.micromanager.settings import MicroManagerStage
+from faintfield.rig.stages.gantry import Gantry, make_stage
+from faintfield.rig.stages.micromanager import MicroManagerController, MicroManagerStage
 from faintfield.rig.stages.protocol import SERIAL_PROTOCOLS, StageSettings
 from faintfield.rig.stages.protocol import SIMULATED as SIMULATED  # commands take it from here
 from faintfield.rig.stages.transport import SerialPort, TrafficLog
@@ -45,14 +43,10 @@ SIMULATED_FIRMWARE = {"grbl": SimulatedGrbl, "grblhal": SimulatedGrblHal, "marli
 
 @dataclass(frozen=True)
 class Rig:
-    """The devices of a capture, not yet connected.
+    """The devices of a capture, not yet connected, and their clock.
 
     Parameters
     ----------
-    stage, camera : Gantry, Camera
-        The devices.
-    clock : Clock
-        Their clock.
     arrange : callable
         Called with kind and sweep at the beginning of each step; a simulated lab then does what a person does in a
         real one.
@@ -70,16 +64,8 @@ class Rig:
 def open_rig(settings: RigSettings, traffic: TrafficLog | None = None, decode: Decode = lambda path: None) -> Rig:
     """Construct the stage and the camera of a rig.toml; neither is connected yet.
 
-    A real camera may look on while a simulated stage moves: a rehearsal without motors.
-
-    Parameters
-    ----------
-    settings : RigSettings
-        Content of the rig.toml.
-    traffic : TrafficLog, optional
-        Log of every byte to and from the stage.
-    decode : callable, optional
-        Reads the pixels of a frame's file; a watched folder then knows when a file is complete.
+    A real camera may look on while a simulated stage moves: a rehearsal without motors. `traffic` gets every byte to
+    and from the stage; `decode` reads the pixels of a file, so that a watched folder knows when a file is complete.
 
     Raises
     ------
@@ -90,7 +76,7 @@ def open_rig(settings: RigSettings, traffic: TrafficLog | None = None, decode: D
     """
     if settings.stage.protocol == "micromanager" and settings.drift.check:
         raise PlanRefused(
-            "drift.check = true times homing against the switches, which Micro-Manager does not tell; set it to false"
+            "drift.check = true times homing switches, of which Micro-Manager knows none; set it to false"
         )
     bench = _simulated_bench(settings.stage) if settings.stage.simulated else None
     core = _shared_core(settings)
@@ -106,7 +92,6 @@ def open_rig(settings: RigSettings, traffic: TrafficLog | None = None, decode: D
 
 
 def _open_camera(settings: CameraSettings, core: SharedCore | None, decode: Decode) -> Camera:
-    """Return a real camera, not yet connected."""
     match settings:
         case GPhoto2Settings():
             return GPhoto2Camera(settings)
@@ -122,20 +107,18 @@ def _open_camera(settings: CameraSettings, core: SharedCore | None, decode: Deco
 
 
 def _shared_core(settings: RigSettings) -> SharedCore | None:
-    """Return the core that camera and stage share if Micro-Manager drives both."""
     if not isinstance(settings.camera, MicroManagerSettings) or settings.stage.protocol != "micromanager":
         return None
-    ours, theirs = settings.camera, _micromanager_stage(settings.stage)
-    if (ours.configuration, ours.adapters) != (theirs.configuration, theirs.adapters):
+    camera, stage = settings.camera, _micromanager_stage(settings.stage)
+    if (camera.configuration, camera.adapters) != (stage.configuration, stage.adapters):
         raise PlanRefused(
-            f"camera.configuration = {ours.configuration!r} and stage.configuration = {theirs.configuration!r}, or "
+            f"camera.configuration = {camera.configuration!r} and stage.configuration = {stage.configuration!r}, or "
             "their adapters, differ; Micro-Manager loads one configuration with all devices: name the same in both"
         )
-    return SharedCore(ours.configuration, ours.adapters)
+    return SharedCore(camera.configuration, camera.adapters)
 
 
 def _micromanager_stage(settings: StageSettings) -> MicroManagerStage:
-    """Return the settings of a Micro-Manager stage."""
     return checked_options(settings.options, MicroManagerStage, "[stage] with protocol = 'micromanager'")
 
 
@@ -152,14 +135,10 @@ def open_stage(
 
     Parameters
     ----------
-    settings : StageSettings
-        The `[stage]` table.
-    traffic : TrafficLog, optional
-        Log of every byte sent and received over a serial port.
-    bench : Bench, optional
-        Bench of a simulated stage; by default a new one.
-    core : SharedCore, optional
-        Micro-Manager's core, if the camera uses it as well.
+    settings, traffic : StageSettings, TrafficLog or None
+        The `[stage]` table; log of every byte sent and received over a serial port.
+    bench, core : Bench or None, SharedCore or None
+        Bench of a simulated stage, by default a new one; Micro-Manager's core, if the camera uses it as well.
 
     Raises
     ------
@@ -181,11 +160,6 @@ def open_stage(
     return Gantry(plugin_controller(settings, clock), settings, clock)
 
 
-def is_simulated(settings: StageSettings) -> bool:
-    """Return whether `settings` describe a simulated stage."""
-    return settings.simulated
-
-
 def _simulated_bench(settings: StageSettings) -> Bench:
     """Return the bench of the simulated stage that `settings` name, such as `simulated:grbl` or `simulated:grbl:pty`.
 
@@ -194,8 +168,7 @@ def _simulated_bench(settings: StageSettings) -> Bench:
     name, _, cable = settings.port.removeprefix(SIMULATED).partition(":")
     if (name or "grbl") not in SIMULATED_FIRMWARE or cable not in ("", "pty"):
         raise PlanRefused(
-            f"{settings.port}: no such stage is simulated; name one of {', '.join(SIMULATED_FIRMWARE)}, "
-            "with or without :pty after it"
+            f"{settings.port}: no such stage; choose {', '.join(SIMULATED_FIRMWARE)}, with or without :pty after it"
         )
     if not cable:
         return Bench(SIMULATED_FIRMWARE[name or "grbl"])

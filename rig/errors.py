@@ -88,34 +88,29 @@ class PositionLost(StageError):
     """The stage is not at its target."""
 
 
-class PositionDrifted(PositionLost):
+class _SuspectFrames(StageError):
+    def __init__(self, message: str, *, suspect: tuple[object, ...] = ()) -> None:
+        super().__init__(message)
+        self.suspect = suspect
+
+
+class PositionDrifted(_SuspectFrames, PositionLost):
     """Homing again showed lost steps: positions since the last passed check are suspect.
 
     Attributes
     ----------
     suspect : tuple
-        What was recorded since the last passed check, in order.
+        Frames recorded since the last passed check, in order.
     """
 
-    def __init__(self, message: str, *, suspect: tuple[object, ...] = ()) -> None:
-        super().__init__(message)
-        self.suspect = suspect
 
+class DriftUnknown(_SuspectFrames):
+    """Homing could not be timed, as answers were delayed: nothing is known about lost steps.
 
-class DriftUnknown(StageError):
-    """Homing could not be timed, as this computer or the line delayed answers: nothing is known about lost steps.
-
-    Attributes
-    ----------
-    suspect : tuple
-        What was recorded since the last passed check, in order.
+    It has the frames since the last passed check in `suspect`, as `PositionDrifted` has.
     """
 
     position_kept = True
-
-    def __init__(self, message: str, *, suspect: tuple[object, ...] = ()) -> None:
-        super().__init__(message)
-        self.suspect = suspect
 
 
 class PlanRefused(RigError):

@@ -33,14 +33,8 @@ def set_properties(core: Any, label: str, properties: Mapping[str, str]) -> None
 class SharedCore:
     """A core that is loaded for its first user and unloaded after its last; its methods block, and may hang.
 
-    Devices are loaded once, since most can be opened only once.
-
-    Parameters
-    ----------
-    configuration : str
-        Micro-Manager's .cfg file; by default that of the demonstration devices.
-    adapters : str
-        Folder of the device adapters; by default the one that pymmcore-plus finds.
+    Devices are loaded once, since most can be opened only once. By default the configuration is that of the
+    demonstration devices, and their adapters are those that pymmcore-plus finds.
     """
 
     def __init__(self, configuration: str = "", adapters: str = "") -> None:
@@ -57,7 +51,7 @@ class SharedCore:
             import pymmcore_plus  # noqa: F401
         except ImportError as failure:
             raise PackageMissing(
-                "'micromanager' needs a package that is not installed; run: pip install 'faintfield[micromanager]'"
+                "'micromanager' needs a package; run: pip install 'faintfield[micromanager]'"
             ) from failure
 
     def acquire(self, user: User) -> Any:
@@ -75,7 +69,7 @@ class SharedCore:
             )
         if self._core is None:
             given_up = self._given_up
-            core = self._loaded()
+            core = self._load_core()
             if given_up != self._given_up:  # nobody waits for it any more, and another core may be in use
                 core.unloadAllDevices()
                 raise RuntimeError("the devices were loaded too late; connect again")
@@ -101,8 +95,7 @@ class SharedCore:
             self._core = None
             self._hanging.clear()
 
-    def _loaded(self) -> Any:
-        """Return a core with the configured devices."""
+    def _load_core(self) -> Any:
         from pymmcore_plus import CMMCorePlus
 
         core = CMMCorePlus()

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from faintfield.rig.stages.motion import one_sided_path, path_duration_s
 from faintfield.rig.stages.protocol import MotionLimits, Point
-from faintfield.rig.stages.workspace import StageWorkspace
 
 
 def grid_nodes(rows: int, columns: int) -> list[tuple[int, int]]:
@@ -70,16 +69,12 @@ class Grid(Struct, frozen=True, forbid_unknown_fields=True):
     order: Order = "serpentine"
 
     def __post_init__(self) -> None:
-        if self.rows < 1 or self.columns < 1 or not self.pitch_mm > 0.0:
-            raise ValueError(
-                f"a grid has at least one row and column and a positive pitch; got {self.rows} x {self.columns} "
-                f"at {self.pitch_mm:g} mm"
-            )
-        if self.rows * self.columns > MAX_FRAMES:
-            raise ValueError(
-                f"a grid of {self.rows} x {self.columns} has {self.rows * self.columns} nodes, at most {MAX_FRAMES} "
-                "are possible; take fewer rows or columns"
-            )
+        nodes = self.rows * self.columns
+        if min(self.rows, self.columns) < 1 or not self.pitch_mm > 0.0:
+            size = f"{self.rows} x {self.columns} at {self.pitch_mm:g} mm"
+            raise ValueError(f"a grid has at least one row and column and a positive pitch; got {size}")
+        if nodes > MAX_FRAMES:
+            raise ValueError(f"a grid of {nodes} nodes, at most {MAX_FRAMES} are possible; take fewer rows or columns")
 
     def position(self, row: int, column: int) -> Point:
         """Return the position of a node."""
@@ -133,11 +128,7 @@ class CaptureStep(Struct, frozen=True, forbid_unknown_fields=True):
     at: Literal["grid", "centre"] = "grid"
 
     def __post_init__(self) -> None:
-        if (
-            not self.exposure_s
-            or not all(exposure_s > 0.0 for exposure_s in self.exposure_s)
-            or self.frames_per_node < 1
-        ):
+        if not self.exposure_s or not all(time_s > 0.0 for time_s in self.exposure_s) or self.frames_per_node < 1:
             raise ValueError(f"a step needs exposure times above 0 s and at least one frame; got {self}")
         if max(self.exposure_s) > MAX_EXPOSURE_S:
             raise ValueError(f"exposure_s = {max(self.exposure_s):g}; an exposure lasts {MAX_EXPOSURE_S:g} s at most")
@@ -208,16 +199,6 @@ class CapturePlan(Struct, frozen=True, forbid_unknown_fields=True):
             if target != points[-1]:
                 points.extend(one_sided_path(points[-1], target, self.approach_mm))
         return tuple(points)
-
-    def check(self, workspace: StageWorkspace, start: Point | None = None) -> None:
-        """Check that the stage may go to all positions, and along the path between them.
-
-        Raises
-        ------
-        OutsideTravel, KeepOutCrossed
-            The path leaves the travel of the stage, or meets a keep-out box.
-        """
-        workspace.check_path(self.path(start))
 
     def duration_s(self, motion: MotionLimits, feed_mm_per_s: float, start: Point | None = None) -> float:
         """Return the duration of the capture without prompts, from the controller's rates and accelerations."""

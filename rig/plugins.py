@@ -10,7 +10,7 @@ import msgspec
 from msgspec import Struct
 
 from faintfield.rig.cameras.protocol import Camera, CameraReport, Exposure, Thermometer
-from faintfield.rig.cameras.settings import BUILT_IN_BACKENDS, CoolingSettings, PluginSettings
+from faintfield.rig.cameras.settings import BUILT_IN_BACKENDS, MosaicSettings, PluginSettings
 from faintfield.rig.clock import Clock
 from faintfield.rig.errors import CameraError, PlanRefused, PluginFailed, RigError, UnknownPlugin, in_one_line
 from faintfield.rig.stages.protocol import BUILT_IN_PROTOCOLS, WITHOUT_OPTIONS, Controller, StageSettings
@@ -22,7 +22,7 @@ STAGES = "faintfield.stages"
 _BUILT_IN = {CAMERAS: ("camera.backend", BUILT_IN_BACKENDS), STAGES: ("stage.protocol", BUILT_IN_PROTOCOLS)}
 
 # Keys of `[camera]` that are not the plug-in's own.
-_COMMON = ("mosaic", *CoolingSettings.__struct_fields__)
+_COMMON = MosaicSettings.__struct_fields__
 
 
 @dataclass(frozen=True)
@@ -98,19 +98,11 @@ def plugin_camera(settings: PluginSettings, clock: Clock) -> Camera:
     """
     plugin = _load(CAMERAS, settings.name, CameraPlugin)
     options = checked_options(settings.options, plugin.settings, f"[camera] with backend = {settings.name!r}")
-    return PluginCamera(settings.name, _made(settings.name, lambda: plugin.make(options, clock)))
+    return PluginCamera(settings.name, _make(settings.name, lambda: plugin.make(options, clock)))
 
 
 class PluginCamera:
-    """A camera of another package, whose failures all become `CameraError`.
-
-    Parameters
-    ----------
-    name : str
-        Name of the plug-in.
-    camera : Camera
-        Its camera.
-    """
+    """A camera of another package, the plug-in `name`, whose failures all become `CameraError`."""
 
     def __init__(self, name: str, camera: Camera) -> None:
         self._name = name
@@ -138,15 +130,13 @@ class PluginCamera:
         self._named(self._camera.close)
 
     def _named[T](self, call: Callable[[], T]) -> T:
-        """Call the plug-in; what it raises besides `RigError` becomes a `CameraError` that names it."""
         try:
             return call()
         except RigError:
             raise
         except Exception as failure:  # a plug-in may raise anything
             raise CameraError(
-                f"the plug-in {self._name!r} failed with {type(failure).__name__}: {in_one_line(failure)}; tell "
-                "its maintainers"
+                f"the plug-in {self._name!r} failed: {type(failure).__name__}: {in_one_line(failure)}; tell its authors"
             ) from failure
 
 
@@ -155,7 +145,7 @@ def plugin_controller(settings: StageSettings, clock: Clock) -> Controller:
     name = settings.protocol
     plugin = _load(STAGES, name, StagePlugin)
     options = checked_options(settings.options, plugin.settings, f"[stage] with protocol = {name!r}")
-    return _made(name, lambda: plugin.make(options, settings, clock))
+    return _make(name, lambda: plugin.make(options, settings, clock))
 
 
 def checked_options[T](options: Mapping[str, Any], kind: type[T], place: str) -> T:
@@ -167,35 +157,35 @@ def checked_options[T](options: Mapping[str, Any], kind: type[T], place: str) ->
 
 
 def _entry_points(group: str, name: str) -> list[EntryPoint]:
-    """Return the entry points `name` of a group; raises `UnknownPlugin` if there are none."""
     installed = entry_points(group=group)
-    found = [plugin for plugin in installed if plugin.name == name]
-    if not found:
+    entries = [plugin for plugin in installed if plugin.name == name]
+    if not entries:
         key, built_in = _BUILT_IN[group]
         names = sorted({plugin.name for plugin in installed})
         near = difflib.get_close_matches(name, [*built_in, *names], n=1, cutoff=0.5)
-        others = f"or of the plug-ins {', '.join(map(repr, names))}" if names else "no plug-in is installed"
+        plugin_names = f"or of the plug-ins {', '.join(map(repr, names))}" if names else "no plug-in is installed"
         raise UnknownPlugin(
-            f"{key} = {name!r}; choose from {', '.join(map(repr, built_in))}, {others}"
+            f"{key} = {name!r}; choose from {', '.join(map(repr, built_in))}, {plugin_names}"
             + (f"; did you mean {near[0]!r}?" if near else "")
         )
-    return found
+    return entries
 
 
 def _load[T](group: str, name: str, kind: type[T]) -> T:
-    """Return what the entry point `name` of a group holds, which must be a `kind`."""
-    found, key = _entry_points(group, name), _BUILT_IN[group][0]
-    packages = sorted({_package(plugin) for plugin in found})
+    entries, key = _entry_points(group, name), _BUILT_IN[group][0]
+    packages = sorted({f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value for entry in entries})
     if len(packages) > 1:
         raise UnknownPlugin(f"{key} = {name!r} is offered by {' and '.join(packages)}; uninstall all but one")
     try:
-        plugin = found[0].load()
+        plugin = entries[0].load()
     except Exception as failure:
         raise PluginFailed(
             f"the plug-in {name!r} of {packages[0]} cannot be imported: {type(failure).__name__}: "
             f"{in_one_line(failure)}; install what it needs, or another version of it"
         ) from failure
-    if not isinstance(plugin, kind) or not _forbids_unknown(plugin):
+    settings = getattr(plugin, "settings", None)
+    strict = getattr(getattr(settings, "__struct_config__", None), "forbid_unknown_fields", False)
+    if not isinstance(plugin, kind) or not strict:
         raise PluginFailed(
             f"the plug-in {name!r} of {packages[0]} is no {kind.__name__} whose settings forbid unknown fields; "
             "install a version of it that fits this version of faintfield"
@@ -203,21 +193,7 @@ def _load[T](group: str, name: str, kind: type[T]) -> T:
     return plugin
 
 
-def _forbids_unknown(plugin: object) -> bool:
-    """Return whether the settings of a plug-in are a Struct that takes no mistyped keys."""
-    settings = getattr(plugin, "settings", None)
-    return (
-        isinstance(settings, type) and issubclass(settings, Struct) and settings.__struct_config__.forbid_unknown_fields
-    )
-
-
-def _package(entry: EntryPoint) -> str:
-    """Return name and version of the package of an entry point."""
-    return f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value
-
-
-def _made[T](name: str, make: Callable[[], T]) -> T:
-    """Return what a plug-in makes; raises `PluginFailed` if it raises what no camera or stage may."""
+def _make[T](name: str, make: Callable[[], T]) -> T:
     try:
         return make()
     except Exception as failure:

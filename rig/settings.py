@@ -65,7 +65,6 @@ class BoardSettings(Struct, frozen=True, forbid_unknown_fields=True):
         )
 
     def _dictionary(self) -> cv2.aruco.Dictionary:
-        """Return the predefined dictionary that `dictionary` names."""
         return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
 
 
@@ -96,8 +95,8 @@ class SettleSettings(Struct, frozen=True, forbid_unknown_fields=True):
         if min(self.exposure_s, self.longest_s, self.limit_px) <= 0.0 or self.wait_s < 0.0:
             raise ValueError(f"settle times and limits must be positive; got {self}")
         for name in ("exposure_s", "longest_s", "wait_s"):
-            if (given := getattr(self, name)) > MAX_REST_S:
-                raise ValueError(f"settle.{name} = {given:g}; at most {MAX_REST_S:g} s are waited for rest")
+            if (duration_s := getattr(self, name)) > MAX_REST_S:
+                raise ValueError(f"settle.{name} = {duration_s:g}; at most {MAX_REST_S:g} s are waited for rest")
 
 
 class CheckSettings(Struct, frozen=True, forbid_unknown_fields=True):
@@ -182,7 +181,7 @@ class StepSettings(Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"step.at = {self.at!r}; give 'grid' or 'centre'")
         if self.photons_per_s is not None and not (self.kind == "flat" and 0.0 < self.photons_per_s < math.inf):
             raise ValueError(
-                f"step.photons_per_s = {self.photons_per_s} in a {self.kind} step; give a positive number, in flats"
+                f"step.photons_per_s = {self.photons_per_s} in a {self.kind} step; give it in flats, positive"
             )
         self.step()
 

@@ -289,14 +289,14 @@ def _homographies(generator: np.random.Generator, views: int, depth_mm: float) -
     turns = generator.uniform(-0.02, 0.02, (views, 3))
     moved_mm = np.random.default_rng(3).uniform(-20, 20, (views, 2))  # the same for all planes
     moved_mm[-1, 0] = 900.0
-    found = np.zeros((views, 3, 3))
-    for homography, (yaw, pitch, roll), (x_mm, y_mm) in zip(found, turns, moved_mm, strict=True):
+    homographies = np.zeros((views, 3, 3))
+    for homography, (yaw, pitch, roll), (x_mm, y_mm) in zip(homographies, turns, moved_mm, strict=True):
         homography[:] = [
             [depth_mm, -roll * depth_mm, x_mm],
             [roll * depth_mm, depth_mm, y_mm],
             [yaw, pitch, 1.0],
         ]
-    return found
+    return homographies
 
 
 def _planes(generator: np.random.Generator, dtype: np.dtype[np.floating]) -> Scene:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.pipelines.reconstruction.planes import Settings, solve
+from faintfield.pipelines.reconstruction.planes.solve import Settings, solve
 from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.metrics import signal_scale_for_snr
 from faintfield.recon.operator.grid import PlaneGrid

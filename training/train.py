@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from faintfield.pipelines.reconstruction.learned_prior import network_input
+from faintfield.pipelines.reconstruction.planes.learned_prior import network_input
 
 # Channels of the levels, each at half the resolution of the one before.
 WIDTHS = (16, 32, 64, 64)

@@ -4,7 +4,10 @@
 """
 
 from faintfield.calib.noise.calibrate import calibrate
-from faintfield.calib.noise.result import Estimate, NoiseCalibration, NoiseMaps, TransferPoint
+from faintfield.calib.noise.estimate import Estimate
+from faintfield.calib.noise.maps.measure import NoiseMaps
+from faintfield.calib.noise.misfit import TransferPoint
+from faintfield.calib.noise.result import NoiseCalibration
 from faintfield.calib.noise.series.statistics import Conditions, Series, SeriesSums, measure_series
 
 __all__ = [

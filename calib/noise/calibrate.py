@@ -4,32 +4,38 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 from scipy.signal import fftconvolve
 
-from faintfield.calib.noise.estimates import estimate_all
-from faintfield.calib.noise.fitting import MAX_TABLE_WIDTH_DN, NoiseLikelihood, SeriesFit, collect_counts, fit_series
-from faintfield.calib.noise.likelihood.marginal import mass_function
-from faintfield.calib.noise.likelihood.response import BENDS
+from faintfield.calib.errors import CopiedFrame, NotIdentifiable, TooFewFrames
+from faintfield.calib.noise.emva.estimates import estimate_all
+from faintfield.calib.noise.fit.series_fit import (
+    MAX_TABLE_WIDTH_DN,
+    NoiseLikelihood,
+    SeriesFit,
+    collect_counts,
+    fit_series,
+)
+from faintfield.calib.noise.fit.temperature import settle_temperature, with_doubling_error
+from faintfield.calib.noise.likelihood.marginal import Counts, mass_function
+from faintfield.calib.noise.maps.defects import hot_pixels, outlying_pixels, variance_ratio
 from faintfield.calib.noise.maps.measure import measure_pixels, noise_maps
-from faintfield.calib.noise.maps.pixels import hot_pixels, outlying_pixels, variance_ratio
-from faintfield.calib.noise.misfit.diagnostics import (
-    check_series,
+from faintfield.calib.noise.misfit import (
     frame_warnings,
     level_warning,
     noise_warning,
-    odd_light_warnings,
-    saturation_warnings,
     scatter_warnings,
+    series_goodness,
+    transfer_points,
 )
-from faintfield.calib.noise.misfit.goodness import series_goodness
-from faintfield.calib.noise.misfit.temperature import settle_temperature, with_doubling_error
-from faintfield.calib.noise.result import Histogram, NoiseCalibration, TransferPoint
-from faintfield.calib.noise.series.flat_levels import check_flat_levels
-from faintfield.calib.noise.series.saturation import Saturation, find_saturation
+from faintfield.calib.noise.result import Histogram, NoiseCalibration
+from faintfield.calib.noise.series.flats import check_flat_levels, find_saturation
 from faintfield.calib.noise.series.statistics import Series
+from faintfield.calib.noise.strips import Mask
 from faintfield.calib.noise_model import BentResponse
+
+# Smallest frames, in pixels and in rows or columns; fewer leave the spreads over pixels to chance.
+_MIN_PIXELS, _MIN_SIDE_PX = 256, 8
 
 # Mean charge in electrons above which the normal law replaces the Poisson sum: as good there, and smaller in memory.
 _MAX_POISSON_CHARGE_E = 200.0
@@ -66,24 +72,20 @@ def calibrate(series: Sequence[Series], saturation_dn: float = np.inf) -> NoiseC
     series, warmth = settle_temperature(series)
     darks = [item for item in series if item.conditions.kind == "dark"]
     flats = [item for item in series if item.conditions.kind == "flat"]
-    check_series(darks, [])
+    _check_series(darks, [])
     check_flat_levels(darks, flats)
     saturation = find_saturation(darks, flats, saturation_dn)
     # Frames that are saturated all over are identical, which is no fault of theirs.
-    check_series(darks, saturation.kept)
+    _check_series(darks, saturation.kept)
     hot = hot_pixels(darks)
     end_dn = saturation_dn if saturation.level_dn is None else saturation.level_dn
-    fitted, outlying = _fit_without_outlying(darks, saturation.kept, hot, end_dn)
+    fitted, outlying = fit_series(darks, saturation.kept, ~hot, end_dn), np.zeros_like(hot)
+    if fitted.likelihood is not NoiseLikelihood.CENSORED:  # variances of values that are cut off tell nothing
+        outlying = outlying_pixels(*variance_ratio(darks, fitted.dark_noise_dn2)) & ~hot
+    if outlying.any():
+        fitted = fit_series(darks, saturation.kept, ~hot & ~outlying, end_dn)
     fitted = replace(fitted, fit=with_doubling_error(fitted.fit, fitted.moments, darks, warmth))
-    result = _result(fitted, outlying, hot, saturation, end_dn)
-    return replace(result, warnings=(*warmth.warnings, *result.warnings))
-
-
-def _result(
-    fitted: SeriesFit, outlying: NDArray[np.bool_], hot: NDArray[np.bool_], saturation: Saturation, saturation_dn: float
-) -> NoiseCalibration:
-    """Return the numbers, maps and warnings that follow from a fit."""
-    pixels, points = measure_pixels(fitted, hot, outlying), _points(fitted)
+    pixels, points = measure_pixels(fitted, hot, outlying), transfer_points(fitted)
     level, noise = level_warning(fitted), noise_warning(fitted, points)
     estimates, covariance = estimate_all(
         fitted, pixels.response, saturation, levels_hold=level is None, noise_holds=noise is None
@@ -101,71 +103,85 @@ def _result(
         variance_ratio=pixels.variance_ratio,
         points=points,
         histograms=_histograms(fitted, ~hot & ~outlying),
-        saturation_dn=saturation_dn,
+        saturation_dn=end_dn,
         saturation=saturation,
         response=_bent_response(fitted),
-        goodness=series_goodness(fitted.fit, fitted.moments, fitted.darks, fitted.flats),
+        goodness=series_goodness(fitted),
         warnings=(
-            *frame_warnings(fitted),
-            *saturation_warnings(saturation),
+            *warmth.warnings,
+            *frame_warnings(fitted, saturation),
             *filter(None, (level, noise)),
-            *odd_light_warnings(fitted),
             *scatter_warnings(fitted),
             *pixels.warnings(),
         ),
     )
 
 
-def _fit_without_outlying(
-    darks: Sequence[Series], flats: Sequence[Series], hot: NDArray[np.bool_], saturation_dn: float
-) -> tuple[SeriesFit, NDArray[np.bool_]]:
-    """Return the fit without hot and outlying pixels, and the outlying ones (row, column)."""
-    fitted = fit_series(darks, flats, ~hot, saturation_dn)
-    if fitted.likelihood is NoiseLikelihood.CENSORED:  # variances of values that are cut off tell nothing
-        return fitted, np.zeros_like(hot)
-    outlying = outlying_pixels(*variance_ratio(darks, fitted.dark_noise_dn2)) & ~hot
-    return (fit_series(darks, flats, ~hot & ~outlying, saturation_dn) if outlying.any() else fitted), outlying
+def _check_series(darks: Sequence[Series], flats: Sequence[Series]) -> None:
+    if not darks:
+        raise NotIdentifiable("no dark frames: the offset cannot be told from the light; record darks, lens covered")
+    frames: dict[bytes, str] = {}
+    for item in (*darks, *flats):
+        for digest, name in zip(item.digests, item.names, strict=True):
+            if digest in frames:
+                raise CopiedFrame(
+                    f"{name} and {frames[digest]}: the same frame twice, pixel for pixel; noise never repeats: record "
+                    "it again, or leave one out"
+                )
+            frames[digest] = name
+    if all(dark.frames < 2 for dark in darks):
+        raise TooFewFrames(
+            f"{darks[0].names[0]}: the only one of the {darks[0].conditions}, and no exposure has two dark frames, so "
+            "that noise and pattern cannot be told apart; record at least 2 of one exposure, better 10 of each"
+        )
+    if lone := next((flat for flat in flats if flat.frames < 2), None):
+        raise TooFewFrames(
+            f"{lone.names[0]}: the only one of the {lone.conditions}; photon transfer needs 2 frames at least of each "
+            "light level: record another or leave it out"
+        )
+    pixels = darks[0].pattern_dn.size
+    if pixels < _MIN_PIXELS or min(darks[0].pattern_dn.shape) < _MIN_SIDE_PX:
+        raise TooFewFrames(
+            f"frames of {pixels} pixels, limits {_MIN_PIXELS} pixels and {_MIN_SIDE_PX} rows and columns; "
+            "record larger frames, or widen the region"
+        )
 
 
 def _bent_response(fitted: SeriesFit) -> BentResponse | None:
     """Return the bend of the response if the flats show it significantly, None otherwise."""
-    names = [name for name in fitted.fit.values if name in BENDS]
-    if fitted.bend is None or fitted.bend.values.keys() != fitted.fit.values.keys() or not names:
+    bend = fitted.fit.bend
+    if fitted.bend is None or fitted.bend.values.keys() != fitted.fit.values.keys() or not bend.values:
         return None
-    order = list(fitted.fit.values)
-    at = [order.index(name) for name in names]
-    bends = np.array([fitted.fit.values[name] for name in names])
+    bends = np.array([*bend.values.values()])
     brightest = float(fitted.moments.flats.mean_dn.max() - fitted.fit.values["offset_dn"])
-    scale = brightest ** np.arange(1, len(names) + 1)
-    covariance = fitted.fit.covariance[np.ix_(at, at)] * np.outer(scale, scale)
+    scale = brightest ** np.arange(1, bends.size + 1)
+    covariance = bend.covariance * np.outer(scale, scale)
     deviance = float(bends * scale @ np.linalg.solve(covariance, bends * scale))
-    if stats.chi2.sf(deviance, len(names)) > _MAX_STRAIGHT:
+    if stats.chi2.sf(deviance, bends.size) > _MAX_STRAIGHT:
         return None
     return BentResponse(tuple(bends.tolist()), brightest)
 
 
-def _histograms(fitted: SeriesFit, usable: NDArray[np.bool_]) -> tuple[Histogram, ...]:
+def _histograms(fitted: SeriesFit, usable: Mask) -> tuple[Histogram, ...]:
     """Return the values of the shortest and the longest darks with their prediction; none while the gain is unknown."""
     if "log_gain" not in fitted.fit.values:
         return ()
     counts = collect_counts(fitted.darks, usable)
     ends = sorted({int(np.argmin(counts.exposure_s)), int(np.argmax(counts.exposure_s))})
-    return tuple(
-        replace(
-            _histogram(counts.values_dn[j], counts.exposure_s[j], fitted, counts.floor_dn),
-            exposure_s=fitted.darks[j].conditions.exposure_s,
-        )
-        for j in ends
-        if np.ptp(counts.values_dn[j]) < MAX_TABLE_WIDTH_DN
-    )
+    places = [j for j in ends if np.ptp(counts.values_dn[j]) < MAX_TABLE_WIDTH_DN]
+    return tuple(_histogram(counts, j, fitted) for j in places)
 
 
-def _histogram(values_dn: NDArray[np.int32], exposure_s: float, fitted: SeriesFit, floor_dn: int | None) -> Histogram:
-    """Return the counts of the values (frame, pixel) of one dark series, and those that the fit predicts."""
-    fit = fitted.fit.values
+def _histogram(counts: Counts, index: int, fitted: SeriesFit) -> Histogram:
+    """Return the values of one dark series, and those that the fit predicts."""
+    fit, values_dn, exposure_s = fitted.fit.values, counts.values_dn[index], counts.exposure_s[index]
     log_gain, signal = fit["log_gain"], fit.get("dark_signal_dn_per_s", 0.0)
     # The level about which values scatter differs between pixels, rows, columns and frames.
-    pattern_dn2 = fit["dsnu_dn2"] + fit.get("jitter_dn2", 0.0) + fitted.profiles_dn2
+    pattern_dn2 = (
+        fit["dsnu_dn2"]
+        + fit.get("jitter_dn2", 0.0)
+        + float(fitted.darks[0].row_dn.var() + fitted.darks[0].column_dn.var())
+    )
     pattern_dn2 += fit.get("dcnu_dn2_per_s2", 0.0) * exposure_s**2
     spread_dn = float(np.sqrt(max(pattern_dn2, 1e-4)))
     per_dn = max(2, int(np.ceil(2 / spread_dn)))
@@ -173,39 +189,16 @@ def _histogram(values_dn: NDArray[np.int32], exposure_s: float, fitted: SeriesFi
     offset = np.arange(-reach * per_dn, reach * per_dn + 1) / per_dn
     prior = np.exp(-0.5 * (offset / spread_dn) ** 2)
     prior /= prior.sum()
-    lowest, highest = int(values_dn.min()), int(values_dn.max())
+    stated_s, lowest, highest = fitted.darks[index].conditions.exposure_s, int(values_dn.min()), int(values_dn.max())
     # A black level that drifts down moves the values but makes no charge; see `dark_variances_dn2`.
     level_dn = fit["offset_dn"] + min(signal, 0.0) * exposure_s
     u = lowest - reach + np.arange((highest - lowest + 2 * reach) * per_dn + 1) / per_dn - level_dn
     slope = max(signal, 1e-9)
     charge = float(slope / np.exp(log_gain)) * exposure_s
     masses = mass_function(u, exposure_s, charge, exact=charge < _MAX_POISSON_CHARGE_E, spread=False)
-    table = masses(np.array([log_gain, 0.5 * fit["log_read_dn2"] - log_gain, np.log(slope) - log_gain, 0.0]))
-    logs = (table.log_mass[:, 0], table.log_tail[:, 0])
-    mass, tail = (fftconvolve(np.exp(log), prior, "valid")[::per_dn] for log in logs)
-    if floor_dn == lowest:
+    logs, _ = masses(np.array([log_gain, 0.5 * fit["log_read_dn2"] - log_gain, np.log(slope) - log_gain, 0.0]))
+    mass, tail = (fftconvolve(np.exp(log), prior, "valid")[::per_dn] for log in logs[:, :, 0])
+    if counts.floor_dn == lowest:
         mass[0] = tail[0]
-    value = np.arange(lowest, highest + 1)
-    count = np.bincount((values_dn - lowest).ravel(), minlength=value.size)
-    return Histogram(exposure_s, value, count, np.maximum(mass, 0) * values_dn.size)
-
-
-def _points(fitted: SeriesFit) -> tuple[TransferPoint, ...]:
-    """Return the photon transfer and dark signal points."""
-    values, darks, flats = fitted.fit.values, fitted.moments.darks, fitted.moments.flats
-    dark_models = values["offset_dn"] + values.get("dark_signal_dn_per_s", 0.0) * darks.exposure_s
-    rows = zip(
-        (*fitted.darks, *fitted.flats),
-        (*darks.mean_dn, *flats.mean_dn),
-        (*darks.within_dn2, *flats.within_dn2),
-        (*dark_models, *flats.mean_dn),
-        (*fitted.dark_noise_dn2, *fitted.flat_noise_dn2),
-        strict=True,
-    )
-    points = []
-    for flat, mean, within, *model in rows:
-        degrees = max((flat.frames - 1) * fitted.moments.freedom, 1.0)
-        measured = within / degrees if flat.frames > 1 else np.nan
-        numbers = map(float, (mean, measured, measured * np.sqrt(2 / degrees), *model))
-        points.append(TransferPoint(flat.conditions.kind, flat.conditions.exposure_s, flat.frames, *numbers))
-    return tuple(points)
+    count = np.bincount((values_dn - lowest).ravel())
+    return Histogram(stated_s, np.arange(lowest, highest + 1), count, np.maximum(mass, 0) * values_dn.size)

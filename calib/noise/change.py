@@ -3,10 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
-type Array = NDArray[np.float64]
+from faintfield.calib.noise.strips import Array
 
 _QUANTILE = float(stats.norm.ppf(0.975))
 
@@ -53,7 +52,7 @@ class MapDifference:
 
     @property
     def grown(self) -> bool:
-        """Return whether the rms exceeds what is expected by more than these errors are known."""
+        """True if the rms exceeds its expectation by more than the errors are known."""
         return self.rms > (1 + _MIN_GROWTH) * self.expected
 
 

@@ -1,92 +1,20 @@
 """Result of a noise calibration: each quantity with its standard error, or the reason why it has no value."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.errors import NotIdentifiable
-from faintfield.calib.noise.misfit.goodness import SeriesGoodness
-from faintfield.calib.noise.series.saturation import Saturation
+from faintfield.calib.noise.estimate import Estimate
+from faintfield.calib.noise.maps.measure import NoiseMaps
+from faintfield.calib.noise.misfit import SeriesGoodness, TransferPoint
+from faintfield.calib.noise.series.flats import Saturation
+from faintfield.calib.noise.strips import Array, Mask
 from faintfield.calib.noise_model import BentResponse, Map, NoiseModel
 
 # Quantities without which there is no noise model.
 _REQUIRED = ("offset_dn", "gain_dn_per_e", "read_noise_e")
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A measured value, or the reason why there is none.
-
-    Attributes
-    ----------
-    value : float, optional
-        None if the frames do not determine it.
-    se : float, optional
-        Standard error.
-    ci95 : tuple of float, optional
-        95 % confidence interval.
-    why : str, optional
-        Why there is no value, and what to record to get one.
-    """
-
-    value: float | None
-    se: float | None = None
-    ci95: tuple[float, float] | None = None
-    why: str | None = None
-
-
-@dataclass(frozen=True)
-class NoiseMaps:
-    """Maps per pixel, arrays (row, column) of float32; None if the frames do not determine them.
-
-    Attributes
-    ----------
-    offset_dn, offset_variance_dn2 : array
-        Posterior mean of the offset, and the variance of its error.
-    dark_current_e_per_s, dark_current_variance_e2_per_s2 : array, optional
-        Posterior mean of the dark current, and the variance of its error.
-    read_noise_e, read_noise_se_e : array, optional
-        Posterior mean of the read noise, and its standard error.
-    gain_dn_per_e, gain_se_dn_per_e : array, optional
-        Gain, and the standard error of its difference from the mean gain. Maps in electrons are in those of this gain.
-    relative_response, relative_response_se : array, optional
-        Photo response in electrons over its mean, vignetting and PRNU, and its standard error.
-    vignetting : array, optional
-        Smooth part of the photo response.
-    unusable : array, bool
-        Pixels that are hot, noisy or dead.
-    absent : dict of str
-        Why there is no map of the gain or of the read noise, by the name of the map.
-    """
-
-    offset_dn: NDArray[np.float32]
-    offset_variance_dn2: NDArray[np.float32]
-    unusable: NDArray[np.bool_]
-    dark_current_e_per_s: NDArray[np.float32] | None = None
-    dark_current_variance_e2_per_s2: NDArray[np.float32] | None = None
-    read_noise_e: NDArray[np.float32] | None = None
-    read_noise_se_e: NDArray[np.float32] | None = None
-    gain_dn_per_e: NDArray[np.float32] | None = None
-    gain_se_dn_per_e: NDArray[np.float32] | None = None
-    relative_response: NDArray[np.float32] | None = None
-    relative_response_se: NDArray[np.float32] | None = None
-    vignetting: NDArray[np.float32] | None = None
-    absent: dict[str, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class TransferPoint:
-    """One series as EMVA 1288 plots it: measured and modelled mean and variance, in DN and DN²."""
-
-    kind: str
-    exposure_s: float
-    frames: int
-    mean_dn: float
-    variance_dn2: float
-    variance_se_dn2: float
-    model_mean_dn: float
-    model_variance_dn2: float
 
 
 @dataclass(frozen=True)
@@ -106,7 +34,7 @@ class Histogram:
     exposure_s: float
     value_dn: NDArray[np.int64]
     count: NDArray[np.int64]
-    expected: NDArray[np.float64]
+    expected: Array
 
 
 @dataclass(frozen=True)
@@ -139,23 +67,23 @@ class NoiseCalibration:
     saturation_dn : float
         Value from which a pixel is saturated, as stated or found.
     saturation : Saturation
-        Where the flats saturate, and which of them are left out.
+        Saturation of the flats, and those that are left out.
     response : BentResponse, optional
         Bend of the response where the flats show one.
     goodness : tuple of SeriesGoodness
-        How well each series that was used follows the model.
+        Goodness of fit of each series that was used.
     warnings : tuple of str
         Problems of the frames.
     """
 
     estimates: dict[str, Estimate]
-    covariance: tuple[tuple[str, ...], NDArray[np.float64]]
+    covariance: tuple[tuple[str, ...], Array]
     likelihood: str
     maps: NoiseMaps
-    hot: NDArray[np.bool_]
-    noisy: NDArray[np.bool_]
-    dead: NDArray[np.bool_]
-    telegraph: NDArray[np.bool_]
+    hot: Mask
+    noisy: Mask
+    dead: Mask
+    telegraph: Mask
     variance_ratio: NDArray[np.float32]
     points: tuple[TransferPoint, ...]
     histograms: tuple[Histogram, ...]
@@ -183,7 +111,7 @@ class NoiseCalibration:
         fields: dict[str, Map] = {name: value or 0.0 for name, value in values.items()}
         fields["dark_current_e_per_s"] = max(values["dark_current_e_per_s"] or 0.0, 0.0)
         if per_pixel:
-            maps = {name: getattr(self.maps, name, None) for name in fields}
+            maps = {name: getattr(self.maps, name) for name in fields}
             fields |= {name: values for name, values in maps.items() if values is not None}
         return NoiseModel(
             **fields,

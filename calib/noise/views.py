@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from faintfield.calib.errors import NotIdentifiable
-
-type Array = NDArray[np.float64]
+from faintfield.calib.noise.strips import Array
 
 # Side of a block in px: small against objects, large enough for a variance within 9 %.
 _BLOCK_PX = 16
@@ -131,21 +130,18 @@ def _located(
     starts = [np.arange(1, length - _BLOCK_PX - 1, _BLOCK_PX) for length in shape]
     corners = np.stack(np.meshgrid(*starts, indexing="ij"), axis=-1).reshape(-1, 2)
     corners = generator.permutation(corners)[:_MAX_BLOCKS]
-    moves, sound = [], np.ones(len(corners), bool)
-    greys = [_grey(view) for view in views]
-    for grey in greys:
-        if grey is greys[1]:
-            moves.append(np.zeros_like(corners))
-            continue
-        flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST).calc(greys[1], grey, None)
+    moves, sound = [np.zeros_like(corners)], np.ones(len(corners), bool)
+    before, middle, after = map(_grey, views)
+    for grey in (before, after):
+        flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST).calc(middle, grey, None)
         within = _windows(flow, corners, _BLOCK_PX).reshape(len(corners), 2, -1)
-        middle = np.median(within, axis=2)
-        spread = np.abs(within - middle[:, :, None]).mean(axis=2).max(axis=1, initial=0.0)
-        move = np.rint(middle[:, ::-1]).astype(int)
+        median = np.median(within, axis=2)
+        spread = np.abs(within - median[:, :, None]).mean(axis=2).max(axis=1, initial=0.0)
+        move = np.rint(median[:, ::-1]).astype(int)
         first = corners + move
         sound &= (spread < _MAX_SPREAD_PX) & ((first >= 1) & (first + _BLOCK_PX + 1 <= shape)).all(axis=1)
         moves.append(move)
-    return corners[sound], [move[sound] for move in moves]
+    return corners[sound], [moves[view][sound] for view in (1, 0, 2)]
 
 
 def _grey(view: NDArray[np.float32]) -> NDArray[np.uint8]:
@@ -169,7 +165,7 @@ def _residuals(
     saturation_dn: float,
     floor_dn: float,
 ) -> tuple[Array, Array, Array]:
-    """Return mean, variance and texture (block,) of one colour."""
+    """Return mean, variance and texture, the mean square of the gradient, (block,) of one colour."""
     parts = [
         _windows(view[:, :, colour], corners + move - 1, _BLOCK_PX + 2).astype(float)
         for view, move in zip(views, moves, strict=True)
@@ -186,7 +182,9 @@ def _residuals(
     )
     left = residual - (terms @ explained)[:, :, 0]
     variance = np.sum(left**2, axis=1) / (_RESIDUAL_FACTOR * (_BLOCK_PX**2 - _TERMS))
-    return total[:, 1:-1, 1:-1].mean(axis=(1, 2)) / 3, variance, _texture(total)
+    across, along = total[:, 1:-1, 2:] - total[:, 1:-1, :-2], total[:, 2:, 1:-1] - total[:, :-2, 1:-1]
+    texture = np.asarray(np.mean(across**2 + along**2, axis=(1, 2)))
+    return total[:, 1:-1, 1:-1].mean(axis=(1, 2)) / 3, variance, texture
 
 
 def _explaining(total: Array) -> Array:
@@ -194,18 +192,12 @@ def _explaining(total: Array) -> Array:
     y, x = np.mgrid[-1 : 1 : _BLOCK_PX * 1j, -1 : 1 : _BLOCK_PX * 1j]
     centre = total[:, 1:-1, 1:-1]
     right, left, down, up = total[:, 1:-1, 2:], total[:, 1:-1, :-2], total[:, 2:, 1:-1], total[:, :-2, 1:-1]
-    one = np.ones_like(centre)
     mixed = total[:, 2:, 2:] - total[:, 2:, :-2] - total[:, :-2, 2:] + total[:, :-2, :-2]
     curvatures = (right - 2 * centre + left, down - 2 * centre + up, mixed)
-    terms = np.stack([one, one * x, one * y, right - left, down - up, *curvatures], axis=-1)
+    planes = np.broadcast_arrays(1.0, x, y, centre)[:3]
+    terms = np.stack([*planes, right - left, down - up, *curvatures], axis=-1)
     terms = terms.reshape(-1, _BLOCK_PX**2, _TERMS)
     return np.asarray(terms / (np.sqrt(np.mean(terms**2, axis=1, keepdims=True)) + 1e-9))
-
-
-def _texture(total: Array) -> Array:
-    """Return the mean square of the gradient of blocks."""
-    across, along = total[:, 1:-1, 2:] - total[:, 1:-1, :-2], total[:, 2:, 1:-1] - total[:, :-2, 1:-1]
-    return np.asarray(np.mean(across**2 + along**2, axis=(1, 2)))
 
 
 def estimate_view_noise(
@@ -249,11 +241,11 @@ def estimate_view_noise(
 
     variance = curve(groups)
     in_the_dark = float(least_variance_dn2(np.zeros(1))[0])
-    found = _line(mean_dn, variance, counts, gain_dn, in_the_dark)
+    line = _line(mean_dn, variance, counts, gain_dn, in_the_dark)
     generator = np.random.default_rng(1)
-    drawn = [curve([generator.choice(group, len(group)) for group in groups]) for _ in range(_DRAWS)]
-    lines = np.array([_line(mean_dn, variances, counts, gain_dn, in_the_dark) for variances in drawn])
-    gain, read = (_estimate(value, draws) for value, draws in zip(found, lines.T, strict=True))
+    draws = [curve([generator.choice(group, len(group)) for group in groups]) for _ in range(_DRAWS)]
+    lines = np.array([_line(mean_dn, variances, counts, gain_dn, in_the_dark) for variances in draws])
+    gain, read = (_estimate(value, draws) for value, draws in zip(line.tolist(), lines.T, strict=True))
     return ViewNoise(gain, read, mean_dn, variance, int(counts.sum()))
 
 
@@ -293,8 +285,5 @@ def _line(mean_dn: Array, variance_dn2: Array, counts: Array, gain_dn: float | N
 
 
 def _estimate(value: float, draws: Array) -> Estimated:
-    """Return a value with the error and interval of draws."""
-    low, high = np.quantile(draws, [0.025, 0.975])
-    return Estimated(
-        float(value), float(np.std(draws)), (min(float(low), float(value)), max(float(high), float(value)))
-    )
+    low, high = np.quantile(draws, [0.025, 0.975]).tolist()
+    return Estimated(value, float(np.std(draws)), (min(low, value), max(high, value)))

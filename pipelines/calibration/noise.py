@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from faintfield.calib.errors import CalibrationError
 from faintfield.calib.noise import Estimate, NoiseCalibration, calibrate
-from faintfield.calib.noise.room import release
+from faintfield.calib.noise.strips import release
 from faintfield.pipelines.calibration.noise_emva import EmvaMeasurement, measure_emva
 from faintfield.pipelines.calibration.noise_fit import fit_record
 from faintfield.pipelines.calibration.noise_frames import MosaicPhase, Readout, read_series

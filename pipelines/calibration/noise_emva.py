@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from faintfield.calib.noise import Estimate, NoiseCalibration, Series
 from faintfield.calib.noise.emva.nonuniformity import Nonuniformity, TemporalNoise, nonuniformity, temporal_noise
 from faintfield.calib.noise.emva.quantities import derived_quantities, gather_inputs
-from faintfield.calib.noise.emva.warmth import dark_current_doubling
+from faintfield.calib.noise.fit.temperature import dark_current_doubling
 from faintfield.calib.noise.strips import map_of, mean_over
 from faintfield.pipelines.calibration.noise_frames import MosaicPhase
 from faintfield.pipelines.formats.results.noise_emva import EmvaImageRecord, EmvaRecord

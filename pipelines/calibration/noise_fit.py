@@ -1,7 +1,7 @@
 """The part of noise.json that tells how well the series fit: saturation, response, scatter and goodness."""
 
 from faintfield.calib.noise import Estimate, NoiseCalibration
-from faintfield.calib.noise.misfit.goodness import Scatter, SeriesGoodness
+from faintfield.calib.noise.misfit import Scatter, SeriesGoodness
 from faintfield.calib.noise.series.statistics import Series
 from faintfield.pipelines.formats.results.noise_fit import (
     FitRecord,

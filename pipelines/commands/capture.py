@@ -74,9 +74,9 @@ def _live_order(
 ) -> "LiveOrder | None":
     """Return which live planes are asked for, None if none are; `known` are noise, geometry and focal length."""
     from faintfield.pipelines.live.planes_messages import MAX_DEPTHS, LiveOrder
-    from faintfield.pipelines.reconstruction.given_sweeps import swept
+    from faintfield.pipelines.reconstruction.request import sweep_values
 
-    depths = [*(depth_mm or []), *([] if sweep_mm is None else swept("--live-sweep-mm", sweep_mm, "400:900:16"))]
+    depths = [*(depth_mm or []), *([] if sweep_mm is None else sweep_values("--live-sweep-mm", sweep_mm, "400:900:16"))]
     noise, geometry, fx_px = known
     if not depths:
         if any(value is not None for value in known):

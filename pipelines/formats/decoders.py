@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.errors import UnreadableImage
 from faintfield.pipelines.formats.limits import MAX_FRAME_BYTES
-from faintfield.rig.session.regular_files import read_all
+from faintfield.rig.files import read_all
 
 # Takes width and height in px and the size in bytes of a picture when it is decoded; raises if it is too large.
 type Accept = Callable[[int, int, int], None]

@@ -17,7 +17,7 @@ import msgspec
 from faintfield.pipelines.errors import CannotWrite, DiskFull, MissingFile, OutputBusy, OutputExists
 from faintfield.pipelines.formats.digests import with_digest
 from faintfield.pipelines.formats.units import json_of
-from faintfield.rig.session import durable, regular_files
+from faintfield.rig import files as rig_files
 
 # Error numbers of a full disk; numpy reports a short write of an array without a number.
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, None}
@@ -61,7 +61,7 @@ def writing(path: Path) -> Iterator[BinaryIO]:
         except BaseException:
             unfinished.unlink(missing_ok=True)
             raise
-        durable.sync_folder(path.parent)
+        rig_files.sync_folder(path.parent)
 
 
 def write_whole(path: Path, content: bytes | str) -> None:
@@ -119,7 +119,7 @@ def writing_folder(
         except BaseException:
             shutil.rmtree(building, ignore_errors=True)
             raise
-        durable.sync_folder(out.parent)
+        rig_files.sync_folder(out.parent)
 
 
 def _put_in_place(building: Path, out: Path) -> None:
@@ -237,7 +237,7 @@ def require_room(path: Path, needed_bytes: int) -> None:
 def sha256(path: Path) -> str:
     """Return the SHA-256 of a file, in hexadecimal; raise MissingFile if it cannot be read."""
     with _naming_unreadable(path):
-        return regular_files.sha256(path)
+        return rig_files.sha256(path)
 
 
 @contextmanager
@@ -303,7 +303,7 @@ class Hashes:
         self._changed = False
         # Without a whole file everything is hashed
         with suppress(OSError, msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
-            content = regular_files.read_regular(folder / CACHE_FILE, _MAX_CACHE_BYTES)
+            content = rig_files.read_regular(folder / CACHE_FILE, _MAX_CACHE_BYTES)
             self._known = msgspec.json.decode(content, type=dict[str, _Known])
 
     def of(self, name: str) -> str:

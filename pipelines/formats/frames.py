@@ -17,7 +17,7 @@ from faintfield.pipelines.formats.decoders import OVERHEAD_BYTES, Accept, count_
 from faintfield.pipelines.formats.limits import MAX_EXPOSURE_S, MAX_FRAME_BYTES
 from faintfield.pipelines.formats.plain_decoders import NETPBM_SUFFIXES, decode_bmp, decode_exr, decode_netpbm
 from faintfield.pipelines.formats.reading import is_file, opened
-from faintfield.rig.session.regular_files import require_size
+from faintfield.rig.files import require_size
 
 TIFF_SUFFIXES = {".tif", ".tiff"}
 PHOTO_SUFFIXES = {".png", ".jpg", ".jpeg"}

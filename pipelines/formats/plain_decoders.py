@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.errors import UnknownFormat
 from faintfield.pipelines.formats.decoders import OVERHEAD_BYTES, Accept, decode_with_opencv
-from faintfield.rig.session.regular_files import read_all
+from faintfield.rig.files import read_all
 
 NETPBM_SUFFIXES = {".pgm", ".ppm", ".pnm", ".pfm"}
 

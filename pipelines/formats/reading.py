@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.digests import DIGEST_KEY, digest_holds
 from faintfield.pipelines.formats.units import record_of
-from faintfield.rig.session.regular_files import open_regular, read_regular
+from faintfield.rig.files import open_regular, read_regular
 
 # Size in bytes up to which a file of text, settings or records is read. The largest that faintfield writes, the record
 # of a sweep of a thousand planes, has a few million.

@@ -21,7 +21,7 @@ from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.capture.guide import format_duration
 from faintfield.rig.capture.loop import Capture
 from faintfield.rig.capture.survey import Survey, survey
-from faintfield.rig.devices import is_simulated, open_rig
+from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import CameraError, CaptureStopped
 from faintfield.rig.plan import CapturePlan
 from faintfield.rig.session.changes import adopt_settings, check_same_rig
@@ -152,7 +152,7 @@ def needed_bytes(plan: CapturePlan) -> int:
 
 
 def _format_duration(duration_s: float, stage: StageSettings) -> str:
-    clock = " by the simulated stage's clock, far less by yours" if is_simulated(stage) else ""
+    clock = " by the simulated stage's clock, far less by yours" if stage.simulated else ""
     return f"{format_duration(duration_s)} without prompts{clock}"
 
 

@@ -13,8 +13,8 @@ from faintfield.pipelines.live.planes_messages import LiveFrame, PictureKind
 from faintfield.pipelines.live.planes_scene import LiveScene
 from faintfield.pipelines.reconstruction.channels import lattice_noise, view_electrons
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
-from faintfield.pipelines.reconstruction.penalised import MAX_PASSES, Objective
-from faintfield.pipelines.reconstruction.solutions import Settings
+from faintfield.pipelines.reconstruction.planes.penalised import MAX_PASSES, Objective
+from faintfield.pipelines.reconstruction.planes.solutions import Settings
 from faintfield.recon.depth.focus import FocusMeasure
 from faintfield.recon.depth.running import RunningPlane, SeenByView, seen_by_view
 from faintfield.recon.errors import GeometryMismatch

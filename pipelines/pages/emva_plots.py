@@ -290,7 +290,7 @@ def _spectrograms(measured: EmvaMeasurement, title: str, image: MeanImage, unit:
             axes.semilogy(spectrum.frequency, factor * np.sqrt(spectrum.power), lw=0.9, color=colour, label=label)
         white = factor * float(np.sqrt(np.mean([spectrum.white for spectrum in spectra])))
         axes.axhline(white, color=MODEL, lw=1, label="white part")
-        left = factor * np.sqrt(image.noise.pixel)
+        left = factor * np.sqrt(image.noise.variances[0])
         axes.axhline(left, color=MODEL, lw=1, ls="--", label="temporal noise left in the mean")
         axes.set(xlabel="spatial frequency (cycles/pixel)", ylabel=f"amplitude ({unit})", xlim=(0, 0.5))
         low, high = axes.get_ylim()

@@ -17,7 +17,7 @@ from faintfield.pipelines.formats.results.plane_files import plane_name
 from faintfield.pipelines.formats.results.records import GeometryErrors, KnownValue, Method, Metrics
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, load_session, nominal_session
-from faintfield.pipelines.reconstruction.accuracy import assess
+from faintfield.pipelines.reconstruction.planes.accuracy import assess
 from faintfield.pipelines.reconstruction.request import folder_of_method
 from faintfield.pipelines.simulation.synthetic_set import NOISE_FREE, render_scene, write_ground_truth
 from faintfield.recon.metrics import signal_scale_for_snr

@@ -8,8 +8,8 @@ from importlib.util import find_spec
 import numpy as np
 
 from faintfield.pipelines.formats.results.records import Method
-from faintfield.pipelines.reconstruction.planes import solve
-from faintfield.pipelines.reconstruction.solutions import PriorName, Settings
+from faintfield.pipelines.reconstruction.planes.solutions import PriorName, Settings
+from faintfield.pipelines.reconstruction.planes.solve import solve
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.solver.initialization import back_projection

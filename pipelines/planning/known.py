@@ -18,8 +18,8 @@ from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import RigError
 from faintfield.rig.settings import RigSettings
 from faintfield.rig.simulation.lab import lab_experiment
+from faintfield.rig.stages.motion import StageWorkspace
 from faintfield.rig.stages.protocol import MotionLimits
-from faintfield.rig.stages.workspace import StageWorkspace
 
 # The response of a view is that of the pixels this near to where it sees a sample.
 _NEAR_PX = 4

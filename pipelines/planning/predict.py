@@ -319,7 +319,7 @@ class Predictor:
         scene = msgspec.structs.replace(plan, steps=tuple(step for step in plan.steps if step.kind == "dark_scene"))
         whole, part = (Measured(schedule.duration_s(pace.motion, pace.feed_mm_per_s)) for schedule in (plan, scene))
         try:
-            plan.check(pace.workspace)
+            pace.workspace.check_path(plan.path())
         except (OutsideTravel, KeepOutCrossed) as failure:
             return whole, part, str(failure)
         return whole, part, None

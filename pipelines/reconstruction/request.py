@@ -1,9 +1,11 @@
 """Request to `reconstruct` and `run`: their options select planes, are checked, and are resolved for a set."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
 from msgspec import UNSET
 
 from faintfield.pipelines.errors import WrongUsage
@@ -19,16 +21,23 @@ from faintfield.pipelines.formats.results.records import (
 )
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.formats.sets.stated import plane_stem
-from faintfield.pipelines.reconstruction.autofocus import best_focus, found_range_mm, searched_range_mm, sweep_of_range
-from faintfield.pipelines.reconstruction.given_sweeps import swept, swept_depths
+from faintfield.pipelines.reconstruction.depth.autofocus import (
+    best_focus,
+    found_range_mm,
+    searched_range_mm,
+    sweep_of_range,
+)
 from faintfield.pipelines.reconstruction.operators import check_in_front
 from faintfield.pipelines.reconstruction.options import PLACES, Options
-from faintfield.pipelines.reconstruction.solutions import PriorName, Settings
+from faintfield.pipelines.reconstruction.planes.solutions import PriorName, Settings
 
 DEFAULT_METHOD: Method = "pmlem"
 
 # Fewer depths leave nothing to interpolate between.
 _MIN_DEPTHS_OF_A_MAP = 5
+
+# Largest sweep: more planes are a typing error, and would fill any disk.
+_MAX_PLANES = 10_000
 
 # Methods whose planes a prior can improve.
 _WITH_PRIOR: frozenset[Method] = frozenset({"pmlem", *JOINT_METHODS})
@@ -194,13 +203,15 @@ def select_planes(options: Options) -> Selection:
         settings = replace(settings, prior=_default_prior(methods, settings, sweeps=sweeps))
     selection = Selection(
         depths_mm=[depth for depth in depths_mm if depth != "auto"],
-        swept_mm=swept_depths(options.sweep_mm) if options.sweep_mm else [],
+        swept_mm=_sweep_depths(options.sweep_mm) if options.sweep_mm else [],
         disparities_px=options.disparity_px or [],
-        swept_px=swept("--sweep-px", options.sweep_px, "-3.5:0.8:40") if options.sweep_px else [],
+        swept_px=sweep_values("--sweep-px", options.sweep_px, "-3.5:0.8:40") if options.sweep_px else [],
         tilted=read_plane_poses(options.plane_pose or []),
         auto=auto,
         own=[depth for depth in own if depth != "auto"],
-        own_swept=swept("--sweep", options.sweep, "400:900:64") if options.sweep not in (None, "", "auto") else [],
+        own_swept=sweep_values("--sweep", options.sweep, "400:900:64")
+        if options.sweep not in (None, "", "auto")
+        else [],
         auto_sweep=options.sweep == "auto",
         depth_map=options.depth_map,
         methods=methods,
@@ -271,6 +282,25 @@ def _check_methods(selection: Selection, methods: list[Method], settings: Settin
     if (settings.uncertainty or settings.penalty != "tv") and not _WITH_PRIOR & set(methods):
         option = "--uncertainty" if settings.uncertainty else f"--penalty {settings.penalty}"
         raise WrongUsage(f"{option} is for pmlem, joint and occlusion, not for {' and '.join(methods)}; leave it out")
+
+
+def _sweep_depths(sweep_mm: str) -> list[float]:
+    """Return the depths of FIRST:LAST:COUNT."""
+    depths = sweep_values("--sweep-mm", sweep_mm, "400:900:64")
+    if min(depths) <= 0:
+        raise WrongUsage(f"--sweep-mm {sweep_mm}: is no sweep; give two different positive depths")
+    return depths
+
+
+def sweep_values(option: str, text: str, example: str) -> list[float]:
+    """Return the numbers of FIRST:LAST:COUNT, in equal steps."""
+    parts = re.fullmatch(r"(-?\d+(?:\.\d*)?):(-?\d+(?:\.\d*)?):(\d+)", text)
+    if parts is None:
+        raise WrongUsage(f"{option} {text}: is no sweep; give FIRST:LAST:COUNT, such as {example}")
+    first, last, count = float(parts[1]), float(parts[2]), int(parts[3])
+    if first == last or not 2 <= count <= _MAX_PLANES:
+        raise WrongUsage(f"{option} {text}: is no sweep; give two different ends and 2 to {_MAX_PLANES} planes")
+    return [round(float(value), 6) for value in np.linspace(first, last, count)]
 
 
 def resolve(

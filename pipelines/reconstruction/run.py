@@ -33,14 +33,19 @@ from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.formats.sets.ground_truth import read_truth
 from faintfield.pipelines.formats.sets.stated import in_units, light_per_e, plane_stem
 from faintfield.pipelines.formats.units import StatedUnits
-from faintfield.pipelines.reconstruction.accuracy import assess
 from faintfield.pipelines.reconstruction.channels import SHARE_OF_DISK, channel_layouts, keeping_frames
-from faintfield.pipelines.reconstruction.depth_accuracy import write_depth_errors
-from faintfield.pipelines.reconstruction.depth_map import check_light, check_sweep, kept_depth_map, write_depth_map
+from faintfield.pipelines.reconstruction.depth.accuracy import write_depth_errors
+from faintfield.pipelines.reconstruction.depth.depth_map import (
+    check_light,
+    check_sweep,
+    kept_depth_map,
+    write_depth_map,
+)
 from faintfield.pipelines.reconstruction.operators import default_pitch_px, plane_grid, tilted_grid
 from faintfield.pipelines.reconstruction.overview import look_at, write_overview
+from faintfield.pipelines.reconstruction.planes.accuracy import assess
+from faintfield.pipelines.reconstruction.planes.sweep import Runner, Sweep, run_serially
 from faintfield.pipelines.reconstruction.request import Request, distinct_depths, folder_of_method
-from faintfield.pipelines.reconstruction.sweep import Runner, Sweep, run_serially
 from faintfield.recon.operator.grid import PlaneGrid
 
 # Planes whose mean is at most this, in electrons per pixel, count as black.

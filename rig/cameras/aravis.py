@@ -1,24 +1,295 @@
-"""GenICam cameras (GigE Vision, USB3 Vision), through Aravis."""
+"""GenICam cameras (GigE Vision, USB3 Vision), through Aravis: one acquisition and one trigger for each frame."""
 
-from collections.abc import Callable
-from contextlib import suppress
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from ctypes import c_double, c_int
 
-from faintfield.rig.cameras.aravis_device import AravisDevice
-from faintfield.rig.cameras.aravis_library import AravisError, AravisLibrary
-from faintfield.rig.cameras.bounded import call_within
-from faintfield.rig.cameras.protocol import CameraReport, Exposure
+from faintfield.rig.cameras.aravis_library import AravisError, AravisLibrary, Reference
+from faintfield.rig.cameras.aravis_pixels import PixelFormat
+from faintfield.rig.cameras.aravis_times import FrameTimes, Moment, Stamps
+from faintfield.rig.cameras.protocol import CameraReport, Exposure, Metadata, Pixels, call_within
 from faintfield.rig.cameras.settings import AravisSettings
 from faintfield.rig.errors import CameraError, CameraTimeout, in_one_line
 
+# ArvBufferStatus, in words; 0 is success.
+_STATUS = {
+    -1: "its state is unknown",
+    1: "no data came",
+    2: "its packets did not all come in time",
+    3: "packets are missing",
+    4: "a packet came with a number that it cannot have",
+    5: "more data came than a frame has",
+    6: "it was still arriving",
+    7: "it was aborted",
+    8: "it holds no picture",
+}
+
+# No sensor has more rows or columns, and no frame more bytes.
+_MAX_SIDE_PX = 65_536
+_MAX_PAYLOAD = 2_000_000_000
+
+# ARV_GV_STREAM_OPTION_PACKET_SOCKET_DISABLED, and ARV_AUTO_OFF
+_NO_PACKET_SOCKET = 1
+_AUTO_OFF = 0
+
+
+class AravisDevice:
+    """A camera that is connected and waits for requests; its methods block, and may hang if the camera does.
+
+    Raises
+    ------
+    AravisError
+        No camera is found, or it cannot be set up.
+    CameraError
+        The camera keeps another region, pixel format or gain.
+    """
+
+    def __init__(self, library: AravisLibrary, settings: AravisSettings) -> None:
+        self._library = library
+        self._settings = settings
+        self._format = PixelFormat.named(settings.pixel_format)
+        self._times = FrameTimes()
+        self._exposure_s: float | None = None
+        self._in_use = threading.Lock()
+        if settings.camera.startswith("Fake"):
+            library.call("arv_enable_interface", b"Fake")
+        camera = library.reference("arv_camera_new", settings.camera.encode() or None)
+        if camera is None:
+            raise AravisError("no camera is found")
+        self._camera: Reference = camera
+        try:
+            self._configure()
+            self._format_code = self._set_format()
+            self._region = self._set_region()
+            self._call("arv_camera_set_trigger", b"Software")
+            self._has_temperature = bool(self._call("arv_camera_is_feature_available", b"DeviceTemperature"))
+            vendor, model = self._text("arv_camera_get_vendor_name"), self._text("arv_camera_get_model_name")
+            self._name = " ".join(filter(None, (vendor, model, self._text("arv_camera_get_device_id"))))
+        except BaseException:
+            camera.release()
+            raise
+        self._pretends = (vendor, model) == ("Aravis", "Fake")  # it sends a pattern at once, however long it exposes
+
+    def release(self) -> None:
+        """Disconnect as soon as no call in another thread uses the camera."""
+        with self._in_use:
+            self._camera.release()
+
+    def report(self) -> CameraReport:
+        """Return vendor, model and serial number, region, format and limits."""
+        with self._in_use:
+            return self._report()
+
+    def take(self, exposure_s: float) -> tuple[Pixels, Metadata]:
+        """Expose, and return values and metadata of the frame."""
+        with self._in_use:
+            return self._take(exposure_s)
+
+    def _report(self) -> CameraReport:
+        left, upper, width, height = self._region
+        shortest_us, longest_us = self._library.numbers(
+            "arv_camera_get_exposure_time_bounds", c_double, 2, self._camera.pointer
+        )
+        settings = {
+            "PixelFormat": self._format.name,
+            "Region": f"{width} x {height} at {left}, {upper}",
+            "ExposureTime": f"{1e-6 * shortest_us:g} to {1e-6 * longest_us:g} s",
+            **self._settings.features,
+        }
+        if self._call("arv_camera_is_gain_available"):
+            settings["Gain"] = f"{self._library.call('arv_camera_get_gain', self._camera.pointer):g}"
+        sample_bytes = 1 if self._format.bits == 8 else 2
+        return CameraReport(
+            self._name,
+            width * height * sample_bytes + 512,
+            readout_s=0.05,
+            settings=settings,
+            exposure_range_s=(1e-6 * shortest_us, 1e-6 * longest_us),
+        )
+
+    def _take(self, exposure_s: float) -> tuple[Pixels, Metadata]:
+        library = self._library
+        if self._exposure_s != exposure_s:
+            self._set_exposure(exposure_s)
+        payload = self._call("arv_camera_get_payload")
+        if not self._format.frame_bytes(*self._region[2:]) <= payload <= _MAX_PAYLOAD:
+            raise CameraError(
+                f"the camera announces frames of {payload} bytes for the region {list(self._region)} in "
+                f"{self._format.name}; open it again"
+            )
+        stream = library.reference("arv_camera_create_stream", self._camera.pointer, None, None)
+        buffer = library.reference("arv_buffer_new_allocate", payload)
+        if stream is None or buffer is None:
+            raise AravisError("it gives no stream")
+        try:
+            library.call("arv_stream_push_buffer", stream.pointer, buffer.transfer())
+            with self._acquiring():
+                requested = Moment.now()
+                self._call("arv_camera_software_trigger")
+                wait_us = round(1e6 * (exposure_s + 0.5 * self._settings.answer_s))
+                frame = library.reference("arv_stream_timeout_pop_buffer", stream.pointer, wait_us)
+                now = Moment.now()
+            if frame is None:
+                raise CameraTimeout(
+                    f"no frame came within {1e-6 * wait_us:g} s; check the cable, and for a network camera the "
+                    "firewall and camera.packet_bytes"
+                )
+            try:
+                return self._values(frame.pointer), self._metadata(frame.pointer, requested, now, exposure_s)
+            finally:
+                frame.release()
+        finally:
+            stream.release()
+
+    def _configure(self) -> None:
+        """Set what the settings say; the gain is read back, the other features are not."""
+        settings = self._settings
+        if self._call("arv_camera_is_gv_device"):
+            if not settings.packet_socket:
+                self._call("arv_camera_gv_set_stream_options", _NO_PACKET_SOCKET)
+            if settings.packet_bytes is not None:
+                self._call("arv_camera_gv_set_packet_size", settings.packet_bytes)
+        with suppress(AravisError):  # a program that was killed may have left it running
+            self._call("arv_camera_stop_acquisition")
+        device = self._call("arv_camera_get_device")
+        for name, value in settings.features.items():
+            self._library.call("arv_device_set_features_from_string", device, f'{name}="{value}"'.encode())
+        if self._call("arv_camera_is_exposure_auto_available"):
+            self._call("arv_camera_set_exposure_time_auto", _AUTO_OFF)
+        if self._call("arv_camera_is_gain_auto_available"):
+            self._call("arv_camera_set_gain_auto", _AUTO_OFF)
+        if settings.gain is not None:
+            self._set_gain(settings.gain)
+        if self._call("arv_camera_are_chunks_available"):
+            with suppress(AravisError):  # not every camera has this one
+                self._call("arv_camera_set_chunks", b"Timestamp")
+
+    def _set_gain(self, gain: float) -> None:
+        self._call("arv_camera_set_gain", gain)
+        kept = self._library.call("arv_camera_get_gain", self._camera.pointer)
+        if abs(kept - gain) > max(0.01, 0.01 * abs(gain)):
+            raise CameraError(f"the camera keeps gain {kept:g} instead of camera.gain = {gain:g}; choose {kept:g}")
+
+    def _set_format(self) -> int:
+        name = self._format.name
+        self._call("arv_camera_set_pixel_format_from_string", name.encode())
+        kept, code = self._text("arv_camera_get_pixel_format_as_string"), self._call("arv_camera_get_pixel_format")
+        if kept != name or code >> 16 & 0xFF != self._format.stored_bits:
+            raise CameraError(f"the camera keeps pixel format {kept} (0x{code:08x}) instead of {name}; choose another")
+        return code
+
+    def _set_region(self) -> tuple[int, ...]:
+        region_px = self._settings.region_px
+        if region_px is not None:
+            left, upper, width, height = region_px
+            sensor = self._library.numbers("arv_camera_get_sensor_size", c_int, 2, self._camera.pointer)
+            if left + width > sensor[0] or upper + height > sensor[1]:
+                size = f"{sensor[0]} x {sensor[1]}"
+                raise CameraError(
+                    f"camera.region_px = {list(region_px)} leaves the sensor of {size} pixels; correct it"
+                )
+            self._call("arv_camera_set_region", *region_px)
+        region = self._library.numbers("arv_camera_get_region", c_int, 4, self._camera.pointer)
+        if region_px is not None and region != region_px:
+            raise CameraError(
+                f"the camera reads the region {list(region)} instead of {list(region_px)}; choose another"
+            )
+        left, upper, width, height = region
+        if not (0 < width <= _MAX_SIDE_PX and 0 < height <= _MAX_SIDE_PX):
+            raise CameraError(f"the camera reports a frame of {width} x {height} pixels; set camera.region_px")
+        if self._format.mosaic is not None and (left % 2 or upper % 2):
+            raise CameraError(
+                f"the camera's region begins at column {left}, row {upper}, which shifts its mosaic; set "
+                "camera.region_px with an even column and row"
+            )
+        return region
+
+    def _set_exposure(self, exposure_s: float) -> None:
+        self._exposure_s = None  # what the camera keeps after a failure is not known
+        shortest_us, longest_us = self._library.numbers(
+            "arv_camera_get_exposure_time_bounds", c_double, 2, self._camera.pointer
+        )
+        if not 0.99 * shortest_us <= 1e6 * exposure_s <= 1.01 * longest_us:
+            raise CameraError(
+                f"exposure_s = {exposure_s:g} is not among the camera's, {1e-6 * shortest_us:g} to "
+                f"{1e-6 * longest_us:g}; choose one of them"
+            )
+        self._call("arv_camera_set_exposure_time", 1e6 * exposure_s)
+        set_s = 1e-6 * self._library.call("arv_camera_get_exposure_time", self._camera.pointer)
+        if abs(set_s - exposure_s) > 0.01 * exposure_s:
+            raise CameraError(f"the camera exposes {set_s:g} s for exposure_s = {exposure_s:g}; choose {set_s:g}")
+        self._exposure_s = exposure_s
+
+    @contextmanager
+    def _acquiring(self) -> Iterator[None]:
+        self._call("arv_camera_start_acquisition")
+        try:
+            yield
+        except BaseException:
+            with suppress(AravisError):
+                self._call("arv_camera_stop_acquisition")
+            raise
+        self._call("arv_camera_stop_acquisition")
+
+    def _values(self, frame: int) -> Pixels:
+        library = self._library
+        status = library.call("arv_buffer_get_status", frame)
+        if status != 0:
+            raise CameraError(
+                f"the frame is incomplete: {_STATUS.get(status, f'state {status}')}; check the cable, and for a "
+                "network camera camera.packet_bytes and the load of the network"
+            )
+        size = (library.call("arv_buffer_get_image_width", frame), library.call("arv_buffer_get_image_height", frame))
+        code = library.call("arv_buffer_get_image_pixel_format", frame)
+        padding = library.numbers("arv_buffer_get_image_padding", c_int, 2, frame)
+        if size != self._region[2:] or code != self._format_code or any(padding):
+            raise CameraError(
+                f"a frame came with {size[0]} x {size[1]} pixels in format 0x{code:08x}, padded by {list(padding)} "
+                f"bytes, instead of {self._region[2]} x {self._region[3]} in {self._format.name}; open the camera again"
+            )
+        return self._format.values(library.bytes_of(frame), *size)
+
+    def _metadata(self, frame: int, requested: Moment, now: Moment, exposure_s: float) -> Metadata:
+        """Return what is known of a frame, after checking that it began after its request."""
+        library = self._library
+        received_ns = library.call("arv_buffer_get_system_timestamp", frame)
+        stamps = Stamps(received_ns, library.call("arv_buffer_get_timestamp", frame))
+        self._times.check(stamps, requested, now, 0.0 if self._pretends else exposure_s)
+        metadata: dict[str, str | int | float] = {
+            "camera": self._name,
+            "pixel_format": self._format.name,
+            "frame_id": library.call("arv_buffer_get_frame_id", frame),
+            "received_ns": stamps.received_ns,
+            "camera_time_ns": stamps.camera_ns,
+        }
+        if library.call("arv_buffer_has_chunks", frame):
+            parser = library.reference("arv_camera_create_chunk_parser", self._camera.pointer)
+            if parser is not None:
+                with suppress(AravisError):  # other chunks may have been switched on
+                    value = library.call("arv_chunk_parser_get_integer_value", parser.pointer, frame, b"ChunkTimestamp")
+                    metadata["chunk_timestamp"] = value
+                parser.release()
+        temperature_c = self.temperature_c()
+        if temperature_c is not None:
+            metadata["temperature_c"] = temperature_c
+        return metadata
+
+    def temperature_c(self) -> float | None:
+        """Return the temperature in °C, None if the camera does not measure it."""
+        if not self._has_temperature:
+            return None
+        return float(self._library.call("arv_camera_get_float", self._camera.pointer, b"DeviceTemperature"))
+
+    def _text(self, name: str) -> str:
+        return self._library.text(name, self._camera.pointer)
+
+    def _call(self, name: str, *arguments: object) -> int:
+        return int(self._library.call(name, self._camera.pointer, *arguments) or 0)
+
 
 class AravisCamera:
-    """A `Camera` that speaks GenICam.
-
-    Parameters
-    ----------
-    settings : AravisSettings
-        The `[camera]` table.
-    """
+    """A `Camera` that speaks GenICam."""
 
     def __init__(self, settings: AravisSettings) -> None:
         self._settings = settings
@@ -62,13 +333,11 @@ class AravisCamera:
                 call_within(self._settings.answer_s, device.release, "disconnecting")
 
     def _opened(self) -> AravisDevice:
-        """Return the camera; raises `CameraError` before `open`."""
         if self._device is None:
             raise CameraError("the camera is not connected; open it first")
         return self._device
 
     def _bounded[T](self, call: Callable[[], T], what: str, extra_s: float = 0.0) -> T:
-        """Call with a time limit, and raise `CameraError` for what the library reports."""
         try:
             return call_within(self._settings.answer_s + extra_s, call, what)
         except CameraTimeout:

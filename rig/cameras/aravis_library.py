@@ -84,15 +84,7 @@ class _GError(ctypes.Structure):
 
 
 class Reference:
-    """The only reference that we hold to an object of the library.
-
-    Parameters
-    ----------
-    pointer : int
-        Address of the object, of which this becomes the owner.
-    release : callable
-        Gives the reference back; called with `pointer`, once.
-    """
+    """The only reference that we hold to an object of the library; `release` is called once, with its address."""
 
     def __init__(self, pointer: int, release: Callable[[int], None]) -> None:
         self.pointer = pointer
@@ -104,7 +96,7 @@ class Reference:
         """Give the reference back; later calls do nothing."""
         self._release()
 
-    def given_away(self) -> int:
+    def transfer(self) -> int:
         """Return the pointer to a function that takes over the reference."""
         self._release.detach()
         return self.pointer
@@ -125,9 +117,7 @@ class AravisLibrary:
             self._gobject = ctypes.CDLL("libgobject-2.0.so.0")
             self._glib = ctypes.CDLL("libglib-2.0.so.0")
         except OSError as failure:
-            raise MissingExtra(
-                f"backend 'aravis' needs {LIBRARY}, which is not installed; run: apt-get install libaravis-0.8-0"
-            ) from failure
+            raise MissingExtra(f"backend 'aravis' needs {LIBRARY}; run: apt-get install libaravis-0.8-0") from failure
         self._gobject.g_object_unref.restype, self._gobject.g_object_unref.argtypes = None, (c_void_p,)
         self._glib.g_error_free.restype, self._glib.g_error_free.argtypes = None, (c_void_p,)
         for name, (result, arguments) in _PLAIN.items():
@@ -156,19 +146,13 @@ class AravisLibrary:
         found: bytes | None = self.call(name, *arguments)
         return "" if found is None else found.decode(errors="replace")
 
-    def integers(self, name: str, count: int, *arguments: Any) -> tuple[int, ...]:
-        """Call a function that fills in `count` integers, and return these."""
-        values = [c_int() for _ in range(count)]
+    def numbers(self, name: str, kind: type[c_int | c_double], count: int, *arguments: Any) -> tuple[Any, ...]:
+        """Call a function that fills in `count` numbers, and return these."""
+        values = [kind() for _ in range(count)]
         self.call(name, *arguments, *map(byref, values))
         return tuple(value.value for value in values)
 
-    def floats(self, name: str, count: int, *arguments: Any) -> tuple[float, ...]:
-        """Call a function that fills in `count` floats, and return these."""
-        values = [c_double() for _ in range(count)]
-        self.call(name, *arguments, *map(byref, values))
-        return tuple(value.value for value in values)
-
-    def owned(self, name: str, *arguments: Any) -> Reference | None:
+    def reference(self, name: str, *arguments: Any) -> Reference | None:
         """Call a function that returns a new reference; None if it returns nothing."""
         pointer: int | None = self.call(name, *arguments)
         return None if pointer is None else Reference(pointer, self._gobject.g_object_unref)
@@ -180,12 +164,10 @@ class AravisLibrary:
         return ctypes.string_at(data, size.value) if data else b""
 
     def _declare(self, name: str, result: Any, arguments: tuple[Any, ...]) -> None:
-        """Declare the types of a function."""
         try:
             function = getattr(self._aravis, name)
         except AttributeError as failure:
             raise MissingExtra(
-                f"backend 'aravis' needs {LIBRARY} of version {_VERSION} or newer; the one that is installed has no "
-                f"{name}: install a newer one"
+                f"backend 'aravis' needs {LIBRARY} {_VERSION} or newer, which has {name}; install it"
             ) from failure
         function.restype, function.argtypes = result, arguments

@@ -60,14 +60,7 @@ class PixelFormat:
         return -(-width * height * self.stored_bits // 8)
 
     def values(self, content: bytes, width: int, height: int) -> Pixels:
-        """Return the values of a frame.
-
-        Parameters
-        ----------
-        content : bytes
-            The frame, without padding; what follows it, such as chunks, is ignored.
-        width, height : int
-            Size in pixels.
+        """Return the values of a frame without padding; what follows it, such as chunks, is ignored.
 
         Returns
         -------

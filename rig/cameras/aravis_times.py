@@ -72,14 +72,7 @@ class FrameTimes:
     def check(self, stamps: Stamps, requested: Moment, now: Moment, exposure_s: float) -> None:
         """Raise `CameraError` if the frame's exposure began before it was requested, or that cannot be told.
 
-        Parameters
-        ----------
-        stamps : Stamps
-            Time stamps of the frame.
-        requested, now : Moment
-            When the frame was triggered, and a moment after it came.
-        exposure_s : float
-            Exposure time; 0 if the camera only pretends to expose.
+        `now` is a moment after the frame came. `exposure_s` is 0 if the camera only pretends to expose.
         """
         passed_s = 1e-9 * (now.clock_ns - requested.clock_ns)
         by_date_s = 1e-9 * (now.date_ns - requested.date_ns)
@@ -101,7 +94,6 @@ class FrameTimes:
             self._last[exposure_s] = (requested.clock_ns + after_ns, stamps.camera_ns)
 
     def _check_own(self, stamps: Stamps, requested: Moment, exposure_s: float) -> None:
-        """Raise `CameraError` if the frame is too old by the camera's own clock."""
         if stamps.camera_ns <= self._newest_ns:
             raise CameraError(
                 "a frame came that is not newer by the camera's clock than the one before; take it again, or open the "

@@ -5,6 +5,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import NamedTuple
 
 from faintfield.rig.cameras.protocol import CameraReport, Decode, Exposure
 from faintfield.rig.cameras.settings import FolderSettings
@@ -29,69 +30,30 @@ _ZERO_TAIL_BYTES = 512
 _PROBE = ".faintfield-time"
 
 
-@dataclass(frozen=True)
-class _Request:
-    """When a frame was asked for.
-
-    Attributes
-    ----------
-    asked_s, end_s, deadline_s : float
-        Times of the request, of the earliest end of the exposure, and of giving up, by the rig's clock.
-    folder_time_s : float or None
-        Time of the request by the clock of the folder's file system, None if it is not known or does not count.
-    """
+class _Request(NamedTuple):
+    """A request for a frame, by the rig's clock; `folder_time_s` is by that of the folder's file system, if known."""
 
     asked_s: float
-    end_s: float
+    exposure_s: float
     deadline_s: float
     folder_time_s: float | None
 
 
 @dataclass
 class _Arrival:
-    """A file that is being written, as it was last seen.
+    """A file that is being written, in the state that it has had since `since_s`; `problem` is why it is no picture."""
 
-    Attributes
-    ----------
-    state : (Path, int, int)
-        The file, its size in bytes, and the time of its last change in ns.
-    since_s : float
-        Time at which it was first seen in this state, by the rig's clock.
-    problem : str
-        Why it does not decode, if it does not.
-    """
-
-    state: tuple[Path, int, int]
+    path: Path
+    size_bytes: int
+    changed_ns: int
     since_s: float
     problem: str = ""
-
-    @property
-    def path(self) -> Path:
-        """The file."""
-        return self.state[0]
-
-    @property
-    def size_bytes(self) -> int:
-        """Size of the file."""
-        return self.state[1]
-
-    @property
-    def changed_s(self) -> float:
-        """Time of its last change by the file system's clock."""
-        return self.state[2] * 1e-9
 
 
 class FolderCamera:
     """A `Camera` that takes its frames from new files in a folder.
 
-    Parameters
-    ----------
-    settings : FolderSettings
-        The `[camera]` table.
-    clock : Clock
-        Clock of the waits.
-    decode : callable, optional
-        Reads the pixels of a file, to see whether it is complete; without it every kind of file is an unknown one.
+    `decode` reads the pixels of a file, to see whether it is complete; without it every kind of file is an unknown one.
     """
 
     def __init__(self, settings: FolderSettings, clock: Clock, decode: Decode = lambda path: None) -> None:
@@ -101,7 +63,7 @@ class FolderCamera:
         self._decode = decode
         self._known: set[Path] | None = None
         self._device = 0
-        self._seen_when_late: set[Path] | None = None
+        self._known_when_late: set[Path] | None = None
 
     def open(self) -> None:
         """Remember the files that are already in the folder, which are not frames of this session."""
@@ -134,13 +96,15 @@ class FolderCamera:
         known = self._require_open()
         with self._translate_errors():
             files = set(self._files())
-            if self._seen_when_late is not None and files - self._seen_when_late:
-                self._seen_when_late = None  # the late file has come in the meantime
+            if self._known_when_late is not None and files - self._known_when_late:
+                self._known_when_late = None  # the late file has come in the meantime
             known.update(files)  # a late or unrequested frame shows another position
-            request = self._request(exposure_s)
+            now_s = self._clock.now_s()
+            deadline_s = now_s + exposure_s + self._settings.arrival_s
+            request = _Request(now_s, exposure_s, deadline_s, self._folder_time_s())
             arrival: _Arrival | None = None
             while self._clock.now_s() < request.deadline_s:
-                arrival = self._look(known, arrival)
+                arrival = self._arriving_file(known, arrival)
                 if arrival is not None:
                     self._refuse_late(arrival, known)
                     self._refuse_early(arrival, request, known)
@@ -152,18 +116,20 @@ class FolderCamera:
                             metadata={"camera_file": arrival.path.name},
                         )
                 self._clock.sleep_s(_POLL_S)
-        self._seen_when_late = set(known)
-        raise self._late(arrival, request)
+        self._known_when_late = set(known)
+        state = "no file came"
+        if arrival is not None:
+            state = f"{arrival.path.name} never stopped growing"
+            if arrival.problem:
+                state = f"{arrival.path.name} is not complete ({arrival.problem.partition('; ')[0]})"
+        raise CameraTimeout(
+            f"{self._folder}: {state} within {exposure_s + self._settings.arrival_s:g} s; "
+            "check that the camera's program is triggered and saves there"
+        )
 
     def close(self) -> None:
         """Forget the folder's files."""
         self._known = None
-
-    def _request(self, exposure_s: float) -> _Request:
-        """Return when a frame is asked for, which is now."""
-        now_s = self._clock.now_s()
-        deadline_s = now_s + exposure_s + self._settings.arrival_s
-        return _Request(now_s, now_s + exposure_s, deadline_s, self._folder_time_s())
 
     def _folder_time_s(self) -> float | None:
         """Return the time in s by the file system's clock, which for a network folder is that of another computer."""
@@ -179,8 +145,7 @@ class FolderCamera:
             with suppress(OSError):
                 probe.unlink()
 
-    def _look(self, known: set[Path], before: _Arrival | None) -> _Arrival | None:
-        """List the folder, and return the state of the new file, None if there is none."""
+    def _arriving_file(self, known: set[Path], before: _Arrival | None) -> _Arrival | None:
         new = sorted(set(self._files()) - known)
         if len(new) > 1:
             known.update(new)
@@ -195,13 +160,15 @@ class FolderCamera:
         except FileNotFoundError:  # it was renamed after the listing
             return None
         state = (new[0], status.st_size, status.st_mtime_ns)
-        return before if before is not None and before.state == state else _Arrival(state, self._clock.now_s())
+        if before is not None and (before.path, before.size_bytes, before.changed_ns) == state:
+            return before
+        return _Arrival(*state, self._clock.now_s())
 
     def _refuse_late(self, arrival: _Arrival, known: set[Path]) -> None:
         """Refuse the first file after a frame that did not come in time, perhaps of where the stage was before."""
-        if self._seen_when_late is None:
+        if self._known_when_late is None:
             return
-        self._seen_when_late = None
+        self._known_when_late = None
         known.add(arrival.path)
         raise CameraError(
             f"{arrival.path}: may be the frame before, which did not come in time; take this frame again, and raise "
@@ -210,33 +177,37 @@ class FolderCamera:
 
     def _refuse_early(self, arrival: _Arrival, request: _Request, known: set[Path]) -> None:
         """Refuse a file whose exposure was begun before the frame was asked for, perhaps while the stage moved."""
-        exposure_s = request.end_s - request.asked_s
         # Read after the listing, so that a file is never taken for an earlier one than it is
         after_s = self._clock.now_s() - request.asked_s
-        if after_s < exposure_s:
+        if after_s < request.exposure_s:
             known.add(arrival.path)
             raise CameraError(
-                f"{arrival.path}: came {after_s:.2f} s after the frame was asked for, which is exposed for "
-                f"{exposure_s:g} s, so that it was begun before; start no exposure by hand, state the camera's true "
-                "exposure time, and take this frame again"
+                f"{arrival.path}: came {after_s:.2f} s after the request for a frame of {request.exposure_s:g} s, so "
+                "that its exposure was begun before; start no exposure by hand, state the camera's true exposure "
+                "time, and take this frame again"
             )
         if request.folder_time_s is None:
             return
-        early_s = request.folder_time_s + exposure_s - arrival.changed_s
+        changed_s = 1e-9 * arrival.changed_ns
+        early_s = request.folder_time_s + request.exposure_s - changed_s
         if early_s > _TIME_GRAIN_S:
             known.add(arrival.path)
             raise CameraError(
-                f"{arrival.path}: was last changed at {_in_words(arrival.changed_s)}, {early_s:.1f} s before "
-                f"the exposure of {exposure_s:g} s that was asked for at {_in_words(request.folder_time_s)} could end; "
+                f"{arrival.path}: was last changed at {_utc(changed_s)}, {early_s:.1f} s before the exposure of "
+                f"{request.exposure_s:g} s that was asked for at {_utc(request.folder_time_s)} could end; "
                 "take this frame again, or set camera.file_times = false if the program keeps the camera's own time"
             )
 
     def _is_complete(self, arrival: _Arrival) -> bool:
-        """Return whether a file is written to its end, as far as can be known."""
         quiet_s = self._clock.now_s() - arrival.since_s
         long_quiet = quiet_s >= self._settings.quiet_s
         arrival.problem = ""
-        if arrival.size_bytes == 0 or quiet_s < _QUIET_S or (_ends_in_zeros(arrival) and not long_quiet):
+        if arrival.size_bytes == 0 or quiet_s < _QUIET_S:
+            return False
+        with arrival.path.open("rb") as file:
+            file.seek(max(arrival.size_bytes - _ZERO_TAIL_BYTES, 0))
+            ends_in_zeros = not any(file.read(_ZERO_TAIL_BYTES))
+        if ends_in_zeros and not long_quiet:
             return False
         try:
             return self._decode(arrival.path) is not None or long_quiet
@@ -244,27 +215,13 @@ class FolderCamera:
             arrival.problem = str(failure)
             return False
 
-    def _late(self, arrival: _Arrival | None, request: _Request) -> CameraTimeout:
-        """Return the failure for a frame that did not come in time."""
-        state = "no file came"
-        if arrival is not None:
-            state = f"{arrival.path.name} never stopped growing"
-            if arrival.problem:
-                state = f"{arrival.path.name} is not complete ({arrival.problem.partition('; ')[0]})"
-        return CameraTimeout(
-            f"{self._folder}: {state} within {request.deadline_s - request.asked_s:g} s; "
-            "check that the camera's program is triggered and saves there"
-        )
-
     def _files(self) -> list[Path]:
-        """Return the files with the configured suffixes."""
         if self._folder.stat().st_dev != self._device:  # where a disk was mounted, an empty folder remains
             raise self._gone()
         return [path for path in self._folder.iterdir() if path.suffix.lower() in self._settings.suffixes]
 
     @contextmanager
     def _translate_errors(self) -> Iterator[None]:
-        """Raise `CameraError` for a folder or file that cannot be read any more."""
         try:
             yield
         except OSError as failure:
@@ -276,11 +233,9 @@ class FolderCamera:
             ) from failure
 
     def _gone(self) -> CameraError:
-        """Return the failure for a folder that was there."""
         return CameraError(f"{self._folder}: the folder is gone; mount it again, and take this frame again")
 
     def _require_open(self) -> set[Path]:
-        """Return the files seen so far; raises `CameraError` before `open`."""
         if self._known is None:
             if not self._folder.is_dir():  # opening it again after a failure has failed, too
                 raise self._gone()
@@ -288,13 +243,5 @@ class FolderCamera:
         return self._known
 
 
-def _ends_in_zeros(arrival: _Arrival) -> bool:
-    """Return whether the last bytes of a file are all zero."""
-    with arrival.path.open("rb") as file:
-        file.seek(max(arrival.size_bytes - _ZERO_TAIL_BYTES, 0))
-        return not any(file.read(_ZERO_TAIL_BYTES))
-
-
-def _in_words(time_s: float) -> str:
-    """Return a time of a file system's clock in UTC, such as 12:04:31.2."""
+def _utc(time_s: float) -> str:
     return datetime.fromtimestamp(time_s, UTC).strftime("%H:%M:%S.%f")[:-5] + " UTC"

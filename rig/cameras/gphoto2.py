@@ -6,8 +6,7 @@ from functools import partial
 from pathlib import PurePath
 from typing import Any
 
-from faintfield.rig.cameras.bounded import call_within
-from faintfield.rig.cameras.protocol import CameraReport, Exposure
+from faintfield.rig.cameras.protocol import CameraReport, Exposure, call_within
 from faintfield.rig.cameras.settings import GPhoto2Settings
 from faintfield.rig.errors import CameraError, CameraTimeout, MissingExtra
 
@@ -18,13 +17,7 @@ _RECORDED = ("iso", "f-number", "aperture", "imageformat", "imagequality", "focu
 
 
 class GPhoto2Camera:
-    """A `Camera` that libgphoto2 supports.
-
-    Parameters
-    ----------
-    settings : GPhoto2Settings
-        The `[camera]` table.
-    """
+    """A `Camera` that libgphoto2 supports."""
 
     def __init__(self, settings: GPhoto2Settings) -> None:
         self._settings = settings
@@ -37,9 +30,7 @@ class GPhoto2Camera:
         try:
             import gphoto2
         except ImportError as failure:
-            raise MissingExtra(
-                "backend 'gphoto2' needs a package that is not installed; run: pip install 'faintfield[gphoto2]'"
-            ) from failure
+            raise MissingExtra("backend 'gphoto2' needs a package; run: pip install 'faintfield[gphoto2]'") from failure
         self._gphoto2 = gphoto2
         self.close()
         self._camera = self._bounded(self._connect, "connecting")
@@ -79,7 +70,6 @@ class GPhoto2Camera:
                 pass  # any fault was already raised when the camera was used
 
     def _bounded(self, call: Any, what: str, extra_s: float = 0.0) -> Any:
-        """Call with a time limit, and raise `CameraError` for what the library raises."""
         if self._camera is None and call != self._connect:
             raise CameraError("the camera is not connected; open it first")
         try:
@@ -94,7 +84,6 @@ class GPhoto2Camera:
             ) from failure
 
     def _connect(self) -> Any:
-        """Return the connected camera."""
         camera = self._gphoto2.Camera()
         if self._settings.port:
             ports = self._gphoto2.PortInfoList()
@@ -104,7 +93,6 @@ class GPhoto2Camera:
         return camera
 
     def _read_settings(self) -> dict[str, str]:
-        """Return the value of every setting, by name."""
         values: dict[str, str] = {}
         pending = [self._camera.get_config()]
         containers = (self._gphoto2.GP_WIDGET_WINDOW, self._gphoto2.GP_WIDGET_SECTION)
@@ -126,12 +114,10 @@ class GPhoto2Camera:
         raise CameraError("the camera lets no program set its exposure time; turn its dial to M (manual)")
 
     def _shutter_choices(self) -> dict[float, str]:
-        """Return the camera's text for each exposure time in seconds."""
         choices = ((choice, shutter_s(choice)) for choice in self._shutter().get_choices())
         return {seconds: choice for choice, seconds in choices if seconds is not None}
 
     def _set_shutter(self, exposure_s: float) -> None:
-        """Set the nearest available exposure time; raises `CameraError` if it is more than 1 % off."""
         choices = self._shutter_choices()
         nearest = min(choices, key=lambda seconds: abs(seconds - exposure_s), default=None)
         if nearest is None or abs(nearest - exposure_s) > 0.01 * nearest:
@@ -142,7 +128,6 @@ class GPhoto2Camera:
         self._camera.set_single_config(widget.get_name(), widget)
 
     def _set(self, name: str, value: str) -> None:
-        """Change one of the camera's settings; raises `CameraError` for a name or a value that it does not offer."""
         try:
             widget = self._camera.get_single_config(name)
         except self._gphoto2.GPhoto2Error as failure:
@@ -188,7 +173,6 @@ class GPhoto2Camera:
         )
 
     def _release(self) -> tuple[bytes, str]:
-        """Expose, and return the file and its name."""
         place = self._camera.capture(self._gphoto2.GP_CAPTURE_IMAGE)
         file = self._camera.file_get(place.folder, place.name, self._gphoto2.GP_FILE_TYPE_NORMAL)
         content = bytes(file.get_data_and_size())

@@ -5,8 +5,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from faintfield.rig.cameras.bounded import call_within
-from faintfield.rig.cameras.protocol import CameraReport, Exposure, Metadata
+from faintfield.rig.cameras.protocol import CameraReport, Exposure, Metadata, call_within
 from faintfield.rig.cameras.settings import MicroManagerSettings
 from faintfield.rig.errors import CameraError, CameraTimeout, MissingExtra, in_one_line
 from faintfield.rig.micromanager import NotOffered, PackageMissing, SharedCore, set_properties
@@ -16,15 +15,7 @@ _TEMPERATURES = ("CCDTemperature", "SensorTemperature", "Temperature")
 
 
 class MicroManagerCamera:
-    """A `Camera` that Micro-Manager supports, through pymmcore-plus.
-
-    Parameters
-    ----------
-    settings : MicroManagerSettings
-        The `[camera]` table.
-    shared : SharedCore, optional
-        The core, if the stage uses it as well.
-    """
+    """A `Camera` that Micro-Manager supports, through pymmcore-plus; the stage may share its core."""
 
     def __init__(self, settings: MicroManagerSettings, shared: SharedCore | None = None) -> None:
         self._settings = settings
@@ -55,9 +46,7 @@ class MicroManagerCamera:
             lambda: self._snap(exposure_s), f"an exposure of {exposure_s:g} s", extra_s=2.0 * exposure_s
         )
         if pixels.dtype.kind != "u" or pixels.dtype.itemsize > 2:
-            raise CameraError(
-                f"the camera gives pixels of type {pixels.dtype}; set its PixelType to 16bit, or 8bit if it has no more"
-            )
+            raise CameraError(f"the camera gives pixels of type {pixels.dtype}; set its PixelType to 16bit or 8bit")
         return Exposure(".tiff", pixels=pixels, metadata=metadata)
 
     def temperature_c(self) -> float | None:
@@ -71,7 +60,6 @@ class MicroManagerCamera:
             self._release()
 
     def _bounded[T](self, call: Callable[[], T], what: str, extra_s: float = 0.0, *, connecting: bool = False) -> T:
-        """Call with a time limit, and raise `CameraError` for what the library raises."""
         if self._core is None and not connecting:
             raise CameraError("the camera is not connected; open it first")
         try:
@@ -89,12 +77,10 @@ class MicroManagerCamera:
             ) from failure
 
     def _release(self) -> None:
-        """Let the devices go."""
         with suppress(CameraError, RuntimeError):  # any fault was already raised when the camera was used
             call_within(self._settings.answer_s, lambda: self._shared.release("camera"), "disconnecting")
 
     def _load(self) -> Any:
-        """Load the configured devices, set the camera's properties, and return the core."""
         core = self._shared.acquire("camera")
         camera = core.getCameraDevice()
         if not camera:
@@ -103,24 +89,21 @@ class MicroManagerCamera:
         return core
 
     def _snap(self, exposure_s: float) -> tuple[Any, Metadata]:
-        """Expose, and return the pixels, the camera's label and its temperature."""
         self._core.setExposure(1e3 * exposure_s)
         pixels = self._core.snap()
         return pixels, {"camera": self._core.getCameraDevice(), "temperature_c": self._read_temperature()}
 
     def _read_temperature(self) -> float | None:
-        """Return the temperature of the sensor, None if there is no such property, or none that is a number."""
         label = self._core.getCameraDevice()
         present = set(self._core.getDevicePropertyNames(label))
         name = next((name for name in _TEMPERATURES if name in present), None)
         try:
-            found_c = math.nan if name is None else float(self._core.getProperty(label, name))
+            temperature_c = math.nan if name is None else float(self._core.getProperty(label, name))
         except ValueError:
             return None
-        return found_c if math.isfinite(found_c) else None
+        return temperature_c if math.isfinite(temperature_c) else None
 
     def _read_report(self) -> CameraReport:
-        """Return the report."""
         core = self._core
         label = core.getCameraDevice()
         pixels = core.getImageWidth() * core.getImageHeight() * core.getNumberOfComponents()

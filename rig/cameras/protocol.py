@@ -8,6 +8,9 @@ from typing import Any, Protocol, runtime_checkable
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from faintfield.rig.clock import result_within
+from faintfield.rig.errors import CameraTimeout
+
 type Pixels = NDArray[Any]
 type Metadata = Mapping[str, str | int | float | Sequence[float] | None]
 
@@ -89,15 +92,7 @@ class Camera(Protocol):
         """Return the camera's name, limits and settings."""
 
     def expose(self, exposure_s: float, number: int) -> Exposure:
-        """Take one frame.
-
-        Parameters
-        ----------
-        exposure_s : float
-            Exposure time.
-        number : int
-            Number of the exposure in the session, counting those that were not kept.
-        """
+        """Take one frame; `number` counts the exposures of a session, also those that were not kept."""
 
     def close(self) -> None:
         """Disconnect; closing twice does no harm."""
@@ -109,3 +104,16 @@ class Thermometer(Protocol):
 
     def temperature_c(self) -> float | None:
         """Return the temperature in °C, None if this camera has no sensor for it."""
+
+
+def call_within[T](bound_s: float, call: Callable[[], T], what: str) -> T:
+    """Return the result of `call`, or raise `CameraTimeout` if there is none within `bound_s`; see `result_within`.
+
+    The message says `what` the call does.
+    """
+    try:
+        return result_within(bound_s, call, "camera")
+    except TimeoutError as failure:
+        raise CameraTimeout(
+            f"the camera did not finish {what} in {bound_s:g} s; check cable and battery, switch it off and on"
+        ) from failure

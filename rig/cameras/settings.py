@@ -22,14 +22,6 @@ _OWN_FEATURES = {"PixelFormat", "Gain", "ExposureTime"}
 MAX_ANSWER_S = 3600.0
 
 
-def check_mosaic(mosaic: Mosaic | None) -> None:
-    """Check the rows of one period of colour filters; raises `ValueError`."""
-    if mosaic is None:
-        return
-    if not mosaic or not mosaic[0] or len({len(row) for row in mosaic}) > 1 or set("".join(mosaic)) - set("RGB"):
-        raise ValueError(f"camera.mosaic = {list(mosaic)}; give rows of one length of the letters R, G and B")
-
-
 class CoolingSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Keys of every `[camera]` table: the temperature at which frames are taken.
 
@@ -59,9 +51,28 @@ class CoolingSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
             )
         if wanted_c is None and (self.settle_tolerance_c, self.settle_limit_s) != (0.5, 900.0):
             raise ValueError(
-                "camera.settle_tolerance_c and settle_limit_s are those of the wait for settle_temperature_c; give it, "
-                "or remove them"
+                "camera.settle_tolerance_c and settle_limit_s need settle_temperature_c; give it, or remove them"
             )
+
+
+class MosaicSettings(CoolingSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Keys of the `[camera]` tables of cameras whose files do not state their colour filters.
+
+    Parameters
+    ----------
+    mosaic : tuple of str, optional
+        Rows of one period of the colour filters, such as `["RG", "GB"]`; by default there are none.
+    """
+
+    mosaic: Mosaic | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.mosaic is None:
+            return
+        widths, letters = set(map(len, self.mosaic)), set("".join(self.mosaic))
+        if not letters or len(widths) > 1 or not letters <= set("RGB"):
+            raise ValueError(f"camera.mosaic = {list(self.mosaic)}; give rows of one length of the letters R, G and B")
 
 
 class GPhoto2Settings(CoolingSettings, frozen=True, forbid_unknown_fields=True, tag_field="backend", tag="gphoto2"):
@@ -89,7 +100,7 @@ class GPhoto2Settings(CoolingSettings, frozen=True, forbid_unknown_fields=True, 
 
 
 class MicroManagerSettings(
-    CoolingSettings, frozen=True, forbid_unknown_fields=True, tag_field="backend", tag="micromanager"
+    MosaicSettings, frozen=True, forbid_unknown_fields=True, tag_field="backend", tag="micromanager"
 ):
     """A camera for which Micro-Manager has a device adapter.
 
@@ -103,19 +114,12 @@ class MicroManagerSettings(
         Properties of the camera, set when it is opened, such as `Binning = "1"`.
     answer_s : float
         Time limit for every operation, in addition to the exposure.
-    mosaic : tuple of str, optional
-        Rows of one period of the colour filters, such as `["RG", "GB"]`; by default there are none.
     """
 
     configuration: str = ""
     adapters: str = ""
     properties: dict[str, str] = {}
     answer_s: float = 20.0
-    mosaic: Mosaic | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_mosaic(self.mosaic)
 
 
 class AravisSettings(CoolingSettings, frozen=True, forbid_unknown_fields=True, tag_field="backend", tag="aravis"):
@@ -154,8 +158,8 @@ class AravisSettings(CoolingSettings, frozen=True, forbid_unknown_fields=True, t
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if taken := sorted(_OWN_FEATURES & set(self.features)):
-            raise ValueError(f"camera.features has {', '.join(taken)}, which other keys or the capture set; remove it")
+        if own := sorted(_OWN_FEATURES & set(self.features)):
+            raise ValueError(f"camera.features has {', '.join(own)}, which other keys or the capture set; remove it")
         if self.packet_bytes is not None and not 576 <= self.packet_bytes <= 65535:
             raise ValueError(f"camera.packet_bytes = {self.packet_bytes}; give 576 to 65535")
         bayer = self.mosaic is not None
@@ -175,7 +179,7 @@ class AravisSettings(CoolingSettings, frozen=True, forbid_unknown_fields=True, t
         return PixelFormat.named(self.pixel_format).mosaic
 
 
-class PluginSettings(CoolingSettings, frozen=True, forbid_unknown_fields=True, tag_field="backend", tag="plugin"):
+class PluginSettings(MosaicSettings, frozen=True, forbid_unknown_fields=True, tag_field="backend", tag="plugin"):
     """A camera that another package drives; docs/plugins.md.
 
     Parameters
@@ -184,20 +188,13 @@ class PluginSettings(CoolingSettings, frozen=True, forbid_unknown_fields=True, t
         Name of the entry point in the group `faintfield.cameras`, which is `backend` in rig.toml.
     options : dict
         The other keys of the table, which the plug-in's own settings type checks.
-    mosaic : tuple of str, optional
-        Rows of one period of the colour filters, such as `["RG", "GB"]`; by default there are none.
     """
 
     name: str
     options: dict[str, Any] = {}
-    mosaic: Mosaic | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_mosaic(self.mosaic)
 
 
-class FolderSettings(CoolingSettings, frozen=True, forbid_unknown_fields=True, tag_field="backend", tag="folder"):
+class FolderSettings(MosaicSettings, frozen=True, forbid_unknown_fields=True, tag_field="backend", tag="folder"):
     """Any vendor's program that saves each frame as a file in a folder.
 
     Parameters
@@ -215,8 +212,6 @@ class FolderSettings(CoolingSettings, frozen=True, forbid_unknown_fields=True, t
     file_times : bool
         Refuse a file that was last changed before the exposure could end; switch this off for a program that gives its
         files the camera's own time.
-    mosaic : tuple of str, optional
-        Rows of one period of the colour filters; raw files contain this themselves.
     """
 
     folder: str
@@ -225,20 +220,16 @@ class FolderSettings(CoolingSettings, frozen=True, forbid_unknown_fields=True, t
     arrival_s: float = 60.0
     quiet_s: float = 5.0
     file_times: bool = True
-    mosaic: Mosaic | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not Path(self.folder).name:
             raise ValueError(f"camera.folder = {self.folder!r} names no folder; give the folder of the camera's files")
-        check_mosaic(self.mosaic)
         if not 0.0 <= self.quiet_s < self.arrival_s:
-            raise ValueError(
-                f"camera.quiet_s = {self.quiet_s:g}; give less than arrival_s = {self.arrival_s:g}, and at least 0"
-            )
+            raise ValueError(f"camera.quiet_s = {self.quiet_s:g}; give 0 to less than arrival_s = {self.arrival_s:g}")
 
 
-class SimulatedSettings(CoolingSettings, frozen=True, forbid_unknown_fields=True, tag_field="backend", tag="simulated"):
+class SimulatedSettings(MosaicSettings, frozen=True, forbid_unknown_fields=True, tag_field="backend", tag="simulated"):
     """The paper's camera and scene, rendered from the true position of the simulated stage.
 
     Parameters
@@ -249,8 +240,6 @@ class SimulatedSettings(CoolingSettings, frozen=True, forbid_unknown_fields=True
         Photons on a pixel that sees a white object, with the lights on and almost off.
     read_noise_e, gain_dn_per_e, saturation_dn : float, float, int
         Read noise, gain and highest value of the sensor; by default those of the paper.
-    mosaic : tuple of str, optional
-        Rows of one period of the colour filters, such as `["RG", "GB"]`; by default there are none.
     position_error_mm, rotation_error_mrad : float
         Standard deviation, per axis, of the camera's pose from where the motors are.
     scale_error, squareness_mrad : float
@@ -269,7 +258,6 @@ class SimulatedSettings(CoolingSettings, frozen=True, forbid_unknown_fields=True
     read_noise_e: float = 12.0**0.5
     gain_dn_per_e: float = 2.0
     saturation_dn: int = 65535
-    mosaic: Mosaic | None = None
     position_error_mm: float = 0.0
     rotation_error_mrad: float = 0.0
     scale_error: float = 0.0
@@ -284,17 +272,14 @@ class SimulatedSettings(CoolingSettings, frozen=True, forbid_unknown_fields=True
             raise ValueError(f"camera.size_px = {list(self.size_px)} is too small; give at least 8 x 8")
         width, height = self.size_px
         if width * height > MAX_SIMULATED_PIXELS:
-            raise ValueError(
-                f"camera.size_px = {list(self.size_px)} has {width * height} pixels, at most {MAX_SIMULATED_PIXELS} "
-                "are simulated; give a smaller frame"
-            )
+            size = f"{width * height} pixels, at most {MAX_SIMULATED_PIXELS} are simulated"
+            raise ValueError(f"camera.size_px = {list(self.size_px)} has {size}; give a smaller frame")
         if self.gain_dn_per_e <= 0 or min(self.read_noise_e, self.position_error_mm, self.rotation_error_mrad) < 0:
             raise ValueError("camera: a gain is positive, and read noise and errors are not negative; correct them")
         if min(self.lit_photons_per_s, self.unlit_photons_per_s, self.seed) < 0 or not 0 < self.saturation_dn < 2**16:
             raise ValueError("camera: light and seed are not negative, and saturation_dn is 1 to 65535; correct them")
         if not self.cooling_s > 0.0:
             raise ValueError(f"camera.cooling_s = {self.cooling_s:g}; give a positive time")
-        check_mosaic(self.mosaic)
 
 
 type CameraSettings = (

@@ -19,14 +19,9 @@ _BOARD_SEARCH_PX = 1600
 
 
 class Findings(Struct, frozen=True):
-    """Result of the check of a frame.
+    """Measured values of a frame by name, and warnings, one line each, with the limit and a remedy.
 
-    Parameters
-    ----------
-    values : dict
-        Measured values by name: `median_dn`, `contrast_dn`, `saturated_share`, `sharpness`, `board_corners`, `leak_dn`.
-    warnings : tuple of str
-        Warnings, one line each, with the limit and a remedy.
+    The names are `median_dn`, `contrast_dn`, `saturated_share`, `sharpness`, `board_corners` and `leak_dn`.
     """
 
     values: dict[str, float]
@@ -42,25 +37,14 @@ def check_frame(
 ) -> Findings:
     """Measure a frame as its kind requires, and compare the values with the limits.
 
-    Board corners are only counted: a warning depends on more than one frame, see `rig.capture.checks`.
-
-    Parameters
-    ----------
-    pixels : array
-        (row, column) or (row, column, colour).
-    kind : str
-        Kind of the frame.
-    limits : CheckSettings
-        Limits beyond which there is a warning.
-    boards : sequence of BoardSettings
-        The boards that a charuco frame should show.
-    earlier_sharpness : sequence of float
-        Sharpness of earlier frames of the same step.
+    `pixels` are (row, column) or (row, column, colour). Sharpness is compared with earlier frames of the same step.
+    Corners of boards are only counted: a warning depends on more than one frame, see `board_warnings`.
     """
     values: dict[str, float] = {"median_dn": float(np.median(pixels))}
     grey = pixels if pixels.ndim == 2 else pixels.mean(axis=2)
     if kind in LIT_KINDS:
-        values["saturated_share"] = _saturated_share(pixels, limits.saturation_dn)
+        largest_dn = np.iinfo(pixels.dtype).max if pixels.dtype.kind in "iu" else np.inf
+        values["saturated_share"] = float(np.mean(pixels >= (limits.saturation_dn or largest_dn)))
     if kind in ("charuco", "bright"):
         values["contrast_dn"] = float(np.subtract(*np.quantile(grey, (0.99, 0.01))))
         values["sharpness"] = _sharpness(grey)
@@ -71,12 +55,6 @@ def check_frame(
     return Findings(
         {name: round(value, 5) for name, value in values.items()}, _warnings(kind, values, limits, earlier_sharpness)
     )
-
-
-def _saturated_share(pixels: Pixels, saturation_dn: float | None) -> float:
-    """Return the share of pixels at or above saturation."""
-    limit_dn = saturation_dn or (np.iinfo(pixels.dtype).max if pixels.dtype.kind in "iu" else np.inf)
-    return float(np.mean(pixels >= limit_dn))
 
 
 def _sharpness(grey: Pixels) -> float:
@@ -101,30 +79,27 @@ def _leak_dn(grey: Pixels) -> float:
 
 
 def _count_board_corners(grey: Pixels, boards: Sequence[BoardSettings]) -> int:
-    """Return the number of board corners found."""
     white = max(float(np.quantile(grey, 0.99)), 1.0)
     scale = min(1.0, _BOARD_SEARCH_PX / max(grey.shape))
     small = cv2.resize(np.asarray(grey, np.float32), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     picture = np.clip(small * (255.0 / white), 0, 255).astype(np.uint8)
-    found = 0
+    count = 0
     for board in boards:
         corners = cv2.aruco.CharucoDetector(board.in_opencv()).detectBoard(picture)[0]
-        found += 0 if corners is None else len(corners)
-    return found
+        count += 0 if corners is None else len(corners)
+    return count
 
 
 def _warnings(
     kind: StepKind, values: dict[str, float], limits: CheckSettings, earlier_sharpness: Sequence[float]
 ) -> tuple[str, ...]:
-    """Return the warnings about the measured values."""
     warnings = []
     share = values.get("saturated_share", 0.0)
     if share > limits.saturated_share:
         warnings.append(f"{share:.1%} of the pixels are saturated, limit {limits.saturated_share:.1%}; expose shorter")
     if values.get("contrast_dn", np.inf) < limits.least_contrast_dn:
         warnings.append(
-            f"contrast {values['contrast_dn']:.0f} DN, limit {limits.least_contrast_dn:.0f}; "
-            "turn the light on or expose longer"
+            f"contrast {values['contrast_dn']:.0f} DN, limit {limits.least_contrast_dn:.0f}; add light or expose longer"
         )
     if kind == "flat" and values["median_dn"] < limits.least_flat_dn:
         warnings.append(
@@ -136,9 +111,7 @@ def _warnings(
     ):
         warnings.append(f"sharpness {values['sharpness']:.3f}, limit {limit:.3f}; look for vibration or changed focus")
     if values.get("leak_dn", 0.0) > limits.leak_dn:
-        warnings.append(
-            f"parts differ by {values['leak_dn']:.1f} DN in the dark, limit {limits.leak_dn:g}; look for stray light"
-        )
+        warnings.append(f"parts differ by {values['leak_dn']:.1f} DN, limit {limits.leak_dn:g}; look for stray light")
     return tuple(warnings)
 
 
@@ -153,53 +126,37 @@ _MAX_NAMED = 6
 def board_warnings(
     last: PlannedFrame, frames: Sequence[PlannedFrame], corners: Mapping[int, int], limit: int
 ) -> tuple[str, ...]:
-    """Return the warnings about boards that are due right after a frame was taken.
+    """Return the warnings about boards that are due right after a frame, `last`, was taken.
 
-    There is a warning when all of the first frames of a sweep show too little, when more than half of a sweep did, and
-    when after all sweeps no board was seen from some node, so that its pose cannot be found.
-
-    Parameters
-    ----------
-    last : PlannedFrame
-        The frame just taken.
-    frames : sequence of PlannedFrame
-        All frames of the plan.
-    corners : mapping of int to int
-        Number of board corners found, by the number of each frame taken.
-    limit : int
-        Smallest number of corners that suffices.
+    There is a warning when all of the first frames of a sweep show fewer than `limit` corners, when more than half of
+    a sweep did, and when after all sweeps no board was seen from some node, so that its pose cannot be found. `corners`
+    are the corners found, by the number of each frame taken.
     """
     boards = [frame for frame in frames if frame.kind == "charuco"]
     sweep = [frame for frame in boards if frame.step == last.step]
-    seen = [corners[frame.number] for frame in sweep if frame.number in corners]
-    poor = sum(found < limit for found in seen)
+    counts = [corners[frame.number] for frame in sweep if frame.number in corners]
+    poor = sum(count < limit for count in counts)
     warnings = []
     sweep_name = f"board sweep {last.sweep + 1}"
-    if len(seen) == poor == min(_FIRST_FRAMES, len(sweep)):
+    if len(counts) == poor == min(_FIRST_FRAMES, len(sweep)):
         warnings.append(
-            f"{sweep_name}: none of its first {poor} frames shows {limit} board corners, the most is {max(seen)}; "
+            f"{sweep_name}: none of its first {poor} frames shows {limit} board corners, the most is {max(counts)}; "
             "move the board into view, or correct [[board]]"
         )
-    elif len(seen) == len(sweep) and poor > _MAX_POOR_SHARE * len(seen):
+    elif len(counts) == len(sweep) and poor > _MAX_POOR_SHARE * len(counts):
         warnings.append(
-            f"{sweep_name}: {poor} of {len(seen)} frames show fewer than {limit} board corners, limit half of them; "
+            f"{sweep_name}: {poor} of {len(counts)} frames show fewer than {limit} board corners, limit half of them; "
             "stand the board nearer to the middle and take the sweep again, or add one"
         )
     if all(frame.number in corners for frame in boards):
-        warnings.extend(_blind_node_warnings(boards, corners, limit))
+        best: dict[tuple[int, int], int] = {}
+        for frame in boards:
+            best[frame.stop.node] = max(best.get(frame.stop.node, 0), corners[frame.number])
+        blind = [list(node) for node, count in best.items() if count < limit]
+        named = ", ".join(map(str, blind[:_MAX_NAMED])) + (" …" if len(blind) > _MAX_NAMED else "")
+        if blind:
+            warnings.append(
+                f"{len(blind)} of {len(best)} nodes see {limit} board corners in no sweep ({named}), so that their "
+                "poses cannot be found; add a sweep with a board in their view"
+            )
     return tuple(warnings)
-
-
-def _blind_node_warnings(boards: Sequence[PlannedFrame], corners: Mapping[int, int], limit: int) -> list[str]:
-    """Return a warning about the nodes from which no sweep shows enough of a board."""
-    best: dict[tuple[int, int], int] = {}
-    for frame in boards:
-        best[frame.stop.node] = max(best.get(frame.stop.node, 0), corners[frame.number])
-    blind = [list(node) for node, found in best.items() if found < limit]
-    if not blind:
-        return []
-    named = ", ".join(map(str, blind[:_MAX_NAMED])) + (" …" if len(blind) > _MAX_NAMED else "")
-    return [
-        f"{len(blind)} of {len(best)} nodes see {limit} board corners in no sweep ({named}), so that their poses "
-        "cannot be found; add a sweep with a board in their view"
-    ]

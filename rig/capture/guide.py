@@ -135,33 +135,22 @@ class OperatorInterface(Protocol):
         """Show the frame just taken."""
 
 
-def step_prompt(frame: PlannedFrame, step: int, steps: int, frames: int, duration_s: float) -> Prompt:
-    """Return the prompt before a step.
-
-    Parameters
-    ----------
-    frame : PlannedFrame
-        First frame of the step.
-    step, steps : int
-        Number of the step, from 1, and number of steps.
-    frames, duration_s : int, float
-        Number of frames to be taken, and the time for them in s.
-    """
+def step_prompt(frame: PlannedFrame, steps: int, frames: int, duration_s: float) -> Prompt:
+    """Return the prompt before a step, whose first of `frames` frames is `frame`; they take `duration_s`."""
     to_do = _TO_DO_AGAIN.get(frame.kind, _TO_DO[frame.kind]) if frame.sweep else _TO_DO[frame.kind]
     motion = f"Then {frames} frames follow, {format_duration(duration_s)}. The stage moves by itself: keep clear of it."
     return Prompt(
         key="step",
-        title=step_title(frame, step, steps),
+        title=_step_title(frame, steps),
         lines=(*to_do, motion, _CHECK[frame.kind]),
         answers=("go", "skip", "stop"),
         unattended="go",
     )
 
 
-def step_title(frame: PlannedFrame, step: int, steps: int) -> str:
-    """Return the title of a step, given any of its frames, its number from 1 and the number of steps."""
+def _step_title(frame: PlannedFrame, steps: int) -> str:
     sweep = f" {frame.sweep + 1}" if frame.kind in ("charuco", "flat") else ""
-    return f"Step {step} of {steps}: {TITLES[frame.kind]}{sweep}"
+    return f"Step {frame.step + 1} of {steps}: {TITLES[frame.kind]}{sweep}"
 
 
 def format_duration(duration_s: float) -> str:
@@ -181,12 +170,10 @@ class Dialogue:
 
     Parameters
     ----------
-    session : Session
-        Open session whose state is shown, and whose journal keeps what is said.
+    session, pace : Session, Pace
+        Open session, whose state is shown and whose journal keeps what is said; and the remaining time.
     operator : OperatorInterface
         Answers prompts and shows the state of the capture.
-    pace : Pace
-        Estimates the remaining time.
 
     Attributes
     ----------
@@ -206,19 +193,20 @@ class Dialogue:
         self._session.journal.event("prompt", key=prompt.key, title=prompt.title, lines=prompt.lines, answer=answer)
         return answer
 
+    def ask_or_stop(self, prompt: Prompt) -> Answer:
+        """Ask the operator as `ask` does; raise `CaptureStopped` if the answer is to stop."""
+        answer = self.ask(prompt)
+        if answer == "stop":
+            self.stop()
+        return answer
+
     def warn(self, text: str) -> None:
         """Record a warning, and show it from now on."""
         self._session.journal.event("warning", message=text)
         self.warnings = (text,)
 
     def stop(self) -> NoReturn:
-        """End the capture on behalf of the operator.
-
-        Raises
-        ------
-        CaptureStopped
-            Always.
-        """
+        """Raise `CaptureStopped` on behalf of the operator."""
         self._session.journal.event("stopped")
         done, total = len(self._session.valid()), len(self._session.frames)
         raise CaptureStopped(f"stopped with {done} of {total} frames taken; run the same command to go on")
@@ -228,29 +216,26 @@ class Dialogue:
         session = self._session
         missing, steps = session.missing(), session.plan.steps
         to_check = {frame.step for frame in missing if steps[frame.step].at == "grid"}
-        self.operator.show_status(
-            Status(
-                doing=doing,
-                step=frame.step + 1,
-                steps=len(steps),
-                title=step_title(frame, frame.step + 1, len(steps)),
-                done=len(session.valid()),
-                total=len(session.frames),
-                to_go_s=self._pace.remaining_s(missing, len(to_check) if session.frozen.rig.drift.check else 0),
-                node=frame.stop.node,
-                grid=self._shares_done(frame.step),
-                warnings=self.warnings,
-            )
+        status = Status(
+            doing=doing,
+            step=frame.step + 1,
+            steps=len(steps),
+            title=_step_title(frame, len(steps)),
+            done=len(session.valid()),
+            total=len(session.frames),
+            to_go_s=self._pace.remaining_s(missing, len(to_check) if session.frozen.rig.drift.check else 0),
+            node=frame.stop.node,
+            grid=self._shares_done(frame.step),
+            warnings=self.warnings,
         )
+        self.operator.show_status(status)
 
     def _shares_done(self, step: int) -> tuple[tuple[float, ...], ...]:
         """Return the share of a step's frames that is done, per row and column; −1 where the step has none."""
         grid, valid = self._session.frozen.rig.grid, self._session.valid()
-        taken: defaultdict[tuple[int, int], list[bool]] = defaultdict(list)
+        done: defaultdict[tuple[int, int], list[bool]] = defaultdict(list)
         for frame in self._session.frames:
             if frame.step == step:
-                taken[frame.stop.node].append(frame.number in valid)
-        shares = {node: sum(frames) / len(frames) for node, frames in taken.items()}
-        return tuple(
-            tuple(shares.get((row, column), -1.0) for column in range(grid.columns)) for row in range(grid.rows)
-        )
+                done[frame.stop.node].append(frame.number in valid)
+        nodes = [[done.get((row, column)) for column in range(grid.columns)] for row in range(grid.rows)]
+        return tuple(tuple(sum(frames) / len(frames) if frames else -1.0 for frames in row) for row in nodes)

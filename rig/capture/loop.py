@@ -2,15 +2,16 @@
 
 import msgspec
 
+from faintfield.rig.cameras.protocol import Decode
 from faintfield.rig.capture.guide import MAX_UNATTENDED_TRIES, Answer, Dialogue, OperatorInterface, Prompt, step_prompt
 from faintfield.rig.capture.pace import Pace
 from faintfield.rig.capture.survey import check_plan
-from faintfield.rig.capture.take import Decode, DriftChecks, FrameTaker
+from faintfield.rig.capture.take import DriftChecks, FrameTaker
 from faintfield.rig.devices import Rig
 from faintfield.rig.errors import CameraError, DriftUnknown, NotHomed, PlanRefused, PositionDrifted, StageError
 from faintfield.rig.plan import PlannedFrame
 from faintfield.rig.session.homings import begin_group, unchecked_frames
-from faintfield.rig.session.journal import CommittedFrame, Suspect
+from faintfield.rig.session.journal import Suspect
 from faintfield.rig.session.session import Session
 from faintfield.rig.stages.drift import recover
 
@@ -20,10 +21,8 @@ class Capture:
 
     Parameters
     ----------
-    session : Session
-        Open session, where the frames are stored.
-    rig : Rig
-        Stage and camera, not yet connected.
+    session, rig : Session, Rig
+        Open session, where the frames are stored; stage and camera, not yet connected.
     operator : OperatorInterface
         Answers prompts and shows the state of the capture.
     decode : callable
@@ -65,7 +64,6 @@ class Capture:
             self._rig.stage.close()
 
     def _connect(self) -> None:
-        """Connect to stage and camera, check the plan, and home."""
         rig, session = self._rig, self._session
         rig.stage.connect()
         rig.camera.open()
@@ -91,20 +89,16 @@ class Capture:
                 return
 
     def _run_step(self, missing: list[PlannedFrame]) -> None:
-        """Prompt for the next step, and take its frames."""
         session, first = self._session, missing[0]
         frames = [frame for frame in missing if frame.step == first.step]
         self._dialogue.show_status(first, "waiting for your answer")
         duration_s = self._pace.remaining_s(frames, 0)
-        answer = self._dialogue.ask(
-            step_prompt(first, first.step + 1, len(session.plan.steps), len(frames), duration_s)
-        )
+        prompt = step_prompt(first, len(session.plan.steps), len(frames), duration_s)
+        answer = self._dialogue.ask_or_stop(prompt)
         if answer == "skip":
             for frame in frames:
                 session.skip(frame)
             return
-        if answer == "stop":
-            self._dialogue.stop()
         self._rig.arrange(first.kind, first.sweep)
         for frame, following in zip(frames, [*frames[1:], None], strict=True):
             if frame not in session.skipped():
@@ -123,7 +117,9 @@ class Capture:
             try:
                 self._drift.check_after(nodes)
             except DriftUnknown as failure:
-                self._handle_untimed_check(failure)
+                self._untimed_checks += 1
+                reason = "taken before a check of the stage that says nothing"
+                self._drift.ask_to_retake(failure, "Drift could not be checked", self._untimed_checks, reason)
             except (StageError, NotHomed, PlanRefused) as failure:
                 if self._handle_failure(frame, failure) == "again":
                     continue
@@ -132,26 +128,15 @@ class Capture:
                     self._untimed_checks = 0
             return
 
-    def _handle_untimed_check(self, failure: DriftUnknown) -> None:
-        """Record frames about which a check says nothing, and ask whether to take them again."""
-        doubtful = [frame for frame in failure.suspect if isinstance(frame, CommittedFrame)]
-        self._session.journal.event("suspect", message=str(failure), intents=[frame.intent for frame in doubtful])
-        self._dialogue.warn(str(failure))
-        self._untimed_checks += 1
-        unattended: Answer = "retake" if self._untimed_checks < MAX_UNATTENDED_TRIES else "stop"
-        answers: tuple[Answer, ...] = ("retake", "keep", "stop")
-        answer = self._dialogue.ask(Prompt("drift", "Drift could not be checked", (str(failure),), answers, unattended))
-        if answer == "stop":
-            self._dialogue.stop()
-        if answer == "retake":
-            self._session.void(doubtful, "taken before a check of the stage that says nothing")
-
     def _take(self, frame: PlannedFrame) -> None:
-        """Take a frame; after a failure, ask what to do until it is taken, skipped, or the capture stops."""
         self._failures = 0
         while True:
             try:
-                self._note_homing()
+                if self._rig.stage.homings != self._homings_in_journal:
+                    self._homings_in_journal = self._rig.stage.homings
+                    if self._drift.watch is not None:
+                        self._mark_unchecked("the stage was homed")
+                    begin_group(self._session.journal)
                 self._taker.take(frame)
             except (StageError, NotHomed, CameraError) as failure:
                 if self._handle_failure(frame, failure) == "skip":
@@ -161,18 +146,18 @@ class Capture:
                 return
 
     def _handle_request(self, frame: PlannedFrame) -> None:
-        """Do what the operator requested since the last frame."""
         request = self._operator.take_request()
         if request is None:
             return
         self._session.journal.event("wish", frame=frame.number, wish=request)
         choice: str = request
+        if request == "stop":
+            self._dialogue.stop()
         if request == "pause":
             self._dialogue.show_status(frame, "paused")
             lines = (f"The next frame is {frame.name}.",)
-            choice = self._dialogue.ask(Prompt("paused", "Paused", lines, ("go", "retake", "skip", "stop"), "go"))
-        if choice == "stop":
-            self._dialogue.stop()
+            prompt = Prompt("paused", "Paused", lines, ("go", "retake", "skip", "stop"), "go")
+            choice = self._dialogue.ask_or_stop(prompt)
         if choice == "skip":
             self._session.skip(frame)
         if choice == "retake" and self._taker.last is not None:
@@ -213,14 +198,6 @@ class Capture:
             self._session.journal.event("recovery_failed", frame=frame.number, device=device, **event)
             self._dialogue.warn(f"{frame.name}: the {device} was not recovered: {failure}")
 
-    def _note_homing(self) -> None:
-        """Begin a homing group in the journal if the stage was homed since the last frame."""
-        if self._rig.stage.homings != self._homings_in_journal:
-            self._homings_in_journal = self._rig.stage.homings
-            if self._drift.watch is not None:
-                self._mark_unchecked("the stage was homed")
-            begin_group(self._session.journal)
-
     def _mark_unchecked(self, event: str) -> None:
         """Mark the frames at nodes that no drift check will confirm, since `event` came before it."""
         session = self._session
@@ -233,18 +210,14 @@ class Capture:
             self._dialogue.warn(message)
 
     def _may_home(self, *question: str) -> bool:
-        """Ask before the stage moves to its switches."""
         return self._dialogue.ask(Prompt("home", "Homing", question, ("go", "stop"), "go")) == "go"
 
     def _ask_about_skipped(self) -> list[PlannedFrame]:
-        """Ask what to do with the skipped frames; return those to be taken after all."""
         skipped = self._session.skipped()
         if not skipped:
             return []
         lines = (f"{len(skipped)} frames were skipped, the first is {skipped[0].name}.",)
-        answer = self._dialogue.ask(Prompt("skipped", "Skipped frames", lines, ("again", "keep", "stop"), "stop"))
-        if answer == "stop":
-            self._dialogue.stop()
-        if answer == "again":
+        prompt = Prompt("skipped", "Skipped frames", lines, ("again", "keep", "stop"), "stop")
+        if self._dialogue.ask_or_stop(prompt) == "again":
             self._session.unskip()
         return self._session.missing()

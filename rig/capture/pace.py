@@ -18,10 +18,8 @@ class Pace:
 
     Parameters
     ----------
-    stage : Gantry
-        A connected stage.
-    clock : Clock
-        The rig's time.
+    stage, clock : Gantry, Clock
+        A connected stage, and the rig's time.
     rest_s, readout_s : float
         The planned rest at each stop, and a frame's time besides its exposure.
 
@@ -66,15 +64,7 @@ class Pace:
         self._repeated = True
 
     def remaining_s(self, frames: list[PlannedFrame], drift_checks: int) -> float:
-        """Return how long `frames` will take, without prompts.
-
-        Parameters
-        ----------
-        frames : list of PlannedFrame
-            The frames still to be taken, in order.
-        drift_checks : int
-            Number of drift checks still to come.
-        """
+        """Return how long `frames`, in this order, and a number of drift checks will take, without prompts."""
         stop_s = median(self._stop_s) if self._stop_s else self._guess_s[0]
         first_s = median(self._frame_s[False] or [self._guess_s[1]])
         again_s = median(self._frame_s[True] or [first_s])
@@ -90,6 +80,5 @@ class Pace:
         return total_s
 
     def _motion_s(self, start: Point, target: Point) -> float:
-        """Return how long the motion from `start` to `target` takes."""
         path = (start, *one_sided_path(start, target, self._stage.settings.approach_mm))
         return path_duration_s(path, self._stage.identify().motion, self._stage.feed_mm_per_s())

@@ -40,16 +40,8 @@ def measure_settling(expose: Callable[[float], Pixels], clock: Clock, settings: 
     """Measure when the rig comes to rest; call it right after a move.
 
     The mean of the last third of the frames is the picture r at rest. A small shift d changes a frame by ∇r · d, so d
-    is the least-squares solution of ∇r · d = frame − r over all pixels.
-
-    Parameters
-    ----------
-    expose : callable
-        Takes and returns a frame, given its exposure time in s.
-    clock : Clock
-        The rig's time.
-    settings : SettleSettings
-        Duration, exposure time and largest harmless shift.
+    is the least-squares solution of ∇r · d = frame − r over all pixels. `expose` takes and returns a frame, given its
+    exposure time in s.
     """
     begun_s = clock.now_s()
     times_s: list[float] = []
@@ -79,7 +71,6 @@ def _smooth(pixels: Pixels) -> NDArray[np.float32]:
 
 
 def _shifts_px(frames: list[Pixels], rest: Pixels) -> NDArray[np.float64]:
-    """Return the shift in pixels of each frame from the picture at rest."""
     along_rows, along_columns = np.gradient(np.asarray(rest, float))
     gradients = np.stack([along_columns.ravel(), along_rows.ravel()])
     normal = gradients @ gradients.T + 1e-9 * np.eye(2)

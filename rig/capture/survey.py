@@ -15,19 +15,7 @@ from faintfield.rig.stages.protocol import Identity
 
 
 class Survey(Struct, frozen=True):
-    """Result of `survey`.
-
-    Parameters
-    ----------
-    stage : Identity
-        Identity of the stage, as its controller reports it.
-    camera : CameraReport
-        Identity of the camera, as it reports it.
-    plan : CapturePlan
-        Plan of the capture.
-    duration_s : float
-        Duration of the capture in s, without prompts.
-    """
+    """Identity of stage and camera as they report it, the plan, and its duration in s without prompts."""
 
     stage: Identity
     camera: CameraReport
@@ -73,12 +61,11 @@ def check_plan(plan: CapturePlan, stage: Gantry, camera: CameraReport) -> None:
     PlanRefused
         A position is not allowed or an exposure time is not offered; the message names the first.
     """
-    plan.check(stage.workspace())
+    stage.workspace().check_path(plan.path())
     for exposure_s in sorted({exposure_s for step in plan.steps for exposure_s in step.exposure_s}):
         if not camera.offers(exposure_s):
             offered = camera.exposures_s or camera.exposure_range_s or ()
             nearest = min(offered, key=lambda offer: abs(math.log(offer / exposure_s)), default=math.nan)
             raise PlanRefused(
-                f"exposure_s = {exposure_s:g} is not offered by the camera, the nearest that is: {nearest:g}; "
-                "correct it in rig.toml"
+                f"the camera does not offer exposure_s = {exposure_s:g}, the nearest is {nearest:g}; correct it"
             )

@@ -1,21 +1,20 @@
 """Take one frame, and check for drift: move, rest, verify the position, expose, write, check and commit."""
 
 import itertools
+from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import msgspec
 
-from faintfield.rig.cameras.protocol import Decode as Decode  # the loop takes it from here
-from faintfield.rig.cameras.protocol import Pixels
+from faintfield.rig.cameras.protocol import Decode, Exposure, Pixels
 from faintfield.rig.capture.checks import LIT_KINDS, Findings, board_warnings, check_frame
 from faintfield.rig.capture.guide import MAX_UNATTENDED_TRIES, Answer, Dialogue, Prompt
-from faintfield.rig.capture.layout import LayoutCheck
 from faintfield.rig.capture.pace import Pace
 from faintfield.rig.capture.settling import Settling, measure_settling
 from faintfield.rig.capture.temperature import TemperatureWait
 from faintfield.rig.devices import Rig
-from faintfield.rig.errors import CameraError, PositionDrifted
+from faintfield.rig.errors import CameraError, DriftUnknown, PositionDrifted
 from faintfield.rig.plan import PlannedFrame
 from faintfield.rig.session.journal import CommittedFrame, FrameRecord
 from faintfield.rig.session.session import Session
@@ -27,19 +26,15 @@ class DriftChecks:
 
     Parameters
     ----------
-    session : Session
-        Open session, whose frames become void if they are taken again.
-    rig : Rig
-        Stage and clock.
-    dialogue : Dialogue
-        Asks what to do after lost steps.
-    pace : Pace
-        Learns how long a check takes.
+    session, rig, dialogue, pace : Session, Rig, Dialogue, Pace
+        Frames become void if they are taken again; stage and clock; asks what to do; learns how long a check takes.
 
     Attributes
     ----------
     watch : DriftWatch or None
         Measures the drift; None if `drift.check` is off.
+    nodes : int
+        Number of nodes that the stage moved to since the last check.
     """
 
     def __init__(self, session: Session, rig: Rig, dialogue: Dialogue, pace: Pace) -> None:
@@ -48,7 +43,7 @@ class DriftChecks:
         self._rig = rig
         self._dialogue = dialogue
         self._pace = pace
-        self._nodes = 0
+        self.nodes = 0
         self._failures = 0
         self.watch = DriftWatch(rig.stage, limit_mm=settings.limit_mm) if settings.check else None
 
@@ -62,44 +57,42 @@ class DriftChecks:
         self.watch.check()
         self._pace.check_s = self._rig.clock.now_s() - begun_s
 
-    def count_node(self) -> None:
-        """Note that the stage moved to a node."""
-        self._nodes += 1
-
     def add(self, frame: CommittedFrame) -> None:
         """Note that a frame relies on the position of the stage."""
         if self.watch is not None:
-            self.watch.note(frame)
+            self.watch.unchecked.append(frame)
 
     def check_after(self, nodes: int) -> None:
         """Check for drift if at least `nodes` nodes were visited since the last check; 0 means no check."""
-        if self.watch is None or nodes == 0 or self._nodes < nodes or not self.watch.unchecked:
+        if self.watch is None or nodes == 0 or self.nodes < nodes or not self.watch.unchecked:
             return
-        self._nodes = 0
+        self.nodes = 0
         self._pace.here = None
         try:
             drift = self.watch.check()
         except PositionDrifted as failure:
-            self._handle_drift(failure)
+            self._failures += 1
+            self.ask_to_retake(failure, "The stage lost its scale", self._failures, "taken from a doubtful position")
+            self._rig.stage.recover()
+            self.begin()
         else:
             self._session.journal.event("drift_check", away_mm=drift.away_mm)
 
-    def _handle_drift(self, failure: PositionDrifted) -> None:
-        """Record which frames are suspect, and ask whether to take them again."""
+    def ask_to_retake(self, failure: PositionDrifted | DriftUnknown, title: str, failures: int, reason: str) -> None:
+        """Record which frames are suspect, and ask whether to take them again; stop unattended captures at last.
+
+        Raises
+        ------
+        CaptureStopped
+            The operator asked for it.
+        """
         suspect = [frame for frame in failure.suspect if isinstance(frame, CommittedFrame)]
         self._session.journal.event("suspect", message=str(failure), intents=[frame.intent for frame in suspect])
         self._dialogue.warn(str(failure))
-        self._failures += 1
-        unattended: Answer = "retake" if self._failures < MAX_UNATTENDED_TRIES else "stop"
-        answer = self._dialogue.ask(
-            Prompt("drift", "The stage lost its scale", (str(failure),), ("retake", "keep", "stop"), unattended)
-        )
-        if answer == "stop":
-            self._dialogue.stop()
-        if answer == "retake":
-            self._session.void(suspect, "taken from a doubtful position")
-        self._rig.stage.recover()
-        self.begin()
+        unattended: Answer = "retake" if failures < MAX_UNATTENDED_TRIES else "stop"
+        prompt = Prompt("drift", title, (str(failure),), ("retake", "keep", "stop"), unattended)
+        if self._dialogue.ask_or_stop(prompt) == "retake":
+            self._session.void(suspect, reason)
 
 
 # Exposures that are not kept are numbered from here, beyond the number of any frame.
@@ -111,16 +104,10 @@ class FrameTaker:
 
     Parameters
     ----------
-    session : Session
-        Open session, where the frames are stored.
-    rig : Rig
-        Stage, camera and clock; connected and homed before `take`.
-    dialogue : Dialogue
-        Informs the operator.
-    drift : DriftChecks
-        Counts the nodes and frames that the next drift check covers.
-    pace : Pace
-        Knows the position of the stage, and learns how long a frame takes.
+    session, rig : Session, Rig
+        Open session, where the frames are stored; stage, camera and clock, connected and homed before `take`.
+    dialogue, drift, pace : Dialogue, DriftChecks, Pace
+        Informs the operator; counts nodes and frames for the next drift check; knows the position of the stage.
     decode : callable
         Reads the pixels of a frame's file; returns None if it cannot, and raises `CameraError` for a damaged file.
 
@@ -140,9 +127,9 @@ class FrameTaker:
         self._drift = drift
         self._pace = pace
         self._decode = decode
-        self._layouts = LayoutCheck(session, decode)
         self._temperature = TemperatureWait(session, rig, dialogue)
         self._settle_s: float | None = None
+        self._layouts: dict[str, str | None] = {}
         self._unkept_numbers = itertools.count(_FIRST_UNKEPT_NUMBER)
         self.last: PlannedFrame | None = None
 
@@ -169,13 +156,12 @@ class FrameTaker:
             raise
 
     def _go_to(self, frame: PlannedFrame) -> None:
-        """Move the stage to the node of a frame, and wait until it is at rest."""
         target = frame.stop.target
         if self._pace.here == target:
             return
         self._pace.depart()
         self._rig.stage.move_to(*target)
-        self._drift.count_node()
+        self._drift.nodes += 1
         measures = self._settle_s is None and frame.kind in LIT_KINDS
         if measures:
             self._settle_s = self._find_settling(frame)
@@ -193,24 +179,50 @@ class FrameTaker:
         rig.stage.verify_at(*frame.stop.target)
         written = session.write(frame, intent, exposure)
         try:
-            pixels = self._layouts.pixels_of(frame, written.path, exposure)
+            pixels = self._decode_frame(frame, written.path, exposure)
         except CameraError as failure:
             session.reject(frame, written, str(failure))
             raise
-        found = self._check(frame, pixels)
-        record = FrameRecord(position.point, frame.exposure_s, dict(exposure.metadata), found.values, found.warnings)
+        findings = self._check(frame, pixels)
+        checked = (findings.values, findings.warnings)
+        record = FrameRecord(position.point, frame.exposure_s, dict(exposure.metadata), *checked)
         self._drift.add(session.commit(frame, written, record))
         self.last = frame
-        if found.warnings:
-            self._dialogue.warnings = tuple(f"{frame.name}: {warning}" for warning in found.warnings)
+        if findings.warnings:
+            self._dialogue.warnings = tuple(f"{frame.name}: {warning}" for warning in findings.warnings)
         if frame.kind == "charuco":
-            self._check_boards(frame)
+            corners = {
+                number: int(committed.record.checks["board_corners"])
+                for number, committed in session.valid().items()
+                if "board_corners" in committed.record.checks
+            }
+            for warning in board_warnings(frame, session.frames, corners, self._settings.checks.board_corners):
+                self._dialogue.warn(warning)
         self._pace.finish_frame(begun_s, frame.exposure_s)
         if pixels is not None:
-            self._dialogue.operator.show_frame(frame, pixels, found.values)
+            self._dialogue.operator.show_frame(frame, pixels, findings.values)
+
+    def _decode_frame(self, frame: PlannedFrame, path: Path, exposure: Exposure) -> Pixels | None:
+        """Return the pixels of a frame, None if it cannot be decoded here; its layout must be that of the session."""
+        pixels = exposure.pixels if exposure.pixels is not None else self._decode(path)
+        layout = self._layouts[path.name] = _layout(pixels)
+        numbers = self._session.valid().keys() - {frame.number}  # a frame is not compared with an earlier take of it
+        first = self._session.valid()[min(numbers)] if numbers else None
+        expected = None if first is None else self._layout_of(first)
+        if first is not None and expected is not None and layout != expected:
+            raise CameraError(
+                f"{path.name}: {f'has {layout}' if layout else 'cannot be decoded'}, but {first.file} has {expected}; "
+                "set the camera as it was when the session was begun, and take this frame again"
+            )
+        return pixels
+
+    def _layout_of(self, committed: CommittedFrame) -> str | None:
+        if committed.file not in self._layouts:
+            with suppress(CameraError):  # a session of an earlier version may hold such a frame
+                self._layouts[committed.file] = _layout(self._decode(self._session.path_of(committed)))
+        return self._layouts.setdefault(committed.file, None)
 
     def _check(self, frame: PlannedFrame, pixels: Pixels | None) -> Findings:
-        """Return the measured values and the warnings of a frame."""
         if pixels is None:
             return Findings(
                 {}, ("the file cannot be decoded here, so nothing was checked; look at it with the camera's program",)
@@ -222,16 +234,6 @@ class FrameTaker:
         ]
         return check_frame(pixels, frame.kind, self._settings.checks, self._settings.board, earlier_sharpness)
 
-    def _check_boards(self, frame: PlannedFrame) -> None:
-        """Warn if a sweep, or all of them, show too little of the boards."""
-        corners = {
-            number: int(taken.record.checks["board_corners"])
-            for number, taken in self._session.valid().items()
-            if "board_corners" in taken.record.checks
-        }
-        for warning in board_warnings(frame, self._session.frames, corners, self._settings.checks.board_corners):
-            self._dialogue.warn(warning)
-
     def _find_settling(self, frame: PlannedFrame) -> float:
         """Return the rest in s after a move: measured earlier in this session, measured now, or planned."""
         settings = self._settings.settle
@@ -241,17 +243,16 @@ class FrameTaker:
         if not (settings.measure and self._rig.camera_sees_stage):
             return self._session.plan.settle_s
         self._dialogue.show_status(frame, "measuring how long the rig swings")
-        found = measure_settling(self._take_unkept, self._rig.clock, settings)
-        self._session.journal.event("settling", frame=frame.number, **msgspec.to_builtins(found))
-        if not found.settled:
+        settling = measure_settling(self._take_unkept, self._rig.clock, settings)
+        self._session.journal.event("settling", frame=frame.number, **msgspec.to_builtins(settling))
+        if not settling.settled:
             self._dialogue.warn(
                 f"the rig was not seen at rest within {settings.longest_s:g} s, which is the rest from now on; "
                 "light the scene, stiffen the rig or lower its acceleration, or set settle.measure = false"
             )
-        return found.wait_s
+        return settling.wait_s
 
     def _take_unkept(self, exposure_s: float) -> Pixels:
-        """Return a frame that is not kept."""
         exposure = self._rig.camera.expose(exposure_s, next(self._unkept_numbers))
         if exposure.content is None:
             assert exposure.pixels is not None
@@ -261,7 +262,13 @@ class FrameTaker:
             path.write_bytes(exposure.content)
             pixels = self._decode(path)
         if pixels is None:
-            raise CameraError(
-                "frames cannot be decoded here, so settling cannot be measured; set settle.measure = false"
-            )
+            raise CameraError("frames cannot be decoded, so settling is not measured; set settle.measure = false")
         return pixels
+
+
+def _layout(pixels: Pixels | None) -> str | None:
+    """Return size and type of the pixels of a frame, such as `640 x 480 pixels of uint16`."""
+    if pixels is None:
+        return None
+    colours = f" x {pixels.shape[2]} colours" if pixels.ndim == 3 else ""
+    return f"{pixels.shape[1]} x {pixels.shape[0]} pixels{colours} of {pixels.dtype.name}"

@@ -22,12 +22,8 @@ class TemperatureWait:
 
     Parameters
     ----------
-    session : Session
-        Open session, whose journal keeps how long each wait was.
-    rig : Rig
-        Camera and clock.
-    dialogue : Dialogue
-        Shows the temperature, and stops the capture if that is asked for.
+    session, rig, dialogue : Session, Rig, Dialogue
+        The journal keeps how long each wait was; the camera is read; the operator sees the temperature, and can stop.
     """
 
     def __init__(self, session: Session, rig: Rig, dialogue: Dialogue) -> None:
@@ -60,43 +56,36 @@ class TemperatureWait:
         self._settled_step = None
 
     def _wait(self, frame: PlannedFrame, settings: CoolingSettings, target_c: float) -> None:
-        """Wait until the temperature has stayed at `target_c` for a while."""
         clock = self._rig.clock
         begun_s, steady_s = clock.now_s(), math.inf
         while True:
-            found_c = read_temperature(self._rig.camera)
-            if found_c is None:
+            temperature_c = read_temperature(self._rig.camera)
+            if temperature_c is None:
                 raise CameraError(
-                    f"the camera reports no temperature, wanted is camera.settle_temperature_c = {target_c:g}; check "
-                    "its cooler and its cable"
+                    f"camera.settle_temperature_c = {target_c:g}, but none is reported; check cooler and cable"
                 )
             now_s = clock.now_s()
-            near = abs(found_c - target_c) <= settings.settle_tolerance_c
+            near = abs(temperature_c - target_c) <= settings.settle_tolerance_c
             steady_s = min(steady_s, now_s) if near else math.inf
             if now_s - steady_s >= _STEADY_S:
                 break
             if now_s - begun_s >= settings.settle_limit_s:
                 raise CameraTimeout(
-                    f"the sensor is at {found_c:.1f} C after {now_s - begun_s:.0f} s, and did not stay within "
+                    f"the sensor is at {temperature_c:.1f} C after {now_s - begun_s:.0f} s, and did not stay within "
                     f"{settings.settle_tolerance_c:g} K of {target_c:.1f} C for {_STEADY_S:g} s; check its cooler and "
                     "the set point in the camera's settings, or raise camera.settle_limit_s"
                 )
-            self._dialogue.show_status(frame, f"sensor at {found_c:.1f} C, waiting for {target_c:.1f} C")
-            self._heed_stop(frame)
+            self._dialogue.show_status(frame, f"sensor at {temperature_c:.1f} C, waiting for {target_c:.1f} C")
+            request = self._dialogue.operator.take_request()
+            if request is not None:  # other wishes than to stop are for the frames
+                self._session.journal.event("wish", frame=frame.number, wish=request)
+                if request == "stop":
+                    self._dialogue.stop()
+                self._dialogue.warn(f"there is nothing to {request} while the sensor settles; stop, or wait")
             clock.sleep_s(_POLL_S)
         self._session.journal.event(
-            "temperature", frame=frame.number, temperature_c=found_c, waited_s=round(now_s - begun_s, 3)
+            "temperature", frame=frame.number, temperature_c=temperature_c, waited_s=round(now_s - begun_s, 3)
         )
-
-    def _heed_stop(self, frame: PlannedFrame) -> None:
-        """Stop if the operator wishes so; other wishes are for the frames."""
-        request = self._dialogue.operator.take_request()
-        if request is None:
-            return
-        self._session.journal.event("wish", frame=frame.number, wish=request)
-        if request == "stop":
-            self._dialogue.stop()
-        self._dialogue.warn(f"there is nothing to {request} while the sensor settles; stop, or wait")
 
 
 def read_temperature(camera: Camera) -> float | None:

@@ -37,12 +37,8 @@ _REHEARSED = "stage.port (simulated)"
 class SettingChange(Struct, frozen=True):
     """A setting whose value differs; detail of the event `setting_changed`.
 
-    Parameters
-    ----------
-    key : str
-        Table and key, such as `checks.leak_dn` or `step[2].exposure_s`.
-    old, new : object
-        Values as in JSON; None where a file has no such key.
+    The key has its table, such as `checks.leak_dn` or `step[2].exposure_s`. Values are as in JSON, None where a file
+    has no such key.
     """
 
     key: str
@@ -56,7 +52,7 @@ class SettingChange(Struct, frozen=True):
 
     def __str__(self) -> str:
         """Return the change in words."""
-        return f"{self.key} was {_in_words(self.old)} and is {_in_words(self.new)}"
+        return f"{self.key} was {_toml_text(self.old)} and is {_toml_text(self.new)}"
 
 
 def find_changes(before: RigSettings, now: RigSettings) -> list[SettingChange]:
@@ -74,11 +70,9 @@ def check_same_rig(frozen: FrozenPlan, now: RigSettings) -> None:
     PlanRefused
         A frozen setting differs; the message names each with both values.
     """
-    refused = [str(change) for change in find_changes(frozen.rig, now) if change.frozen]
-    if refused:
+    if changes := ", ".join(str(change) for change in find_changes(frozen.rig, now) if change.frozen):
         raise PlanRefused(
-            f"the rig.toml differs from the plan.json of the session: {', '.join(refused)}; set it back, or begin a "
-            "new session"
+            f"the rig.toml differs from the plan.json of the session: {changes}; set it back, or begin a new session"
         )
 
 
@@ -125,7 +119,6 @@ def present_settings(folder: Path) -> RigSettings:
 
 
 def _changed(rig: RigSettings, changes: Iterable[SettingChange]) -> RigSettings:
-    """Return settings after changes; raises `ValueError` for one that is not possible."""
     content: dict[str, dict[str, Any]] = msgspec.to_builtins(rig)
     for change in changes:
         table, _, key = change.key.partition(".")
@@ -142,20 +135,14 @@ def _leaves(content: Any, key: str = "") -> Iterator[tuple[str, Any]]:
     if isinstance(content, dict):
         for name, value in content.items():
             yield from _leaves(value, f"{key}.{name}" if key else name)
-    elif _is_of_tables(content):
+    elif isinstance(content, Sequence) and content and all(isinstance(item, dict) for item in content):
         for index, value in enumerate(content):
             yield from _leaves(value, f"{key}[{index}]")
     else:
         yield key, content
 
 
-def _is_of_tables(content: object) -> bool:
-    """Return whether `content` is a list of tables."""
-    return isinstance(content, Sequence) and bool(content) and all(isinstance(item, dict) for item in content)
-
-
-def _in_words(value: object) -> str:
-    """Return a value as TOML has it, shortened."""
+def _toml_text(value: object) -> str:
     if value is None:
         return "not set"
     text = msgspec.json.encode(value).decode()

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import msgspec
 
-from faintfield.rig.errors import SessionCorrupt, SessionUnreadable, SessionUnwritable
+from faintfield.rig.errors import SessionCorrupt, SessionUnreadable, SessionUnwritable, in_one_line
 from faintfield.rig.session.disk import require_kind, translate_errors, translate_read_errors, write_new
 
 # Format of the sessions that are begun now. In format 1 the tables are not strict; format 2 has a chain of hashes over
@@ -40,19 +40,8 @@ CREATE TABLE chain (
     id INTEGER PRIMARY KEY, "table" TEXT NOT NULL, first INTEGER NOT NULL, last INTEGER NOT NULL,
     sha256 BLOB NOT NULL) STRICT;
 """
-_OLD_TABLES = """
-CREATE TABLE IF NOT EXISTS event (
-    id INTEGER PRIMARY KEY AUTOINCREMENT, at TEXT NOT NULL, kind TEXT NOT NULL, frame INTEGER, detail TEXT NOT NULL);
-CREATE TABLE IF NOT EXISTS intent (
-    id INTEGER PRIMARY KEY AUTOINCREMENT, at TEXT NOT NULL, frame INTEGER NOT NULL);
-CREATE TABLE IF NOT EXISTS "commit" (
-    intent INTEGER PRIMARY KEY REFERENCES intent (id), at TEXT NOT NULL, file TEXT NOT NULL UNIQUE,
-    sha256 TEXT NOT NULL, bytes INTEGER NOT NULL, detail TEXT NOT NULL);
-CREATE TABLE IF NOT EXISTS void (
-    intent INTEGER PRIMARY KEY REFERENCES intent (id), at TEXT NOT NULL, why TEXT NOT NULL);
-CREATE TABLE IF NOT EXISTS traffic (
-    id INTEGER PRIMARY KEY AUTOINCREMENT, at_s REAL NOT NULL, direction TEXT NOT NULL, data BLOB NOT NULL);
-"""
+_KEY = "id INTEGER PRIMARY KEY"
+_OLD_TABLES = _TABLES.replace(" STRICT;", ";").replace(f"{_KEY},", f"{_KEY} AUTOINCREMENT,")
 SCHEMAS = {1: _OLD_TABLES, 2: _TABLES + _CHAIN, FORMAT: _TABLES}
 
 # Limits of what a journal may hold. A week of serial traffic takes a third of a gigabyte. The longest value is a list
@@ -160,8 +149,8 @@ def check_database(db: sqlite3.Connection, path: Path) -> int:
     try:
         db.execute("PRAGMA cell_size_check = ON")
         schema = _schema(db)
-        found = [number for number, text in SCHEMAS.items() if schema == _schema_of(text)]
-        if not found:
+        formats = [number for number, text in SCHEMAS.items() if schema == _schema_of(text)]
+        if not formats:
             raise SessionCorrupt(f"{path}: has other tables than a journal; restore the journal from a copy")
         damage = str(db.execute("PRAGMA integrity_check(1)").fetchone()[0])
         if damage != "ok":
@@ -170,7 +159,7 @@ def check_database(db: sqlite3.Connection, path: Path) -> int:
             raise SessionCorrupt(f"{path}: an exposure that it names is missing; restore the journal from a copy")
     finally:
         db.set_progress_handler(None, 0)
-    return found[0]
+    return formats[0]
 
 
 @contextmanager
@@ -184,14 +173,13 @@ def translate_sqlite_errors(path: Path, *, read_only: bool) -> Iterator[None]:
             raise
         remedy = _REMEDIES.get(code & 0xFF)
         if remedy is None:
-            raise SessionCorrupt(f"{path}: {_message(failure)}; restore the journal from a copy") from failure
+            raise SessionCorrupt(f"{path}: {in_one_line(failure)}; restore the journal from a copy") from failure
         if read_only:
             raise SessionUnreadable(
-                f"{path}: cannot be read ({_message(failure)}); allow the folder to be read and written, or copy the "
-                "session to where it may be"
+                f"{path}: cannot be read ({in_one_line(failure)}); allow the folder to be written, or copy the session"
             ) from failure
         raise SessionUnwritable(
-            f"{path}: {_message(failure)}; what was committed is safe: {remedy}, and run the same command again"
+            f"{path}: {in_one_line(failure)}; what was committed is safe: {remedy}, and run the same command again"
         ) from failure
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as failure:
         # A message of SQLite quotes what it finds in the file, which need not be text
@@ -205,21 +193,14 @@ def _companions(path: Path) -> tuple[Path, Path, Path]:
 
 
 def _schema(db: sqlite3.Connection) -> list[tuple[str, ...]]:
-    """Return all that a database declares: tables, indices, triggers and views."""
     return db.execute("SELECT type, name, tbl_name, sql FROM sqlite_schema ORDER BY type, name").fetchmany(100)
 
 
 @cache
 def _schema_of(text: str) -> list[tuple[str, ...]]:
-    """Return what a database declares that was made by `text`."""
     db = sqlite3.connect(":memory:")
     try:
         db.executescript(text)
         return _schema(db)
     finally:
         db.close()
-
-
-def _message(failure: sqlite3.Error) -> str:
-    """Return the message of a failure in one line."""
-    return " ".join(str(failure).split())

@@ -14,8 +14,7 @@ import tifffile
 
 from faintfield.rig.cameras.protocol import Exposure
 from faintfield.rig.errors import SessionBusy, SessionCorrupt, SessionUnreadable, SessionUnwritable
-from faintfield.rig.session.durable import make_folder, sync_folder
-from faintfield.rig.session.names import is_plain_name
+from faintfield.rig.files import is_plain_name, make_folder, sync_folder
 
 PART = ".part"
 
@@ -139,23 +138,18 @@ def lock_session(folder: Path, *, shared: bool = False) -> Iterator[None]:
         descriptor = os.open(path, access | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
     try:
         with translated(path):
-            _take_lock(descriptor, folder, shared=shared)
+            try:
+                fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+            except BlockingIOError as failure:
+                process = re.fullmatch(rb"process \d+", os.pread(descriptor, 100, 0))
+                holder = process[0].decode() if process else "another process"
+                raise SessionBusy(f"{folder}: a capture is under way ({holder}); wait for it or stop it") from failure
+            if not shared:
+                os.ftruncate(descriptor, 0)
+                os.pwrite(descriptor, f"process {os.getpid()}".encode(), 0)
         yield
     finally:
         os.close(descriptor)
-
-
-def _take_lock(descriptor: int, folder: Path, *, shared: bool) -> None:
-    """Lock an open file; write the number of this process into it if the lock is exclusive."""
-    try:
-        fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
-    except BlockingIOError as failure:
-        named = re.fullmatch(rb"process \d+", os.pread(descriptor, 100, 0))
-        holder = named[0].decode() if named else "another process"
-        raise SessionBusy(f"{folder}: a capture is under way ({holder}); wait for it or stop it first") from failure
-    if not shared:
-        os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, f"process {os.getpid()}".encode(), 0)
 
 
 @contextmanager

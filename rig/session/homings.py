@@ -16,14 +16,9 @@ MIN_CHECKS = 6
 
 
 class Homed(Struct, frozen=True):
-    """Detail of an event `homed`: the stage was homed, and its positions may differ from those before.
+    """Detail of an event `homed`: positions from exposure `first_intent` on may differ from those before.
 
-    Parameters
-    ----------
-    group : int
-        Number of the homing group, from 1 on.
-    first_intent : int
-        Number of the first exposure of the group.
+    Groups are numbered from 1 on.
     """
 
     group: int
@@ -60,8 +55,7 @@ class HomingGroups(Struct, frozen=True):
 
     def repeat(self) -> bool:
         """Return whether the switches are known to repeat so well that groups need not be told apart."""
-        known = self.spread_mm is not None and self.checks >= MIN_CHECKS
-        return known and max(self.spread_mm or ()) <= NEGLIGIBLE_MM
+        return self.spread_mm is not None and self.checks >= MIN_CHECKS and max(self.spread_mm) <= NEGLIGIBLE_MM
 
 
 def begin_group(journal: Journal) -> None:
@@ -88,7 +82,9 @@ def homing_groups(journal: Journal) -> HomingGroups:
         for frame in journal.committed()
     }
     away_mm = [check.away_mm for check in journal.details("drift_check", DriftCheck)]
-    return HomingGroups(groups, _spread_mm(away_mm), len(away_mm))
+    comparable = len(away_mm) > 1 and len(set(map(len, away_mm))) == 1
+    spread_mm = tuple(stdev(axis) for axis in zip(*away_mm, strict=True)) if comparable else None
+    return HomingGroups(groups, spread_mm, len(away_mm))
 
 
 def read_homing_groups(folder: Path) -> HomingGroups:
@@ -101,10 +97,3 @@ def read_homing_groups(folder: Path) -> HomingGroups:
     """
     with open_journal(folder, read_plan(folder), read_only=True) as journal:
         return homing_groups(journal)
-
-
-def _spread_mm(checks: list[tuple[float, ...]]) -> tuple[float, ...] | None:
-    """Return the standard deviation of the measured drifts, per axis."""
-    if len(checks) < 2 or len({len(away_mm) for away_mm in checks}) != 1:
-        return None
-    return tuple(stdev(axis) for axis in zip(*checks, strict=True))

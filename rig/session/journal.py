@@ -15,9 +15,9 @@ from msgspec import Meta, Struct
 
 from faintfield.rig.cameras.protocol import Metadata
 from faintfield.rig.errors import SessionCorrupt
+from faintfield.rig.files import is_plain_name
 from faintfield.rig.plan import MAX_FRAMES
 from faintfield.rig.session.database import check_database, connect, create_database, translate_sqlite_errors
-from faintfield.rig.session.names import is_plain_name
 from faintfield.rig.stages.protocol import Point
 from faintfield.rig.stages.transport import Direction
 
@@ -137,10 +137,8 @@ class Journal:
 
     Parameters
     ----------
-    path : Path
-        The SQLite file.
-    create : bool
-        Create the file if it is missing.
+    path, create : Path, bool
+        The SQLite file, which is created if it is missing and `create` is set.
     read_only : bool
         Open without a lock and without writing, so that a write-protected medium can be read.
 
@@ -166,7 +164,14 @@ class Journal:
         with self._translate_errors():
             self._db = connect(path, read_only=read_only)
         try:
-            self._prepare()
+            with self._translate_errors():
+                self._db.execute("BEGIN")  # one state of the journal for all checks
+                self.format = check_database(self._db, self.path)
+                self._db.execute("COMMIT")
+                if not read_only:  # prefer durability to speed
+                    self._db.execute("PRAGMA journal_mode = WAL")
+                    self._db.execute("PRAGMA synchronous = FULL")
+                    self._db.execute("PRAGMA foreign_keys = ON")
         except BaseException:
             self._db.close()
             raise
@@ -225,10 +230,14 @@ class Journal:
     def committed(self) -> list[CommittedFrame]:
         """Return all committed frames in the order of their exposures."""
         with self._translate_errors():
-            return [
-                CommittedFrame(a, b, self._plain(c), d, e, msgspec.json.decode(record, type=FrameRecord), void)
-                for a, b, c, d, e, record, void in self._read(_CommittedRow, _COMMITTED)
+            frames = [
+                CommittedFrame(intent, frame, file, sha256, size, msgspec.json.decode(record, type=FrameRecord), void)
+                for intent, frame, file, sha256, size, record, void in self._read(_CommittedRow, _COMMITTED)
             ]
+        for frame in frames:
+            if not is_plain_name(frame.file):
+                raise SessionCorrupt(f"{self.path}: {frame.file!r:.60} is no name of a frame; restore it from a copy")
+        return frames
 
     def uncommitted(self) -> list[tuple[int, int]]:
         """Return the number and the frame of every exposure that was not committed."""
@@ -245,8 +254,8 @@ class Journal:
         """Return the events in order, all or those of one kind."""
         with self._translate_errors():
             return [
-                JournalEvent(a, b, c, d, msgspec.json.decode(detail, type=dict[str, object]))
-                for a, b, c, d, detail in self._read(_EventRow, _EVENTS, kind)
+                JournalEvent(number, at, kind, frame, msgspec.json.decode(detail, type=dict[str, object]))
+                for number, at, kind, frame, detail in self._read(_EventRow, _EVENTS, kind)
             ]
 
     def details[T](self, kind: str, layout: type[T]) -> list[T]:
@@ -260,34 +269,13 @@ class Journal:
             for row in self._db.execute("SELECT at_s, direction, data FROM traffic ORDER BY id"):
                 yield msgspec.convert(row, _TrafficRow)
 
-    def _prepare(self) -> None:
-        """Check all that the journal holds; for writing, prefer durability to speed."""
-        with self._translate_errors():
-            self._db.execute("BEGIN")  # one state of the journal for all checks
-            self.format = check_database(self._db, self.path)
-            self._db.execute("COMMIT")
-            if not self._read_only:
-                self._db.execute("PRAGMA journal_mode = WAL")
-                self._db.execute("PRAGMA synchronous = FULL")
-                self._db.execute("PRAGMA foreign_keys = ON")
-
     def _read(self, layout: Any, query: str, *arguments: object) -> list[Any]:
-        """Return the rows of a query, each checked against `layout`."""
         rows = [msgspec.convert(row, layout) for row in self._db.execute(query, arguments).fetchmany(_MAX_ROWS + 1)]
         if len(rows) > _MAX_ROWS:
-            raise SessionCorrupt(
-                f"{self.path}: holds more than {_MAX_ROWS} entries of a kind; restore the journal from a copy"
-            )
+            raise SessionCorrupt(f"{self.path}: holds more than {_MAX_ROWS} rows of a kind; restore it from a copy")
         return rows
 
-    def _plain(self, file: str) -> str:
-        """Return the name of a frame's file, which must not lead out of its folder."""
-        if not is_plain_name(file):
-            raise SessionCorrupt(f"{self.path}: {file!r:.60} is not the name of a frame; restore it from a copy")
-        return file
-
     def _add(self, table: str, *rows: tuple[object, ...]) -> int:
-        """Insert rows into a table, and return the number of the last."""
         insert = f'INSERT INTO "{table}" VALUES ({", ".join("?" * len(rows[0]))})'
         return [self._db.execute(insert, row).lastrowid or 0 for row in rows][-1]
 
@@ -312,15 +300,12 @@ class Journal:
                 raise
 
     def _translate_errors(self) -> AbstractContextManager[None]:
-        """Raise a named failure for an error of SQLite."""
         return translate_sqlite_errors(self.path, read_only=self._read_only)
 
 
 def _now() -> str:
-    """Return the time in UTC as ISO 8601."""
     return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
 def _to_json(detail: object) -> str:
-    """Return a detail as JSON text."""
     return msgspec.json.encode(detail).decode()

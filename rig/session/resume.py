@@ -9,6 +9,7 @@ from pathlib import Path
 import msgspec
 
 from faintfield.rig.errors import SessionCorrupt
+from faintfield.rig.files import make_folder, sha256
 from faintfield.rig.session.changes import settings_of
 from faintfield.rig.session.disk import (
     PART,
@@ -19,9 +20,7 @@ from faintfield.rig.session.disk import (
     translate_read_errors,
     write_new,
 )
-from faintfield.rig.session.durable import make_folder
 from faintfield.rig.session.journal import Begun, CommittedFrame, Journal
-from faintfield.rig.session.regular_files import sha256
 from faintfield.rig.session.session import (
     ASIDE,
     FRAMES,
@@ -42,14 +41,8 @@ type Progress = Callable[[Iterable[CommittedFrame]], Iterable[CommittedFrame]]
 def open_session(folder: Path, plan: FrozenPlan | None, progress: Progress = iter) -> Iterator[Session]:
     """Begin a session in `folder`, or resume the one it holds; close it when the block ends.
 
-    Parameters
-    ----------
-    folder : Path
-        Folder of the session, which is created if needed.
-    plan : FrozenPlan, optional
-        Plan of a new session. A session that was begun keeps its own plan.
-    progress : callable
-        Wraps the iteration over the frames whose hashes are compared, to draw a progress bar.
+    A session that was begun keeps its own plan. `progress` wraps the iteration over the frames whose hashes are
+    compared, to draw a progress bar.
 
     Raises
     ------
@@ -83,37 +76,35 @@ def open_session(folder: Path, plan: FrozenPlan | None, progress: Progress = ite
 
 
 def _begin(folder: Path, plan: FrozenPlan | None) -> None:
-    """Write the plan, the first file of a session besides the lock."""
     if plan is None:
         raise SessionCorrupt(f"{folder}: holds no session; name another folder, or begin one from a rig.toml")
-    others = [name for name in list_names(folder) if name not in ("lock", PLAN + PART)]
-    if others:
-        raise SessionCorrupt(f"{folder}: holds {others[0]} and no session; name a new or empty folder")
+    unexpected = [name for name in list_names(folder) if name not in ("lock", PLAN + PART)]
+    if unexpected:
+        raise SessionCorrupt(f"{folder}: holds {unexpected[0]} and no session; name a new or empty folder")
     write_new(folder / PLAN, msgspec.json.format(msgspec.json.encode(plan)) + b"\n")
 
 
 def _check_plan_hash(folder: Path, journal: Journal, digest: str, *, begun: bool) -> None:
-    """Compare the hash of the plan with the one in the journal, or record it in a new journal."""
-    stated = journal.details("begun", Begun)
-    if not stated:
+    begun_events = journal.details("begun", Begun)
+    if not begun_events:
         if begun:
             raise SessionCorrupt(f"{folder / JOURNAL}: is empty but there are frames; restore the journal from a copy")
         journal.event("begun", plan_sha256=digest)
-    elif stated[0].plan_sha256 != digest:
+    elif begun_events[0].plan_sha256 != digest:
         raise SessionCorrupt(f"{folder / PLAN}: was changed after the session was begun; restore it from a copy")
     else:
         journal.event("resumed")
 
 
 def _reconcile(session: Session, names: list[str], progress: Progress) -> None:
-    """Set aside files that are not in the journal; declare frames void whose file is altered or missing."""
     folder, journal = session.folder, session.journal
     committed = {frame.file for frame in journal.committed()}
     present = set(names)
     for name in names:
         if name not in committed:
             moved = set_aside(folder / FRAMES / name, folder / ASIDE)
-            journal.event("set_aside", file=_printable(name), to=moved.name, why="not committed")
+            printable = os.fsencode(name).decode(errors="backslashreplace")
+            journal.event("set_aside", file=printable, to=moved.name, why="not committed")
     for frame in progress(list(session.valid().values())):
         path = session.path_of(frame)
         if frame.file not in present:
@@ -135,8 +126,3 @@ def _is_intact(path: Path, digest: str) -> bool:
             if failure.errno in (errno.EINVAL, errno.ENOENT, errno.ELOOP):  # no regular file, or a link to nowhere
                 return False
             raise
-
-
-def _printable(name: str) -> str:
-    """Return a file name without bytes that are no text."""
-    return os.fsencode(name).decode(errors="backslashreplace")

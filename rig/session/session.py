@@ -12,12 +12,11 @@ from msgspec import Struct
 
 from faintfield.rig.cameras.protocol import Exposure
 from faintfield.rig.errors import SessionCorrupt, SessionUnreadable, SessionUnwritable
+from faintfield.rig.files import is_plain_name, read_regular, sha256
 from faintfield.rig.plan import MAX_NUMBER, CapturePlan, PlannedFrame, planned_frames
 from faintfield.rig.session.database import FORMAT
 from faintfield.rig.session.disk import encode_exposure, list_names, set_aside, translate_errors, write_new
 from faintfield.rig.session.journal import CommittedFrame, FrameRecord, Journal
-from faintfield.rig.session.names import is_plain_name
-from faintfield.rig.session.regular_files import read_regular, sha256
 from faintfield.rig.settings import RigSettings
 
 PLAN, JOURNAL, FRAMES, SUMS, ASIDE = "plan.json", "journal.sqlite", "frames", "SHA256SUMS", "set_aside"
@@ -28,17 +27,7 @@ _MAX_PLAN_BYTES = 32_000_000
 
 
 class FrozenPlan(Struct, frozen=True, forbid_unknown_fields=True):
-    """Content of plan.json: the plan of a capture and the rig that it was made for.
-
-    Parameters
-    ----------
-    plan : CapturePlan
-        All positions and frames.
-    rig : RigSettings
-        Configuration of the rig when the session was begun.
-    format : int
-        Version of the format of the session.
-    """
+    """Content of plan.json: the plan of a capture, the rig that it was made for, and the version of the format."""
 
     plan: CapturePlan
     rig: RigSettings
@@ -61,17 +50,10 @@ class WrittenFile(Struct, frozen=True):
 class Session:
     """A session open for writing, as `rig.session.resume.open_session` yields it.
 
-    Parameters
-    ----------
-    folder : Path
-        Folder of the session.
-    frozen : FrozenPlan
-        Content of plan.json.
-    journal : Journal
-        Open journal of the session.
-
     Attributes
     ----------
+    folder, frozen, journal : Path, FrozenPlan, Journal
+        Folder of the session, content of its plan.json, and its open journal.
     frames : tuple of PlannedFrame
         All frames of the plan, in order.
     rig : RigSettings
@@ -214,7 +196,7 @@ def find_wild_number(content: object, place: str = "plan") -> str | None:
         return f"{place} = {float(content):g}"
     else:
         return None
-    return next((found for value, name in parts if (found := find_wild_number(value, name))), None)
+    return next((wild for value, name in parts if (wild := find_wild_number(value, name))), None)
 
 
 def open_journal(folder: Path, frozen: FrozenPlan, *, create: bool = False, read_only: bool = False) -> Journal:
@@ -229,12 +211,12 @@ def open_journal(folder: Path, frozen: FrozenPlan, *, create: bool = False, read
     if journal.format != frozen.format:
         journal.close()
         raise SessionCorrupt(
-            f"{journal.path}: has format {journal.format}, the plan {frozen.format}; restore the journal from a copy"
+            f"{journal.path}: has format {journal.format}, the plan {frozen.format}; restore it from a copy"
         )
     return journal
 
 
-def find_strangers(frames: Sequence[PlannedFrame], committed: Iterable[CommittedFrame]) -> Iterator[str]:
+def disagreements(frames: Sequence[PlannedFrame], committed: Iterable[CommittedFrame]) -> Iterator[str]:
     """Yield how entries of a journal disagree with the plan, one line each."""
     taken: dict[int, str] = {}
     for frame in committed:
@@ -264,7 +246,7 @@ def valid_frames(
         An entry of the journal disagrees with the plan.
     """
     entries = list(committed)
-    for problem in find_strangers(frames, entries):
+    for problem in disagreements(frames, entries):
         raise SessionCorrupt(f"{folder / JOURNAL}: {problem}; restore the journal from a copy")
     return {frame.frame: frame for frame in entries if frame.void is None}
 

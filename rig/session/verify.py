@@ -1,22 +1,23 @@
 """Verify a session: compare its plan, journal, files and hashes; nothing is changed."""
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import nullcontext
 from pathlib import Path
 
 from msgspec import Struct
 
-from faintfield.rig.plan import PlannedFrame, planned_frames
+from faintfield.rig.files import read_regular, sha256
+from faintfield.rig.plan import planned_frames
 from faintfield.rig.session.disk import list_names, lock_session, translate_read_errors
 from faintfield.rig.session.journal import Begun, CommittedFrame, Sealed, Suspect
-from faintfield.rig.session.regular_files import read_regular, sha256
 from faintfield.rig.session.session import (
     FRAMES,
     JOURNAL,
     PLAN,
     SUMS,
+    disagreements,
     exposure_name,
-    find_strangers,
     is_sealed,
     open_journal,
     read_plan_and_hash,
@@ -24,6 +25,9 @@ from faintfield.rig.session.session import (
 
 # The sums of a capture of MAX_FRAMES frames, taken three times each, have this size in bytes.
 _MAX_SUMS_BYTES = 50_000_000
+
+# SHA-256 of files by name, or why a file cannot be read.
+type _Digests = dict[str, str | OSError]
 
 
 class Verdict(Struct, frozen=True):
@@ -62,14 +66,7 @@ class Verdict(Struct, frozen=True):
 
 
 def verify(folder: Path, progress: Callable[[Iterable[Path]], Iterable[Path]] = iter) -> Verdict:
-    """Verify the session in `folder`.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the session.
-    progress : callable
-        Wraps the iteration over the files that are read, to draw a progress bar.
+    """Verify the session in `folder`; `progress` wraps the iteration over the files that are read, to draw a bar.
 
     Raises
     ------
@@ -80,102 +77,77 @@ def verify(folder: Path, progress: Callable[[Iterable[Path]], Iterable[Path]] = 
     SessionUnreadable
         The system does not let the lock, the plan, the journal or the folder of the frames be read.
     """
-    if not os.path.lexists(folder / "lock"):
-        return _verify(folder, progress)
-    with lock_session(folder, shared=True):
-        return _verify(folder, progress)
+    with lock_session(folder, shared=True) if os.path.lexists(folder / "lock") else nullcontext():
+        frozen, plan_sha256 = read_plan_and_hash(folder)
+        frames = planned_frames(frozen.plan)
+        with open_journal(folder, frozen, read_only=True) as journal:
+            committed = journal.committed()
+            begun = [event.plan_sha256 for event in journal.details("begun", Begun)]
+            sealed = [event.skipped for event in journal.details("sealed", Sealed)]
+            suspects = {intent for event in journal.details("suspect", Suspect) for intent in event.intents}
+            uncommitted = journal.uncommitted()
+        names = list_names(folder / FRAMES)
+        digests: _Digests = {path.name: _digest(path) for path in progress([folder / FRAMES / name for name in names])}
+        orphans = set(names) - {frame.file for frame in committed}
+        begun_names = {exposure_name(frames[frame], intent) for intent, frame in uncommitted if frame < len(frames)}
+        interrupted = tuple(sorted(name for name in orphans if name.partition(".")[0] in begun_names))
+        problems: list[str] = []
+        if begun != [plan_sha256] and (begun or committed or uncommitted):  # else it was interrupted as it began
+            problems.append(f"{PLAN}: is not the plan that the session was begun with")
+        problems += disagreements(frames, committed)
+        problems += _compare(committed, digests, orphans - set(interrupted))
+        if is_sealed(folder):
+            problems += _compare_sums(folder, committed, digests)
+        valid = {frame.frame: frame for frame in committed if frame.void is None}
+        left_out = {number for numbers in sealed[-1:] for number in numbers}
+        open_frames = [frame for frame in frames if frame.number not in valid]
+        missing = tuple(frame.name for frame in open_frames if frame.number not in left_out)
+        if is_sealed(folder):
+            problems += [f"{name}: is missing although the session is complete" for name in missing]
+        return Verdict(
+            problems=tuple(problems),
+            interrupted=interrupted,
+            planned=len(frames),
+            present=sum(digests.get(frame.file) == frame.sha256 for frame in valid.values()),
+            missing=missing,
+            left_out=tuple(frame.name for frame in open_frames if frame.number in left_out),
+            superseded=sum(frame.void is not None and frame.file in digests for frame in committed),
+            suspect=tuple(frame.file for frame in valid.values() if frame.intent in suspects),
+            sealed=is_sealed(folder),
+        )
 
 
-def _verify(folder: Path, progress: Callable[[Iterable[Path]], Iterable[Path]]) -> Verdict:
-    """Verify a session whose lock is held, or that has none."""
-    frozen, plan_sha256 = read_plan_and_hash(folder)
-    frames = planned_frames(frozen.plan)
-    with open_journal(folder, frozen, read_only=True) as journal:
-        committed = journal.committed()
-        begun = [event.plan_sha256 for event in journal.details("begun", Begun)]
-        sealed = [event.skipped for event in journal.details("sealed", Sealed)]
-        suspects = {intent for event in journal.details("suspect", Suspect) for intent in event.intents}
-        uncommitted = journal.uncommitted()
-    names = list_names(folder / FRAMES)
-    digests = {path.name: _digest(path) for path in progress([folder / FRAMES / name for name in names])}
-    interrupted = find_interrupted(frames, uncommitted, set(names) - {frame.file for frame in committed})
-    problems: list[str] = []
-    if begun != [plan_sha256] and (begun or committed or uncommitted):  # else it was interrupted as it began
-        problems.append(f"{PLAN}: is not the plan that the session was begun with")
-    problems += find_strangers(frames, committed)
-    problems += _compare(committed, digests, set(interrupted))
-    if is_sealed(folder):
-        problems += _compare_sums(folder, committed, digests)
-    valid = {frame.frame: frame for frame in committed if frame.void is None}
-    left_out = {number for numbers in sealed[-1:] for number in numbers}
-    open_frames = [frame for frame in frames if frame.number not in valid]
-    missing = tuple(frame.name for frame in open_frames if frame.number not in left_out)
-    if is_sealed(folder):
-        problems += [f"{name}: is missing although the session is complete" for name in missing]
-    return Verdict(
-        problems=tuple(problems),
-        interrupted=interrupted,
-        planned=len(frames),
-        present=sum(digests.get(frame.file) == frame.sha256 for frame in valid.values()),
-        missing=missing,
-        left_out=tuple(frame.name for frame in open_frames if frame.number in left_out),
-        superseded=sum(frame.void is not None and frame.file in digests for frame in committed),
-        suspect=tuple(frame.file for frame in valid.values() if frame.intent in suspects),
-        sealed=is_sealed(folder),
-    )
-
-
-class _Unreadable(Struct, frozen=True):
-    """Why a file cannot be read; stands in for its hash."""
-
-    why: str
-
-
-def _digest(path: Path) -> str | _Unreadable:
-    """Return the hash of a file, or why there is none."""
+def _digest(path: Path) -> str | OSError:
     try:
         return sha256(path)
     except OSError as failure:
-        return _Unreadable(failure.strerror or type(failure).__name__)
+        return failure
 
 
-def find_interrupted(
-    frames: Sequence[PlannedFrame], uncommitted: Iterable[tuple[int, int]], orphans: Iterable[str]
-) -> tuple[str, ...]:
-    """Return the names among `orphans` that an exposure without a commit may have left in `frames/`."""
-    begun = {exposure_name(frames[frame], intent) for intent, frame in uncommitted if frame < len(frames)}
-    return tuple(sorted(name for name in orphans if name.partition(".")[0] in begun))
-
-
-def _compare(
-    committed: list[CommittedFrame], digests: dict[str, str | _Unreadable], interrupted: Set[str]
-) -> Iterator[str]:
-    """Yield the disagreements between journal and files."""
+def _compare(committed: list[CommittedFrame], digests: _Digests, foreign: Iterable[str]) -> Iterator[str]:
     for frame in committed:
         match digests.get(frame.file):
-            case _Unreadable(why=why):
-                yield f"{FRAMES}/{frame.file}: cannot be read ({why})"
+            case OSError() as failure:
+                yield f"{FRAMES}/{frame.file}: cannot be read ({failure.strerror or type(failure).__name__})"
             case None if frame.void is None:
                 yield f"{FRAMES}/{frame.file}: is missing"
             case str(digest) if frame.void is None and digest != frame.sha256:
                 yield f"{FRAMES}/{frame.file}: was altered"
-    for name in sorted(digests.keys() - {frame.file for frame in committed} - interrupted):
+    for name in sorted(foreign):
         yield f"{FRAMES}/{name}: is not in the journal"
 
 
-def _compare_sums(
-    folder: Path, committed: list[CommittedFrame], digests: dict[str, str | _Unreadable]
-) -> Iterator[str]:
+def _compare_sums(folder: Path, committed: list[CommittedFrame], digests: _Digests) -> Iterator[str]:
     """Yield the disagreements between SHA256SUMS and the files; no file is opened because it is named there."""
     with translate_read_errors(folder / SUMS):
         lines = read_regular(folder / SUMS, _MAX_SUMS_BYTES).decode(errors="backslashreplace").splitlines()
-    stated = {name: digest for digest, _, name in (line.partition("  ") for line in lines)}
+    sums = {name: digest for digest, _, name in (line.partition("  ") for line in lines)}
     frames = {
         f"{FRAMES}/{frame.file}": digests.get(frame.file)
         for frame in committed
         if frame.void is None or frame.file in digests
     }
     actual = frames | {name: _digest(folder / name) for name in (PLAN, JOURNAL)}
-    for name in sorted(stated.keys() | actual.keys()):
-        if stated.get(name) != actual.get(name):
+    for name in sorted(sums.keys() | actual.keys()):
+        if sums.get(name) != actual.get(name):
             yield f"{name}: does not agree with {SUMS}"

@@ -45,11 +45,11 @@ class SimulatedBoard:
         """Return the corners (corner, 3) in the reference frame, row by row."""
         row, column = np.divmod(np.arange(self.corner_rows * self.corner_columns), self.corner_columns)
         flat = np.column_stack([column, row, np.zeros(len(row))]) * self.square_mm
-        return _transformed(self.rt_ref_board, flat)
+        return _transform(self.rt_ref_board, flat)
 
     def seen(self, optics: SimulatedOptics, rt_cam_ref: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the images (corner, 2) of the corners in pixels; NaN outside the detector."""
-        points = _transformed(rt_cam_ref, self.points_ref_mm())
+        points = _transform(rt_cam_ref, self.points_ref_mm())
         x, y = distort(points[:, 0] / points[:, 2], points[:, 1] / points[:, 2], optics.distortion)
         pixels = np.column_stack([x * optics.fx_px + optics.cx_px, y * optics.fy_px + optics.cy_px])
         inside = (pixels >= 0).all(axis=1) & (pixels <= np.array(optics.size_px) - 1).all(axis=1) & (points[:, 2] > 0)
@@ -80,10 +80,8 @@ def printed_board(
 
     Parameters
     ----------
-    name : str
-        Name of the plane.
-    picture : array (row, column)
-        Reflectance, 0…1.
+    name, picture : str, array (row, column)
+        Name of the plane, and its reflectance, 0…1.
     pitch_mm : float
         Distance of neighbouring samples of the picture.
     board : SimulatedBoard
@@ -93,7 +91,7 @@ def printed_board(
     """
     height, width = picture.shape
     centre_mm = np.array([width * pitch_mm / 2 - first_corner_mm[0], height * pitch_mm / 2 - first_corner_mm[1], 0.0])
-    pose = np.append(board.rt_ref_board[:3], _transformed(board.rt_ref_board, centre_mm[np.newaxis])[0])
+    pose = np.append(board.rt_ref_board[:3], _transform(board.rt_ref_board, centre_mm[np.newaxis])[0])
     opaque = np.ones(picture.shape, np.float32)
     rx, ry, rz, x, y, z = pose.tolist()
     return TexturedPlane(name, picture.astype(np.float32), opaque, pitch_mm, (rx, ry, rz, x, y, z))
@@ -103,8 +101,7 @@ def _rotation(rodrigues: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(cv2.Rodrigues(rodrigues)[0], np.float64)
 
 
-def _transformed(rt: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Apply a pose to points (point, 3)."""
+def _transform(rt: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(points @ _rotation(np.asarray(rt[:3], np.float64)).T + rt[3:], np.float64)
 
 
@@ -122,18 +119,9 @@ _BOARD_OFFSET = np.array([0.0, 0.0, 0.0, 180.0, 0.0, 40.0])
 
 
 def standing_board(board: BoardSettings, sweep: int, place: int, optics: SimulatedOptics) -> TexturedPlane:
-    """Return a board in the pose of a sweep; several boards stand side by side.
+    """Return a board in the pose of a sweep; several boards stand side by side, each in its own `place`.
 
-    Parameters
-    ----------
-    board : BoardSettings
-        The printed board.
-    sweep : int
-        Index of the sweep, which decides the pose.
-    place : int
-        Index of the board.
-    optics : SimulatedOptics
-        The camera, which decides how finely the board is sampled.
+    The optics of the camera decide how finely the board is sampled.
     """
     poses = six_boards(board.rows - 1, board.columns - 1, board.square_mm)
     standing = poses[sweep % len(poses)]

@@ -15,7 +15,6 @@ from faintfield.rig.errors import CameraError
 from faintfield.rig.plan import StepKind
 from faintfield.rig.settings import BoardSettings
 from faintfield.rig.simulation.boards import standing_board
-from faintfield.rig.simulation.cooling import SET_POINT_C, Cooling
 from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
 from faintfield.rig.simulation.scene import TexturedPlane, render
 from faintfield.rig.simulation.sensor import through_mosaic
@@ -25,16 +24,8 @@ from faintfield.rig.stages.protocol import Point
 _WAVES, _WAVE_LENGTHS_MM = 8, (80.0, 400.0)
 
 
-class Carriage:
-    """Maps motor positions to camera poses, repeatably and without error at the centre.
-
-    Parameters
-    ----------
-    centre : Point
-        Motor position of the reference pose.
-    settings : SimulatedSettings
-        Standard deviation of the pose over the travel, scale and squareness of the axes, and the seed of the rails.
-    """
+class _Carriage:
+    """Maps motor positions to camera poses, repeatably and without error at the centre."""
 
     def __init__(self, centre: Point, settings: SimulatedSettings) -> None:
         self._centre = centre
@@ -78,21 +69,12 @@ class SimulatedLab:
 
     Parameters
     ----------
-    centre : Point
-        Stage position of the reference pose.
-    true_position : callable
-        Returns the true position of the carriages.
-    still_s : callable
-        Returns the time since they stopped.
+    centre, true_position, still_s : Point, callable, callable
+        Stage position of the reference pose; the true position of the carriages, and the time since they stopped.
     boards : tuple of BoardSettings
         Boards of the charuco sweeps.
     settings : SimulatedSettings
         The camera, the light and the errors of the rails.
-
-    Attributes
-    ----------
-    experiment : SimulatedExperiment
-        The paper's objects and the camera, made on first use.
     """
 
     def __init__(
@@ -107,7 +89,7 @@ class SimulatedLab:
         self._still_s = still_s
         self._boards = boards
         self._settings = settings
-        self._carriage = Carriage(centre, settings)
+        self._carriage = _Carriage(centre, settings)
         self._planes: tuple[TexturedPlane, ...] = ()
         self._photons_per_s = 0.0
         self._flat = False
@@ -119,7 +101,6 @@ class SimulatedLab:
 
     @cached_property
     def _illumination(self) -> NDArray[np.float32]:
-        """Relative illumination (row, column) of the lens."""
         return self.experiment.optics.relative_illumination()
 
     def arrange(self, kind: StepKind, sweep: int) -> None:
@@ -174,6 +155,36 @@ def lab_experiment(settings: SimulatedSettings) -> SimulatedExperiment:
     return coloured if settings.mosaic else coloured.grey()
 
 
+# Temperature of a sensor whose cooling is not simulated, and the set point of one whose is, unless it is stated.
+SET_POINT_C = -20.0
+
+# What the cooler's control leaves: three waves of this amplitude, and the range of their periods.
+_RIPPLE_K, _WAVES, _PERIODS_S = 0.03, 3, (40.0, 200.0)
+
+
+class Cooling:
+    """The temperature of a sensor over time.
+
+    It falls, or rises, exponentially from `start_c` at time 0, and then swings a little about the set point; the
+    distance from it falls to 1/e in `time_s`. Without a start it stays at the set point, without any ripple.
+    """
+
+    def __init__(self, start_c: float | None, set_point_c: float, time_s: float, seed: int) -> None:
+        self._start_c = start_c
+        self._set_point_c = set_point_c
+        self._time_s = time_s
+        generator = np.random.default_rng([seed, 2])
+        self._per_s = 2.0 * np.pi / generator.uniform(*_PERIODS_S, _WAVES)
+        self._phase = generator.uniform(0.0, 2.0 * np.pi, _WAVES)
+
+    def temperature_c(self, after_s: float) -> float:
+        """Return the temperature at a time after the camera was switched on."""
+        if self._start_c is None:
+            return self._set_point_c
+        ripple_k = _RIPPLE_K * float(np.sin(self._per_s * after_s + self._phase).sum())
+        return self._set_point_c + (self._start_c - self._set_point_c) * math.exp(-after_s / self._time_s) + ripple_k
+
+
 # Key of the true pose in a frame's metadata.
 TRUE_POSE = "true_rt_cam_ref"
 
@@ -185,17 +196,7 @@ _TIFF_HEADER_BYTES = 512
 
 
 class SimulatedCamera:
-    """A `Camera` that renders its frames; exposures take simulated time.
-
-    Parameters
-    ----------
-    settings : SimulatedSettings
-        The `[camera]` table.
-    clock : Clock
-        The simulated clock.
-    lab : SimulatedLab
-        Renders the frames.
-    """
+    """A `Camera` that renders the frames of a lab; exposures take simulated time."""
 
     def __init__(self, settings: SimulatedSettings, clock: Clock, lab: SimulatedLab) -> None:
         self._settings = settings
@@ -241,6 +242,5 @@ class SimulatedCamera:
         self._open = False
 
     def _require_open(self) -> None:
-        """Raise `CameraError` before `open` and after `close`."""
         if not self._open:
             raise CameraError("the camera is not connected; open it first")

@@ -1,4 +1,4 @@
-"""The objects of the simulated experiments: toys, a resolution chart, a shaded ball."""
+"""The objects of the simulated experiments: flat toys, a resolution chart, a ball; and a scene of surfaces."""
 
 from functools import cache
 
@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.rig.simulation.scene import TexturedPlane
+from faintfield.rig.simulation.shapes import Cylinder, Rectangle, Shape, Sphere
+from faintfield.rig.simulation.surfaces import Surface
 
 # Objects are drawn this many times finer than the texture and averaged, so that edges are smooth.
 _OVERSAMPLING = 4
@@ -41,12 +43,12 @@ class _Canvas:
         angle = np.linspace(0, 2 * np.pi, 240)
         self.polygon([(x_mm + radius_x_mm * np.cos(a), y_mm + radius_y_mm * np.sin(a)) for a in angle], colour)
 
-    def text(self, words: str, x_mm: float, y_mm: float, height_mm: float, colour: Colour) -> None:
+    def text(self, caption: str, x_mm: float, y_mm: float, height_mm: float, colour: Colour) -> None:
         """Write text with its lower left corner at x, y, on what is already drawn."""
         scale = height_mm * self._scale / 21  # the font's capitals are 21 px high at scale 1
         at = tuple(int(value) for value in self._pixels([(x_mm, y_mm)])[0])
         thickness = round(3 * scale)
-        cv2.putText(self._colour, words, at, cv2.FONT_HERSHEY_DUPLEX, scale, _levels(colour), thickness, cv2.LINE_AA)
+        cv2.putText(self._colour, caption, at, cv2.FONT_HERSHEY_DUPLEX, scale, _levels(colour), thickness, cv2.LINE_AA)
 
     def plane(self, name: str, x_mm: float, y_mm: float, depth_mm: float, shading: float) -> TexturedPlane:
         """Return the drawing as an object at x, y and a depth; shading darkens it towards its lower right."""
@@ -164,3 +166,66 @@ def shaded_ball(x_mm: float, y_mm: float, depth_mm: float, radius_mm: float = 75
     colour = np.repeat(reflectance[:, :, np.newaxis], 3, axis=2)
     opacity = np.clip(rim, 0, 1).astype(np.float32)
     return TexturedPlane("ball", colour, opacity, _TEXTURE_PITCH_MM, (0, 0, 0, x_mm, y_mm, depth_mm))
+
+
+type Tile = NDArray[np.float32]
+
+# Angle in rad at which the floor rises away from the camera.
+_RISE = 0.16
+
+
+def surface_scene() -> tuple[Surface, ...]:
+    """Return the scene: a wall and a rising floor fill every view, before them a ball, a page, and a rod 6 mm thick.
+
+    The reference camera sees depths from 517 to 1009 mm. The cameras of a grid that spans 300 mm are all above the
+    floor, and see the rod from the floor, or the lower edge of the view, to the upper edge.
+    """
+    wall = Rectangle((0.0, -0.38, 0.0, 0.0, 0.0, 850.0))
+    floor = Rectangle((_RISE - np.pi / 2, 0.0, 0.0, 0.0, 215.0, 520.0))
+    ball = Sphere((-120.0, 118.0, 680.0), 70.0)
+    page = Rectangle((-0.2, 0.5, 0.0, 125.0, 60.0, 600.0), (85.0, 105.0))
+    rod = Cylinder((45.0, 500.0, 520.0), (5.0, -500.0, 520.0), 3.0)
+    return (
+        _paint("wall", wall, _clouds(1, 1024, 1.1), 1.0, (0.10, 0.12, 0.20), (0.95, 0.90, 0.80)),
+        _paint("floor", floor, _patches(2, 1024, 1.4), 1.0, (0.30, 0.16, 0.08), (0.90, 0.75, 0.55)),
+        _paint("ball", ball, _clouds(3, 512, 1.1), 0.5, (0.45, 0.05, 0.05), (1.00, 0.85, 0.75)),
+        _paint("page", page, _print(4, 512), 0.5, (0.06, 0.06, 0.10), (0.95, 0.95, 0.90)),
+        _paint("rod", rod, _clouds(5, 128, 1.1), 0.5, (0.70, 0.60, 0.20), (1.00, 0.95, 0.60)),
+    )
+
+
+def _paint(name: str, shape: Shape, tile: Tile, pitch_mm: float, dark: Colour, bright: Colour) -> Surface:
+    low, high = np.array(dark), np.array(bright)
+    return Surface(name, shape, (low + tile[:, :, np.newaxis] * (high - low)).astype(np.float32), pitch_mm)
+
+
+def _noise(seed: int, size: int, slope: float) -> Tile:
+    """Return noise whose amplitude falls with frequency to the power of `slope`, of deviation 1; it repeats."""
+    generator = np.random.default_rng(seed)
+    frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(size), np.fft.fftfreq(size)))
+    frequency[0, 0] = np.inf
+    noise = np.fft.ifft2(np.fft.fft2(generator.standard_normal((size, size))) / frequency**slope).real
+    return np.asarray(noise / noise.std(), np.float32)
+
+
+def _clouds(seed: int, size: int, slope: float) -> Tile:
+    return np.asarray(np.clip(0.5 + 0.25 * _noise(seed, size, slope), 0, 1), np.float32)
+
+
+def _patches(seed: int, size: int, slope: float) -> Tile:
+    """Return patches of three shades with faint detail within, 0…1."""
+    noise = _noise(seed, size, slope)
+    shades = np.select([noise > 0.4, noise > -0.4], [0.9, 0.5], 0.1)
+    return np.asarray(np.clip(shades + 0.04 * noise, 0, 1), np.float32)
+
+
+def _print(seed: int, size: int) -> Tile:
+    generator = np.random.default_rng(seed)
+    tile = np.ones((size, size), np.float32)
+    for top in range(8, size - 20, 28):
+        left = 8
+        while left < size - 24:
+            width = int(generator.integers(4, 16))
+            tile[top : top + 14, left : left + width] = generator.choice([0.0, 0.0, 0.45])
+            left += width + int(generator.integers(3, 8))
+    return tile

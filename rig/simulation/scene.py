@@ -133,7 +133,7 @@ def _sample(
             plane.opacity,
         ]
     )
-    seen = cv2.remap(
+    samples = cv2.remap(
         texture.astype(np.float32),
         columns.astype(np.float32),
         rows.astype(np.float32),
@@ -141,8 +141,8 @@ def _sample(
         borderMode=cv2.BORDER_CONSTANT,
         borderValue=0,
     )
-    reflected = seen[:, :, :-1]
-    return (reflected if plane.reflectance.ndim == 3 else reflected[:, :, 0]), seen[:, :, -1]
+    reflected = samples[:, :, :-1]
+    return (reflected if plane.reflectance.ndim == 3 else reflected[:, :, 0]), samples[:, :, -1]
 
 
 def _plane_in_camera(

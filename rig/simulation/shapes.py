@@ -55,7 +55,7 @@ class Rectangle:
         """Solve n · (origin + s · direction - centre) = 0, and keep what lies within the limits."""
         z_of_origin = float(self._axes[2] @ (origin_mm - self.rt_ref_plane[3:]))
         with np.errstate(divide="ignore"):
-            scale = -z_of_origin / turned(self._axes[2:], directions)[0]
+            scale = -z_of_origin / rotate(self._axes[2:], directions)[0]
         scale = np.where(scale > 0, scale, np.inf)
         if np.isinf(self.half_size_mm).all():
             return scale
@@ -69,7 +69,7 @@ class Rectangle:
 
     def coordinates_mm(self, points_mm: Vectors) -> Vectors:
         """Return x, y along the rectangle's axes, from its centre."""
-        return turned(self._axes[:2], _minus(points_mm, self.rt_ref_plane[3:]))
+        return rotate(self._axes[:2], _minus(points_mm, self.rt_ref_plane[3:]))
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class Cylinder:
     def meet(self, origin_mm: NDArray[np.float64], directions: Vectors) -> Scalars:
         """Solve for the distance from the axis, and keep what lies between the ends."""
         origin = self._axes @ (origin_mm - self.start_mm)
-        *across, along = turned(self._axes, directions)
+        *across, along = rotate(self._axes, directions)
         scale = _first_within(origin[:2], np.stack(across), self.radius_mm)
         with np.errstate(invalid="ignore"):  # inf · 0
             height = origin[2].astype(directions.dtype) + scale * along
@@ -128,15 +128,15 @@ class Cylinder:
     def normals(self, points_mm: Vectors) -> Vectors:
         """Return the directions from the axis."""
         from_axis = self._axes[:2].T @ self._axes[:2]
-        return np.asarray(turned(from_axis, _minus(points_mm, self.start_mm)) / self.radius_mm)
+        return np.asarray(rotate(from_axis, _minus(points_mm, self.start_mm)) / self.radius_mm)
 
     def coordinates_mm(self, points_mm: Vectors) -> Vectors:
         """Return the arc around the cylinder, and the distance from its start."""
-        x, y, height = turned(self._axes, _minus(points_mm, self.start_mm))
+        x, y, height = rotate(self._axes, _minus(points_mm, self.start_mm))
         return np.stack([self.radius_mm * np.arctan2(y, x), height])
 
 
-def turned(matrix: NDArray[np.floating], vectors: Vectors) -> Vectors:
+def rotate(matrix: NDArray[np.floating], vectors: Vectors) -> Vectors:
     """Return `matrix @ vectors` in the precision of the vectors; BLAS would start threads, which here only cost."""
     return np.asarray(np.einsum("ij,jk->ik", matrix.astype(vectors.dtype), vectors))
 
@@ -149,7 +149,7 @@ def _first_within(from_centre_mm: NDArray[np.float64], directions: Vectors, radi
     start = from_centre_mm.astype(directions.dtype)
     squared = np.einsum("ij,ij->j", directions, directions)
     with np.errstate(divide="ignore", invalid="ignore"):  # rays along the axis of a cylinder have squared = 0
-        to_nearest = -turned(start[np.newaxis], directions)[0] / squared
+        to_nearest = -rotate(start[np.newaxis], directions)[0] / squared
         passing = _points(start, directions, to_nearest)
         scale = to_nearest - np.sqrt((radius_mm**2 - np.einsum("ij,ij->j", passing, passing)) / squared)
     return np.where(scale > 0, scale, np.inf)

@@ -10,7 +10,7 @@ from scipy.ndimage import map_coordinates
 
 from faintfield.rig.simulation.optics import SimulatedOptics
 from faintfield.rig.simulation.scene import RenderedView, pixel_means
-from faintfield.rig.simulation.shapes import Scalars, Shape, Vectors, turned
+from faintfield.rig.simulation.shapes import Scalars, Shape, Vectors, rotate
 
 # Middle of the half of the sky that lights the scene, seen from it: above, left, and on the camera's side.
 _SKY = np.array([-0.4, -0.7, -0.6]) / np.linalg.norm([-0.4, -0.7, -0.6])
@@ -48,14 +48,14 @@ class Surface:
         Half of the sky is bright, evenly. A surface whose normal is at an angle θ to the middle of that half receives
         (1 + cos θ) / 2 of it, so that shades are soft, and the same from wherever the point is seen.
         """
-        shade = (1 + turned(_SKY[np.newaxis], self.shape.normals(points_mm))[0]) / 2
+        shade = (1 + rotate(_SKY[np.newaxis], self.shape.normals(points_mm))[0]) / 2
         columns, rows = self.shape.coordinates_mm(points_mm) / self.pitch_mm
         tiles = self.reflectance if self.reflectance.ndim == 3 else self.reflectance[:, :, np.newaxis]
         colours = [
             map_coordinates(tile, [rows, columns], order=1, mode="grid-wrap") for tile in np.moveaxis(tiles, 2, 0)
         ]
-        seen = np.stack(colours, axis=-1) * shade[:, np.newaxis]
-        return np.asarray(seen if self.reflectance.ndim == 3 else seen[:, 0], np.float32)
+        light = np.stack(colours, axis=-1) * shade[:, np.newaxis]
+        return np.asarray(light if self.reflectance.ndim == 3 else light[:, 0], np.float32)
 
 
 def render_surfaces(
@@ -67,16 +67,7 @@ def render_surfaces(
 ) -> Iterator[RenderedView]:
     """Yield the view of each pose: each ray shows the first surface that it meets, black if it meets none.
 
-    Parameters
-    ----------
-    surfaces : sequence of Surface
-        Either all grey or all in colour.
-    optics : SimulatedOptics
-        Optics of the camera.
-    poses_rt_cam_ref : array (view, 6)
-        Poses of the camera, Rodrigues rad and mm.
-    samples_per_px : int
-        Rays per pixel and axis, whose mean is the pixel; several reduce aliasing.
+    The surfaces are all grey or all in colour; the other parameters are those of `scene.render`.
     """
     rays = optics.rays(samples_per_px)
     illumination = optics.relative_illumination()
@@ -116,7 +107,7 @@ def _cast(
 def _directions(rays: NDArray[np.floating], r_ref_cam: NDArray[np.float64]) -> Vectors:
     """Return rays (row, column, 2) at unit depth as directions (3, ray) in the reference frame."""
     x, y = rays.reshape(-1, 2).T
-    return turned(r_ref_cam, np.stack([x, y, np.ones_like(x)]))
+    return rotate(r_ref_cam, np.stack([x, y, np.ones_like(x)]))
 
 
 def _first_met(

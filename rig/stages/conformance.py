@@ -19,17 +19,7 @@ _REPORTS = 10
 
 
 class Check(Struct, frozen=True):
-    """The result of one check.
-
-    Parameters
-    ----------
-    name : str
-        What was checked.
-    passed : bool
-        Whether the measured value is within its limit.
-    measured, limit : str
-        The value and its limit, with units.
-    """
+    """The result of one check: the measured value and its limit, with units."""
 
     name: str
     passed: bool
@@ -47,27 +37,16 @@ def check_conformance(stage: Gantry) -> Iterator[Check]:
     StageError
         The stage failed, so that no more checks are possible.
     """
-    yield _settings(stage)
-    yield _homing(stage)
+    warnings = stage.identify().warnings
+    yield Check("settings", not warnings, "; ".join(warnings) or "nothing to change", "nothing to change")
+    bound_s, homing_s = stage.identify().homing_bound_s / 1.5, stage.home().duration_s
+    yield Check("homing", homing_s < bound_s, f"{homing_s:.1f} s", f"< {bound_s:.0f} s")
     yield _limits(stage)
     yield _speed(stage)
     yield _arrival(stage)
     yield _report_rate(stage)
     if stage.identify().has_switches:
         yield _repeatability(stage)
-
-
-def _settings(stage: Gantry) -> Check:
-    """Check that no setting needs to be changed."""
-    warnings = stage.identify().warnings
-    return Check("settings", not warnings, "; ".join(warnings) or "nothing to change", "nothing to change")
-
-
-def _homing(stage: Gantry) -> Check:
-    """Check that homing ends well within its bound."""
-    bound_s = stage.identify().homing_bound_s
-    taken_s = stage.home().duration_s
-    return Check("homing", taken_s < bound_s / 1.5, f"{taken_s:.1f} s", f"< {bound_s / 1.5:.0f} s")
 
 
 def _limits(stage: Gantry) -> Check:
@@ -109,7 +88,6 @@ def _arrival(stage: Gantry) -> Check:
 
 
 def _report_rate(stage: Gantry) -> Check:
-    """Check that positions are reported often enough to follow a motion."""
     started_s = stage.clock.now_s()
     for _ in range(_REPORTS):
         stage.position()
@@ -123,7 +101,7 @@ def _repeatability(stage: Gantry) -> Check:
     try:
         watch.begin()
         for corner in _corners(stage):
-            watch.note(stage.move_to(*corner))
+            watch.unchecked.append(stage.move_to(*corner))
         drift = watch.check()
     except (PositionDrifted, DriftUnknown, PlanRefused) as failure:
         return Check("repeatability", False, str(failure), "no drift")

@@ -33,14 +33,9 @@ _MAX_TIMINGS, _MAX_BEGINNINGS = 5, 3
 
 
 class Drift(Struct, frozen=True):
-    """The distance of the carriages from their count when the stage was homed again.
+    """The distance of the carriages from their count when the stage was homed again, and the largest that passes.
 
-    Parameters
-    ----------
-    away_mm : tuple of float
-        Drift away from the switch: per axis, or one number for both if they home together.
-    limit_mm : float
-        Largest drift that passes.
+    It counts away from the switch: per axis, or one number for both if they home together.
     """
 
     away_mm: tuple[float, ...]
@@ -53,21 +48,18 @@ class Drift(Struct, frozen=True):
 
 
 class DriftWatch:
-    """Checks for drift, and records what was taken at positions that are not yet checked.
+    """Checks a connected stage for drift; drift up to `limit_mm` passes.
 
-    Parameters
+    Attributes
     ----------
-    stage : Gantry
-        A connected stage.
-    limit_mm : float
-        Largest drift that passes a check.
+    unchecked : list
+        Frames at positions that no check has judged since the stage was homed.
     """
 
     def __init__(self, stage: Gantry, *, limit_mm: float = 0.5) -> None:
         self._stage = stage
         self._limit_mm = limit_mm
-        self._unchecked: list[object] = []
-        self._doubtful: list[object] = []
+        self.unchecked: list[object] = []
         self._home = Point(math.nan, math.nan)
         self._taken_s: dict[AxisIndex | None, float] = {}
         self._speed_mm_per_s: dict[AxisIndex | None, float] = {}
@@ -77,24 +69,10 @@ class DriftWatch:
         """Return whether there is a reference, so that drift can be checked."""
         return set(self._speed_mm_per_s) == set(self._homing_axes())
 
-    @property
-    def unchecked(self) -> tuple[object, ...]:
-        """Frames recorded since the last passed check, which the next check judges."""
-        return tuple(self._unchecked)
-
-    @property
-    def doubtful(self) -> tuple[object, ...]:
-        """Frames recorded before a failed check, or not checked before the stage was homed again."""
-        return tuple(self._doubtful)
-
-    def note(self, what: object) -> None:
-        """Record that `what` (a node, a frame) was taken at a position not yet checked."""
-        self._unchecked.append(what)
-
     def begin(self) -> None:
         """Home, and measure how long homing takes from known distances; call again whenever the stage was homed.
 
-        Homing resets the count: what was recorded before and not checked can no longer be checked and is doubtful.
+        Homing resets the count: frames that were recorded before and not checked can no longer be checked.
 
         Raises
         ------
@@ -103,14 +81,17 @@ class DriftWatch:
         PositionDrifted, DriftUnknown
             Homing does not take the same time twice.
         """
-        self._mark_doubtful()
+        self.unchecked.clear()
         self._speed_mm_per_s.clear()
         self._home = self._stage.home().position.point
         if self._stage.identify().homes_together:
             self._require_switches_within_reach()
         for attempts_left in reversed(range(_MAX_BEGINNINGS)):
             try:
-                self._measure()
+                for axis in self._homing_axes():
+                    near_s = self._time_homing_undelayed(axis, 0.5 * _RUN_UP_MM)
+                    self._taken_s[axis] = self._time_homing_undelayed(axis, _RUN_UP_MM)
+                    self._speed_mm_per_s[axis] = self._homing_speed(self._taken_s[axis] - near_s)
                 self.check()  # a disturbance during the timing would falsify every later check
             except (PositionDrifted, DriftUnknown, PlanRefused) as failure:
                 # What a device failed at has to be seen to; a delay passes
@@ -120,23 +101,15 @@ class DriftWatch:
             else:
                 return
 
-    def _measure(self) -> None:
-        """Measure time and speed of homing."""
-        for axis in self._homing_axes():
-            near_s = self._time_homing_well(axis, 0.5 * _RUN_UP_MM)
-            far_s = self._time_homing_well(axis, _RUN_UP_MM)
-            self._taken_s[axis] = far_s
-            self._speed_mm_per_s[axis] = self._homing_speed(far_s - near_s)
-
     def check(self) -> Drift:
-        """Home again: what was recorded is confirmed if this returns, and doubtful if it raises.
+        """Home again: the unchecked frames are confirmed if this returns, and suspect if it raises.
 
         Raises
         ------
         PositionDrifted
-            With what is suspect; the stage may need `recover` and `home`.
+            There is drift; the stage may need `recover` and `home`.
         DriftUnknown
-            Answers were delayed, so that there may be drift or none; with what is suspect.
+            Answers were delayed, so that there may be drift or none.
         PlanRefused
             There is nothing to compare with, because `begin` did not succeed.
         """
@@ -147,14 +120,15 @@ class DriftWatch:
                 self._require_open_switches()
             most, least = self._measure_drift()
             passed = most.passed and least.passed
-            delayed = not passed and (most != least or not self._takes_the_usual_time())
+            # Homing takes the usual time now that the count is right again, unless answers are delayed
+            delayed = not passed and (most != least or not all(drift.passed for drift in self._measure_drift()))
         except PositionDrifted:
             raise
         except StageError as failure:
             raise self._drift_failure(f"the check ended in: {failure}") from failure
         worst = max(most.away_mm, key=abs)
         if delayed:
-            suspect = self._mark_doubtful()
+            suspect = self._take_unchecked()
             raise DriftUnknown(
                 f"homing seemed {worst:+.2f} mm off its scale, but answers were delayed; {len(suspect)} positions "
                 "since the last passed check are in doubt: take them again, and give this computer less to do",
@@ -162,7 +136,7 @@ class DriftWatch:
             )
         if not passed:
             raise self._drift_failure(f"{worst:+.2f} mm off its scale, more than {self._limit_mm:g} mm")
-        self._unchecked.clear()
+        self.unchecked.clear()
         return most
 
     def _measure_drift(self) -> tuple[Drift, Drift]:
@@ -173,10 +147,6 @@ class DriftWatch:
             most.append((time.taken_s - self._taken_s[axis]) * self._speed_mm_per_s[axis])
             least.append(most[-1] - time.late_s * self._speed_mm_per_s[axis])
         return Drift(tuple(most), self._limit_mm), Drift(tuple(least), self._limit_mm)
-
-    def _takes_the_usual_time(self) -> bool:
-        """Return whether homing takes the usual time, now that the count is right again."""
-        return all(drift.passed for drift in self._measure_drift())
 
     def _require_switches_within_reach(self) -> None:
         """Raise unless the stage can move to where a switch closes if its axis has drifted by the limit."""
@@ -194,16 +164,13 @@ class DriftWatch:
             )
 
     def _homing_axes(self) -> tuple[AxisIndex | None, ...]:
-        """Return the arguments of `home` that have to be timed."""
         return (None,) if self._stage.identify().homes_together else (0, 1)
 
     def _time_homing(self, axis: AxisIndex | None, distance_mm: float) -> AnswerTime:
-        """Return the time of homing from `distance_mm` away from where it ends."""
         self._stage.move_to(*self._inward_point(distance_mm))
         return self._stage.home(axis).time
 
-    def _time_homing_well(self, axis: AxisIndex | None, distance_mm: float) -> float:
-        """Return the time of homing whose end was read without delay."""
+    def _time_homing_undelayed(self, axis: AxisIndex | None, distance_mm: float) -> float:
         for _ in range(_MAX_TIMINGS):
             time = self._time_homing(axis, distance_mm)
             if time.late_s == 0.0:
@@ -232,10 +199,9 @@ class DriftWatch:
             raise self._drift_failure(f"the switch of {axes} is closed more than {self._limit_mm:g} mm early")
 
     def _homing_speed(self, difference_s: float) -> float:
-        """Return the homing speed from the time that half the run-up takes."""
         if difference_s <= 0.0:
             raise PlanRefused(
-                "homing takes no longer from farther away, so its time shows no drift; set check = false in [drift]"
+                "homing takes as long from nearer by, so its time shows no drift; set drift.check = false"
             )
         speed = 0.5 * _RUN_UP_MM / difference_s
         if speed * _JITTER_S > self._limit_mm:
@@ -245,15 +211,12 @@ class DriftWatch:
             )
         return speed
 
-    def _mark_doubtful(self) -> tuple[object, ...]:
-        """Mark what is unchecked as doubtful, and return it."""
-        doubtful, self._unchecked = self.unchecked, []
-        self._doubtful.extend(doubtful)
-        return doubtful
+    def _take_unchecked(self) -> tuple[object, ...]:
+        suspect, self.unchecked = tuple(self.unchecked), []
+        return suspect
 
     def _drift_failure(self, why: str) -> PositionDrifted:
-        """Return the exception with what is suspect, which becomes doubtful."""
-        suspect = self._mark_doubtful()
+        suspect = self._take_unchecked()
         return PositionDrifted(
             f"the stage has lost its scale: {why}; {len(suspect)} positions since the last passed check are suspect: "
             "look for an obstacle or too high an acceleration, home, and take them again",
@@ -264,15 +227,8 @@ class DriftWatch:
 def recover(stage: Gantry, may_home: Callable[[str], bool], watch: DriftWatch | None = None) -> None:
     """Make the stage usable again after a `StageError`.
 
-    Parameters
-    ----------
-    stage : Gantry
-        The stage that failed.
-    may_home : callable
-        Called with a question before the stage moves to its switches; homing needs the answer True.
-    watch : DriftWatch, optional
-        Begins again if the stage is homed, or if it could not begin; positions not yet checked for drift become
-        doubtful.
+    Homing needs the answer True of `may_home`, which is called with a question. The watch begins again if the stage is
+    homed, or if it could not begin.
 
     Raises
     ------

@@ -7,14 +7,16 @@ axes restores trust.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from faintfield.rig.clock import Clock
 from faintfield.rig.errors import NotHomed, OutsideTravel, PositionLost, StageError, StageLost
-from faintfield.rig.stages.motion import duration_s, one_sided_path, path_duration_s
+from faintfield.rig.stages.grbl.controller import GrblController
+from faintfield.rig.stages.marlin.controller import MarlinController
+from faintfield.rig.stages.motion import StageWorkspace, duration_s, one_sided_path, path_duration_s
 from faintfield.rig.stages.protocol import AxisIndex, Box, Controller, Homing, Identity, Point, Position, StageSettings
-from faintfield.rig.stages.workspace import StageWorkspace
+from faintfield.rig.stages.transport import LineTransport, Port, TrafficLog
 
 # Longest jog without homing, in mm: enough to see which way an axis moves, too short to do damage.
 _MAX_UNHOMED_JOG_MM = 10.0
@@ -28,12 +30,17 @@ class Gantry:
 
     Parameters
     ----------
-    controller : Controller
-        Driver of the firmware.
+    controller, clock : Controller, Clock
+        Driver of the firmware; clock of the rig.
     settings : StageSettings
         Feed, approach, keep-out boxes and, where the controller does not report it, the travel.
-    clock : Clock
-        Clock of the rig.
+
+    Attributes
+    ----------
+    trusted : bool
+        Whether reported positions can be trusted.
+    homings : int
+        Number of homings: positions before and after a homing may differ by what the switches do.
     """
 
     def __init__(self, controller: Controller, settings: StageSettings, clock: Clock) -> None:
@@ -41,19 +48,9 @@ class Gantry:
         self.settings = settings
         self._controller = controller
         self._identity: Identity | None = None
-        self._trusted = self._failed = False
+        self.trusted = self._failed = False
         self._here: Point | None = None
-        self._homings = 0
-
-    @property
-    def homings(self) -> int:
-        """Number of homings: positions before and after a homing may differ by what the switches do."""
-        return self._homings
-
-    @property
-    def trusted(self) -> bool:
-        """Return whether reported positions can be trusted."""
-        return self._trusted
+        self.homings = 0
 
     def connect(self) -> None:
         """Open the port, wait for the controller and read its settings, without moving.
@@ -87,7 +84,7 @@ class Gantry:
             return reported.intersection(configured)
         except ValueError as failure:
             raise OutsideTravel(
-                f"the configured travel {configured} lies outside the controller's {reported}; correct stage.travel_mm"
+                f"the travel {configured} lies outside the controller's {reported}; correct stage.travel_mm"
             ) from failure
 
     def workspace(self) -> StageWorkspace:
@@ -100,12 +97,7 @@ class Gantry:
         return min(self.identify().motion.rate_mm_per_s) if configured is None else configured / 60.0
 
     def home(self, axis: AxisIndex | None = None) -> Homing:
-        """Home the stage; positions are trusted once all axes have been homed together.
-
-        Parameters
-        ----------
-        axis : 0 or 1, optional
-            Home only this axis, if the controller can (see `Identity.homes_together`).
+        """Home the stage, or one axis if the controller can; positions are trusted once all axes were homed together.
 
         Raises
         ------
@@ -113,12 +105,12 @@ class Gantry:
             A switch was not found in time.
         """
         identity = self.identify()
-        was_trusted = self._trusted
+        was_trusted = self.trusted
         with self._stopping_on_error():
-            self._homings += 1
+            self.homings += 1
             time = self._controller.home(None if identity.homes_together else axis, identity.homing_bound_s)
             point = self._controller.read_position()
-        self._trusted, self._here = was_trusted or axis is None or identity.homes_together, point
+        self.trusted, self._here = was_trusted or axis is None or identity.homes_together, point
         return Homing(self._report(point), time)
 
     def move_to(self, x_mm: float, y_mm: float) -> Position:
@@ -145,29 +137,21 @@ class Gantry:
         return self._report(point)
 
     def jog(self, dx_mm: float, dy_mm: float, *, unlock: bool = False) -> Position:
-        """Move by a distance, homed or not: for bringing up hardware.
-
-        Parameters
-        ----------
-        dx_mm, dy_mm : float
-            Distances along the axes; together at most 10 mm while the stage is not homed.
-        unlock : bool
-            Clear the lock that the controller keeps until it is homed.
+        """Move by a distance, homed or not, to bring up hardware; `unlock` clears the lock of an unhomed controller.
 
         Raises
         ------
         OutsideTravel, KeepOutCrossed
-            The target is not allowed, or the stage is not homed and the distance too long; nothing moves.
+            The target is not allowed, or the stage is not homed and the distance exceeds 10 mm; nothing moves.
         """
         by, target = Point(dx_mm, dy_mm), None
-        if self._trusted:
+        if self.trusted:
             start = self._here or self.position().point
             target = Point(start.x_mm + dx_mm, start.y_mm + dy_mm)
             self.workspace().check_path((start, target))
         elif not math.hypot(*by) <= _MAX_UNHOMED_JOG_MM:
             raise OutsideTravel(
-                f"a jog by {by} is longer than {_MAX_UNHOMED_JOG_MM:g} mm and the stage is not homed; "
-                "jog less, or home first"
+                f"a jog by {by} without homing is longer than {_MAX_UNHOMED_JOG_MM:g} mm; jog less, or home first"
             )
         feed = self.feed_mm_per_s()
         predicted_s = duration_s(Point(0.0, 0.0), by, self.identify().motion, feed)
@@ -187,7 +171,7 @@ class Gantry:
         """
         with self._tracking_trust():
             point = self._controller.read_position()
-        self._here = point if self._trusted else None
+        self._here = point if self.trusted else None
         return self._report(point)
 
     def verify_at(self, x_mm: float, y_mm: float) -> Position:
@@ -213,7 +197,7 @@ class Gantry:
         """Stop at once; the position is kept if the controller decelerates without losing steps."""
         self._here = None
         with self._stopping_on_error():
-            self._trusted &= self._controller.stop()
+            self.trusted &= self._controller.stop()
 
     def recover(self) -> None:
         """Make the controller accept commands again after an error, without moving, and read its settings again.
@@ -225,7 +209,7 @@ class Gantry:
         """
         self._here = None
         with self._tracking_trust():
-            self._trusted &= self._controller.recover(self.settings.reconnect_s)
+            self.trusted &= self._controller.recover(self.settings.reconnect_s)
             self._identity = self._controller.identify()
         self._failed = False
 
@@ -243,8 +227,7 @@ class Gantry:
             self._controller.close()
 
     def _require_trust(self, target: Point) -> None:
-        """Raise `NotHomed` unless reported positions can be trusted."""
-        if not self._trusted:
+        if not self.trusted:
             raise NotHomed(f"the stage's position is not known, so it is not sent to {target}; home it first")
 
     def _checked(self, point: Point, target: Point) -> Point:
@@ -259,12 +242,10 @@ class Gantry:
         return point
 
     def _report(self, point: Point) -> Position:
-        """Return `point` with its tolerance and whether it can be trusted."""
-        return Position(point, self.identify().tolerance_mm, self._trusted)
+        return Position(point, self.identify().tolerance_mm, self.trusted)
 
     def _distrust(self) -> None:
-        """Forget the position of the stage."""
-        self._trusted, self._here = False, None
+        self.trusted, self._here = False, None
 
     @contextmanager
     def _tracking_trust(self) -> Iterator[None]:
@@ -273,7 +254,7 @@ class Gantry:
             yield
         except StageError as failure:
             self._here, self._failed = None, True
-            self._trusted &= failure.position_kept
+            self.trusted &= failure.position_kept
             raise
         except BaseException:
             self._distrust()
@@ -287,5 +268,15 @@ class Gantry:
             with self._tracking_trust():
                 yield
         except BaseException:
-            self._trusted &= self._controller.abort()
+            self.trusted &= self._controller.abort()
             raise
+
+
+def make_stage(
+    settings: StageSettings, clock: Clock, traffic: TrafficLog | None, open_port: Callable[[], Port]
+) -> Gantry:
+    """Return the GRBL or Marlin stage that `settings` describe, not yet connected; `open_port` opens its connection."""
+    line = LineTransport(open_port, clock, traffic)
+    if settings.protocol == "grbl":
+        return Gantry(GrblController(line, settings.axes), settings, clock)
+    return Gantry(MarlinController(line, settings.axes, settings.travel_mm), settings, clock)

@@ -1,10 +1,13 @@
-"""Predicts how long motions take, and plans paths that arrive from one side."""
+"""Paths of the stage: how long they take, arrival from one side, and checks against travel and keep-out boxes."""
 
 import math
 from collections.abc import Sequence
 from itertools import pairwise
 
-from faintfield.rig.stages.protocol import MotionLimits, Point
+from msgspec import Struct
+
+from faintfield.rig.errors import KeepOutCrossed, OutsideTravel
+from faintfield.rig.stages.protocol import Box, MotionLimits, Point
 
 
 def duration_s(start: Point, end: Point, motion: MotionLimits, feed_mm_per_s: float = math.inf) -> float:
@@ -61,3 +64,46 @@ def timeout_s(predicted_s: float) -> float:
 def _along(direction: Sequence[float], limits: tuple[float, float]) -> float:
     """Return the largest rate along `direction` that keeps each axis within its limit."""
     return min(limit / share for limit, share in zip(limits, direction, strict=True) if share > 0.0)
+
+
+# Tolerance in mm: positions computed from a pitch miss the edge that they should touch by rounding errors.
+_ROUNDING_MM = 1e-6
+
+
+class StageWorkspace(Struct, frozen=True):
+    """The travel of the stage, and boxes that it must neither enter nor cross."""
+
+    travel_mm: Box
+    keep_out: tuple[Box, ...] = ()
+
+    def check_path(self, path: Sequence[Point]) -> None:
+        """Raise if a path leaves the travel or meets a keep-out box on any of its straight segments.
+
+        Raises
+        ------
+        OutsideTravel, KeepOutCrossed
+            The message names the position or segment.
+        """
+        for point in path:
+            if not self.travel_mm.holds(point, _ROUNDING_MM):
+                raise OutsideTravel(f"position {point} is outside the travel {self.travel_mm}; move the grid's origin")
+        for start, end in pairwise(path):
+            for box in self.keep_out:
+                if segment_meets(box, start, end):
+                    raise KeepOutCrossed(f"the way from {start} to {end} meets the keep-out box {box}; go around it")
+
+
+def segment_meets(box: Box, start: Point, end: Point) -> bool:
+    """Return whether the straight line from `start` to `end` touches `box`.
+
+    The parameter of the segment is clipped against each pair of edges in turn (Liang and Barsky, 1984).
+    """
+    enter, leave = 0.0, 1.0
+    for a, b, (low, high) in zip(start, end, (box.x_mm, box.y_mm), strict=True):
+        if a == b:
+            if not low <= a <= high:
+                return False
+            continue
+        first, last = sorted(((low - a) / (b - a), (high - a) / (b - a)))
+        enter, leave = max(enter, first), min(leave, last)
+    return enter <= leave

@@ -246,9 +246,7 @@ class StageSettings(Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"stage.options are not for protocol = {self.protocol!r}; remove them")
         firmware = self.port.removeprefix(SIMULATED).partition(":")[0]
         if self.simulated and self.protocol in SERIAL_PROTOCOLS and firmware and not firmware.startswith(self.protocol):
-            raise ValueError(
-                f"stage.port = {self.port!r} is not of protocol = {self.protocol!r}; set stage.protocol to 'simulated'"
-            )
+            raise ValueError(f"stage.port = {self.port!r} is not {self.protocol!r}; set stage.protocol to 'simulated'")
         scheme, of_url, _ = self.port.partition("://")
         if of_url and scheme not in _URL_SCHEMES:
             raise ValueError(

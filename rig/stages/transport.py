@@ -51,13 +51,6 @@ class Port(Protocol):
 class SerialPort:
     """A serial port, or another connection that pyserial has a URL for (`socket://host:port`).
 
-    Parameters
-    ----------
-    url : str
-        Device or pyserial URL.
-    baud : int
-        Bits per second.
-
     Raises
     ------
     StageLost
@@ -99,13 +92,11 @@ class SerialPort:
 
     @contextmanager
     def _reported_as_lost(self) -> Iterator[None]:
-        """Raise `StageLost` for what pyserial raises on a lost connection."""
         try:
             yield
         except (OSError, TypeError) as failure:  # pyserial's own is an OSError; a closed port raises a TypeError
             raise StageLost(
-                f"{self._url}: the connection is lost ({in_one_line(failure)}); "
-                "check cable and power; the stage must be homed again"
+                f"{self._url}: the connection is lost ({in_one_line(failure)}); check cable and power, then home it"
             ) from failure
 
 
@@ -116,10 +107,8 @@ class LineTransport:
     ----------
     open_port : callable
         Opens the connection; called at each `open`.
-    clock : Clock
-        Clock of the time limits.
-    traffic : TrafficLog, optional
-        Log of every byte sent and received.
+    clock, traffic : Clock, TrafficLog or None
+        Clock of the time limits; log of every byte sent and received.
     """
 
     def __init__(self, open_port: Callable[[], Port], clock: Clock, traffic: TrafficLog | None = None) -> None:
@@ -204,7 +193,6 @@ class LineTransport:
             yield line
 
     def _log(self, direction: Direction, data: bytes) -> None:
-        """Record `data`, if there is a log."""
         if self._traffic is not None:
             self._traffic.record(self.clock.now_s(), direction, data)
 

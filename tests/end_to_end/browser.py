@@ -1,13 +1,15 @@
-"""Control a real Chromium by its DevTools protocol over a pipe."""
+"""Control a real Chromium by its DevTools protocol over a pipe, and make requests without it."""
 
 import base64
+import http.client
 import json
 import os
 import shutil
 import subprocess
 import sys
+import urllib.parse
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -173,3 +175,11 @@ def open_browser(folder: Path) -> Iterator[Tab]:
         browser.wait()
         os.close(send)
         os.close(receive)
+
+
+def answer_to(address: str, method: str = "GET", body: bytes | None = None, **headers: str) -> http.client.HTTPResponse:
+    """Return the answer to a request with these headers, for an address that is sent as it is written."""
+    host = urllib.parse.urlsplit(address).netloc
+    with closing(http.client.HTTPConnection(host)) as connection:
+        connection.request(method, address.removeprefix(f"http://{host}"), body, headers)
+        return connection.getresponse()

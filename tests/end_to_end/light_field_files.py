@@ -98,12 +98,12 @@ def _floats(folder: Path, pictures: dict[str, NDArray[np.float32]]) -> None:
 
 def _pages(folder: Path, pictures: dict[str, NDArray[np.float32]]) -> None:
     tifffile.imwrite(
-        folder / "views.tif", np.stack([_sixteen(it) for it in pictures.values()]), photometric="minisblack"
+        folder / "views.tif", np.stack([_sixteen(view) for view in pictures.values()]), photometric="minisblack"
     )
 
 
 def _mosaic(folder: Path, pictures: dict[str, NDArray[np.float32]]) -> None:
-    views = [_sixteen(it) for it in pictures.values()]
+    views = [_sixteen(view) for view in pictures.values()]
     lines = [np.hstack(views[first : first + COLUMNS]) for first in range(0, len(views), COLUMNS)]
     assert cv2.imwrite(str(folder / "views.png"), np.vstack(lines))
 
@@ -140,7 +140,7 @@ class Variant:
     """One way in which the scene comes.
 
     `aligned_px`: by how much each point moves more from node to node. `square`: 7 x 7 views in place of 5 x 7.
-    `change`: what is done to the pictures before they get names. `options`, `beside`: of the command; further files.
+    `change`: what is done to the pictures before they get names. `options`, `sidecars`: of the command; further files.
     `kept`: whether a node is in the set. `ratio`: pitch along columns over that along rows. `words`: what is printed.
     """
 
@@ -150,7 +150,7 @@ class Variant:
     change: Callable[[Views], Views] | None = None
     write: Writer = png16
     options: tuple[str, ...] = ()
-    beside: dict[str, str] = field(default_factory=dict)
+    sidecars: dict[str, str] = field(default_factory=dict)
     kept: Callable[[int, int], bool] = lambda row, column: True
     ratio: float = 1.0
     words: str = ""
@@ -163,7 +163,7 @@ class Variant:
             views = self.change(views)
         size = (7 if self.square else ROWS), COLUMNS
         self.write(folder, {self.names.stem(node, size): view for node, view in views.items()})
-        for name, text in self.beside.items():
+        for name, text in self.sidecars.items():
             (folder / name).write_text(text)
         files = list(folder.iterdir())
         return files[0] if len(files) == 1 else folder

@@ -67,7 +67,7 @@ def _serpentine(line: int, place: int) -> str:
 TURNS = {
     " ".join(words): Names(transpose="transposed" in words, flip_rows="rows" in words, flip_columns="columns" in words)
     for flags in product((False, True), repeat=3)
-    if (words := [it for it, on in zip(("transposed", "rows", "columns"), flags, strict=True) if on])
+    if (words := [word for word, flag in zip(("transposed", "rows", "columns"), flags, strict=True) if flag])
 }
 
 _HCI_NAMES = running(COLUMNS, 0, "input_Cam{:03}")
@@ -88,7 +88,7 @@ CORPUS: dict[str, Variant] = {
     "positions only": Variant(Names(positions_only), aligned_px=MIDDLE_PX),
     **{
         f"HCI, both reversed: {both}": Variant(
-            Names(_HCI_NAMES, flip_rows=both, flip_columns=both), aligned_px=MIDDLE_PX, beside={"parameters.cfg": HCI}
+            Names(_HCI_NAMES, flip_rows=both, flip_columns=both), aligned_px=MIDDLE_PX, sidecars={"parameters.cfg": HCI}
         )
         for both in (False, True)
     },

@@ -14,6 +14,7 @@ from faintfield.rig.session.journal import Journal
 from faintfield.rig.session.session import taken_frames
 from faintfield.rig.simulation.lab import SimulatedLab
 from tests.end_to_end.rigs import write_small_rig
+from tests.faults.capturing import events
 
 # Kind and frames of each step of the rig.toml that `init` writes, on a grid of 2 x 2, with a frame for each exposure.
 STEPS = [*[("charuco", 4)] * 6, ("bright", 4), ("dark_scene", 4), ("noise_reference", 4), ("dark", 4), ("flat", 2)]
@@ -81,7 +82,7 @@ def test_whole_experiment_unattended(whole: Path, shell: Shell) -> None:
     assert [frame.stop.node for frame in frames[:4]] == [(0, 0), (0, 1), (1, 1), (1, 0)]
     assert {frame.exposure_s for frame in frames if frame.kind == "dark"} == {0.05, 0.1, 0.5, 1.0}
     with Journal(whole / "journal.sqlite", read_only=True) as journal:
-        assert [it.frame for it in journal.committed()] == list(range(FRAMES))
+        assert [committed.frame for committed in journal.committed()] == list(range(FRAMES))
         assert not journal.uncommitted()
         assert len(journal.events("drift_check")) == 9
         assert len(journal.events("settling")) == 1
@@ -103,12 +104,12 @@ def test_check_moves_nothing_and_counts_frames(shell: Shell) -> None:
         mock.patch("faintfield.rig.stages.gantry.Gantry.move_to") as move,
         mock.patch("faintfield.rig.stages.gantry.Gantry.home") as home,
     ):
-        found = shell.result("check", shell.rig)
+        result = shell.result("check", shell.rig)
         assert not move.called
         assert not home.called
-    assert found["frames"] == 501
-    assert found["disk_bytes"] == 501 * (2 * 64 * 48 + 512)
-    assert 300.0 < found["duration_s"] < 1000.0
+    assert result["frames"] == 501
+    assert result["disk_bytes"] == 501 * (2 * 64 * 48 + 512)
+    assert 300.0 < result["duration_s"] < 1000.0
     assert "501 frames in 11 steps" in shell.words
 
 
@@ -218,8 +219,7 @@ def test_check_compares_rig_with_session(small: Shell) -> None:
     assert "PlanRefused: the rig.toml differs" in small.words
     assert small.run("capture", small.rig, small.session, "--yes") == 1
     assert "PlanRefused: the rig.toml differs from the plan.json of the session: grid.pitch_mm was 50.0" in small.words
-    with Journal(small.session / "journal.sqlite", read_only=True) as journal:
-        assert journal.events("setting_changed") == []
+    assert events(small.session, "setting_changed") == []
     small.edit("pitch_mm = 40.0", "pitch_mm = 50.0")
     assert small.run("capture", small.rig, small.session, "--yes") == 0
     assert f"{changed[0]}, from now on" in small.words

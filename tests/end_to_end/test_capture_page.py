@@ -1,14 +1,13 @@
 """The page of a capture, in a real headless browser: what the terminal can do it can do, and the two agree."""
 
 import errno
-import http.client
 import re
 import socket
 import threading
 import time
 import urllib.parse
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from unittest import mock
 
@@ -22,18 +21,12 @@ from faintfield.pipelines.live.capture_page import serve_page
 from faintfield.pipelines.live.panel import CapturePanel, OpenPrompt, ShownFrame
 from faintfield.pipelines.live.terminal import TerminalView
 from faintfield.rig.capture.guide import Prompt, Status
-from faintfield.rig.capture.loop import Capture
-from faintfield.rig.capture.survey import survey
-from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import CameraError, CaptureStopped, RigError
 from faintfield.rig.plan import planned_frames
-from faintfield.rig.session.journal import Journal
-from faintfield.rig.session.resume import open_session
-from faintfield.rig.session.session import FrozenPlan
 from faintfield.rig.session.verify import verify
-from tests.end_to_end.browser import Tab
+from tests.end_to_end.browser import Tab, answer_to
 from tests.end_to_end.rigs import write_small_rig
-from tests.faults.capturing import FRAMES, SMALL_RIG
+from tests.faults.capturing import FRAMES, SMALL_RIG, capture, events, frozen_plan
 from tests.patience import HANG_S
 
 STOP = b'{"word": "stop"}'
@@ -66,12 +59,8 @@ class Running:
         return self.failure
 
     def _capture(self) -> None:
-        plan = FrozenPlan(survey(open_rig(SMALL_RIG), SMALL_RIG).plan, SMALL_RIG)
-        try:
-            with open_session(self.folder, plan) as session, TerminalView(self.panel).show():
-                Capture(session, open_rig(SMALL_RIG, session.journal), self.panel, lambda path: None).run()
-        except RigError as failure:
-            self.failure = failure
+        with TerminalView(self.panel).show():
+            self.failure = capture(self.folder, self.panel)
 
 
 @pytest.fixture
@@ -126,8 +115,7 @@ def test_terminal_and_page_agree(running: Running, browser: Tab, capsys: pytest.
     words = capsys.readouterr().err
     assert "Step 1 of 3: Bright set" in words
     assert "[g] go on   [s] skip   [q] stop   (Enter: go on)" in words
-    with Journal(running.folder / "journal.sqlite", read_only=True) as journal:
-        assert [event.detail["answer"] for event in journal.events("prompt")] == ["go", "skip", "stop"]
+    assert [event.detail["answer"] for event in events(running.folder, "prompt")] == ["go", "skip", "stop"]
 
 
 def test_no_name_becomes_part_of_page(browser: Tab) -> None:
@@ -135,7 +123,7 @@ def test_no_name_becomes_part_of_page(browser: Tab) -> None:
     panel = CapturePanel(unattended=False)
     panel.asked = OpenPrompt(1, Prompt(hostile, hostile, (hostile,), ("go",), "go"))
     panel.status = Status(hostile, 1, 1, hostile, 0, 1, 1.0, (0, 0), ((0.0,),), (hostile, hostile + "\udcff"))
-    frame = planned_frames(survey(open_rig(SMALL_RIG), SMALL_RIG).plan)[0]
+    frame = planned_frames(frozen_plan(SMALL_RIG).plan)[0]
     panel.shown = ShownFrame(frame, np.zeros((2, 3), np.uint16), {hostile: 1.0})
     with serve_page(panel) as address:
         browser.open(address)
@@ -143,14 +131,6 @@ def test_no_name_becomes_part_of_page(browser: Tab) -> None:
         assert browser.text().count("<script>") == 5
         assert browser.evaluate("document.title") == "faintfield capture"
         assert browser.evaluate("document.querySelectorAll('script').length") == 1
-
-
-def answer_to(address: str, method: str = "GET", body: bytes | None = None, **headers: str) -> http.client.HTTPResponse:
-    """Return the answer to a request with these headers."""
-    parts = urllib.parse.urlsplit(address)
-    with closing(http.client.HTTPConnection(parts.netloc)) as connection:
-        connection.request(method, parts.path, body, headers)
-        return connection.getresponse()
 
 
 def test_strangers_learn_nothing_and_press_nothing() -> None:
@@ -173,7 +153,7 @@ def test_strangers_learn_nothing_and_press_nothing() -> None:
         ]
         assert answer_to(address).status == answer_to(address + "state").status == 200
     assert [answer.status for answer in answers] == [404] * len(answers)
-    (headers,) = {tuple((name, value) for name, value in it.getheaders() if name != "date") for it in answers}
+    (headers,) = {tuple((name, value) for name, value in answer.getheaders() if name != "date") for answer in answers}
     names = {name for name, _ in headers}
     assert "server" not in names
     assert {"referrer-policy", "cache-control", "connection"} <= names

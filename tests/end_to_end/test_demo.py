@@ -1,6 +1,5 @@
 """`faintfield demo`: small from capture to report; in deep the accuracy of `--quick` and of full size."""
 
-import importlib
 import json
 import os
 import re
@@ -18,7 +17,7 @@ from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import encoded
 from faintfield.pipelines.formats.results.records import JOINT_METHODS, Method
 from faintfield.pipelines.paper import demo as paper
-from faintfield.pipelines.reconstruction import request
+from faintfield.pipelines.workflows import demo as workflow
 
 METHODS = [method for method in get_args(Method.__value__) if method not in JOINT_METHODS]
 DEPTHS_MM = (500.0, 700.0)
@@ -64,9 +63,9 @@ def test_small_demo_from_capture_to_report(
 ) -> None:
     """Nine nodes, and two methods that are fast."""
     methods = ["backprojection", "pmlem-osl"]
-    monkeypatch.setattr(paper, "QUICK", paper.DemoSize(3, 100.0, (288, 216), 3))
-    monkeypatch.setattr(importlib.import_module("faintfield.pipelines.commands.demo"), "_METHODS", methods)
-    monkeypatch.setattr(request, "DEFAULT_METHOD", "pmlem-osl")
+    monkeypatch.setattr(workflow, "QUICK", paper.DemoSize(3, 100.0, (288, 216), 3))
+    monkeypatch.setattr(workflow, "_METHODS", methods)
+    monkeypatch.setattr(workflow, "DEFAULT_METHOD", "pmlem-osl")
     monkeypatch.setattr(Figure, "savefig", _save_nothing)  # text takes most of the time of a page
     out = tmp_path / "demo"
     assert run(["demo", str(out), "--quick", "--json"]) == 0
@@ -121,8 +120,8 @@ def test_demo_is_as_accurate_as_promised(size: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.deep
-@pytest.mark.parametrize(("prior", "beside"), [("tv", 110e6), ("auto", 210e6)])
-def test_memory_of_reconstruction_is_bounded_by_images(prior: str, beside: float, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("prior", "more_bytes"), [("tv", 110e6), ("auto", 210e6)])
+def test_memory_of_reconstruction_is_bounded_by_images(prior: str, more_bytes: float, tmp_path: Path) -> None:
     """At most 1.5 times the images as float32 and 200 MB, 100 more by a prior, with the kernels compiled already."""
     simulated = _run("simulate", str(tmp_path / "scene"))
     assert simulated.returncode == 0, simulated.stderr
@@ -138,7 +137,7 @@ def test_memory_of_reconstruction_is_bounded_by_images(prior: str, beside: float
     said = subprocess.run(command, capture_output=True, text=True, check=True, cwd=_ROOT).stdout
     peak_kb, files_kb = (int(word) for word in said.split()[-2:])
     images_bytes = 49 * 480 * 640 * 4
-    assert (peak_kb - files_kb) * 1024 <= 1.5 * images_bytes + beside
+    assert (peak_kb - files_kb) * 1024 <= 1.5 * images_bytes + more_bytes
 
 
 def test_foreign_folder_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -111,13 +111,13 @@ def captured(folder: Path, changes: dict[str, Any]) -> Path:
 def check_session(session: Path, sent: dict[int, Exposure], fx_px: float, depth_mm: float) -> None:
     """Check that the session is whole, holds what the camera sent, and can be reconstructed with its noise.json."""
     assert (session / "SHA256SUMS").is_file()
-    taken: list[CommittedFrame] = []
+    frames: list[CommittedFrame] = []
     for frame, committed, path in taken_frames(session):
         np.testing.assert_array_equal(tifffile.imread(path), sent[committed.intent].pixels)
         assert committed.record.position_mm == pytest.approx(frame.stop.target, abs=0.01)
-        taken.append(committed)
-    assert len(taken) == FRAMES
-    pixels = sent[taken[0].intent].pixels
+        frames.append(committed)
+    assert len(frames) == FRAMES
+    pixels = sent[frames[0].intent].pixels
     assert pixels is not None
     height, width = pixels.shape
     lens = LensRecord("pinhole", fx_px, fx_px, width / 2, height / 2, ())
@@ -154,12 +154,12 @@ def test_genicam_camera_on_simulated_grbl_stage(tmp_path: Path, monkeypatch: pyt
     frame_ids = [int(str(exposure.metadata["frame_id"])) for _, exposure in sorted(sent.items())]
     assert all(after in (before + 1, frame_ids[0]) for before, after in pairwise(frame_ids)), frame_ids
     _, noise = load_noise_set(session)  # its ramp has no noise that could be measured
-    assert [(it.kind, it.exposure_s) for it in noise.frame] == [
+    assert [(frame.kind, frame.exposure_s) for frame in noise.frame] == [
         *[("dark", exposure_s) for exposure_s in (0.0012, 0.0013) for _ in range(8)],
         *[("flat", exposure_s) for exposure_s in (0.005, 0.009) for _ in range(4)],
     ]
-    told = {"offset_dn": 0.0, "gain_dn_per_e": 1.0, "read_noise_e": 2.0, "dark_current_e_per_s": 0.0}
-    write_by_hand(session / "noise.json", {name: {"value": value} for name, value in told.items()})
+    values = {"offset_dn": 0.0, "gain_dn_per_e": 1.0, "read_noise_e": 2.0, "dark_current_e_per_s": 0.0}
+    write_by_hand(session / "noise.json", {name: {"value": value} for name, value in values.items()})
     check_session(session, sent, fx_px=300.0, depth_mm=500.0)
 
 
@@ -169,8 +169,10 @@ def test_micromanager_camera_on_its_stage(tmp_path: Path, monkeypatch: pytest.Mo
     adapters = pytest.importorskip("mm_test_adapters", reason=why).device_adapter_path()
     sent = record_exposures(monkeypatch, MicroManagerCamera)
     monkeypatch.setattr(guided, "open_rig", rig_with_a_lamp)
-    filled = {key: it.format(adapters=adapters) if isinstance(it, str) else it for key, it in MICROMANAGER.items()}
-    session = captured(tmp_path, filled)
+    changes = {
+        key: text.format(adapters=adapters) if isinstance(text, str) else text for key, text in MICROMANAGER.items()
+    }
+    session = captured(tmp_path, changes)
     faintfield("noise", session)
     check_session(session, sent, fx_px=100.0, depth_mm=50.0)
     noise = json.loads((session / "noise.json").read_text())

@@ -72,7 +72,7 @@ def _assert_range(elemental_set: ElementalSet, variant: Variant) -> None:
     depths = [elemental_set.depth_of_disparity(disparity_px) for disparity_px in moved_px]
     assert 0 < depths[0] < depths[1] < depths[2]
     if elemental_set.settings.units.depth == "mm":
-        assert variant.beside
+        assert variant.sidecars
         assert depths[1] == pytest.approx(HCI_FX_PX * HCI_PITCH_MM / 2.0, rel=1e-6)
 
 
@@ -115,7 +115,7 @@ def _in_focus_px(elemental_set: ElementalSet, best: dict[str, Any]) -> NDArray[n
     """Return the disparities of planes of best focus, which are stated in the unit of the set."""
     if "disparity_px" in best:
         return np.array(best["disparity_px"])
-    return np.array([elemental_set.disparity_of_depth(it) for it in best["depth_mm"]])
+    return np.array([elemental_set.disparity_of_depth(depth_mm) for depth_mm in best["depth_mm"]])
 
 
 @pytest.mark.parametrize("name", WITH_PLANES)
@@ -127,9 +127,9 @@ def test_planes_of_best_focus_lie_at_cards(name: str, tmp_path: Path) -> None:
     assert run(["reconstruct", str(tmp_path / "set"), "--out", str(tmp_path / "planes"), *asked]) == 0
     elemental_set = load_set(tmp_path / "set")
     record = json.loads((tmp_path / "planes" / "reconstruction.json").read_text())
-    found_px = _in_focus_px(elemental_set, record["best_focus"]) / max(variant.ratio, 1.0) - variant.aligned_px
+    focus_px = _in_focus_px(elemental_set, record["best_focus"]) / max(variant.ratio, 1.0) - variant.aligned_px
     true_px = np.array([card.disparity_px for card in CARDS])
-    away_px = np.abs(found_px[:, np.newaxis] - true_px)
+    away_px = np.abs(focus_px[:, np.newaxis] - true_px)
     assert away_px.min(axis=1).max() < 0.3
     # The wall, and the first two of the cards; others, close to one another, may share a plane
     assert away_px.min(axis=0)[:3].max() < 0.3

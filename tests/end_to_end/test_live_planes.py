@@ -1,6 +1,5 @@
 """Live planes beside a simulated capture: in a real browser, and when their process dies or hangs."""
 
-import http.client
 import json
 import os
 import signal
@@ -10,13 +9,14 @@ import threading
 import time
 import urllib.parse
 from collections.abc import Callable
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from multiprocessing import Pipe
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tifffile
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from faintfield.pipelines import cli
@@ -28,17 +28,16 @@ from faintfield.pipelines.live.planes_client import PlanesClient, live_planes
 from faintfield.pipelines.live.planes_messages import LiveOrder, LiveStatus
 from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.capture.loop import Capture
-from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import open_rig
 from faintfield.rig.plan import Grid
 from faintfield.rig.session.resume import open_session
-from faintfield.rig.session.session import FrozenPlan
 from faintfield.rig.session.verify import verify
-from faintfield.rig.settings import DriftSettings, RigSettings, SettleSettings, StepSettings
+from faintfield.rig.settings import RigSettings, StepSettings
 from faintfield.rig.simulation.lab import lab_experiment
-from faintfield.rig.stages.protocol import Point, StageSettings
-from tests.end_to_end.browser import Tab
+from faintfield.rig.stages.protocol import Point
+from tests.end_to_end.browser import Tab, answer_to
 from tests.end_to_end.rigs import write_geometry, write_small_rig
+from tests.faults.capturing import SMALL_RIG, capture_small, frozen_plan
 from tests.patience import HANG_S
 
 _CAMERA = SimulatedSettings(size_px=(96, 72), unlit_photons_per_s=30.0)
@@ -51,14 +50,8 @@ _POLL_S = 0.02
 
 def rig(nodes: int) -> RigSettings:
     """Return a simulated rig that takes the dark scene alone."""
-    return RigSettings(
-        stage=StageSettings("simulated"),
-        camera=_CAMERA,
-        grid=Grid(nodes, nodes, 140.0 / nodes, Point(-350.0, -350.0)),
-        step=(StepSettings("dark_scene", 0.1),),
-        settle=SettleSettings(measure=False),
-        drift=DriftSettings(check=False),
-    )
+    grid = Grid(nodes, nodes, 140.0 / nodes, Point(-350.0, -350.0))
+    return replace(SMALL_RIG, camera=_CAMERA, grid=grid, step=(StepSettings("dark_scene", 0.1),))
 
 
 def write_calibrations(folder: Path, settings: RigSettings) -> None:
@@ -90,12 +83,11 @@ class Running:
         self._begin = threading.Event()
 
     def __enter__(self) -> "Running":
-        plan = FrozenPlan(survey(open_rig(self.settings), self.settings).plan, self.settings)
         begun, opened = threading.Event(), []
 
         # The journal belongs to the thread that opens it
         def capture() -> None:
-            with open_session(self.folder, plan) as session:
+            with open_session(self.folder, frozen_plan(self.settings)) as session:
                 opened.append(session)
                 begun.set()
                 self._begin.wait()
@@ -220,11 +212,7 @@ def wait_for(client: PlanesClient, holds: Callable[[LiveStatus], bool]) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=pytest.mark.deep)])
 def test_end_of_live_planes_leaves_session_alone(tmp_path: Path, number: signal.Signals) -> None:
-    settings = rig(2)
-    plan = FrozenPlan(survey(open_rig(settings), settings).plan, settings)
-    with open_session(tmp_path / "without", plan) as session:
-        panel = CapturePanel(unattended=True)
-        Capture(session, open_rig(settings, session.journal), panel, read_pixels).run()
+    capture_small(tmp_path / "without", rig(2), decode=read_pixels)
     with Running(tmp_path, 2) as running:
         running.take(2)
         wait_for(running.client, lambda status: status.frames == 2 and "mean" in status.planes[0].pictures)
@@ -243,22 +231,16 @@ def test_end_of_live_planes_leaves_session_alone(tmp_path: Path, number: signal.
 
 def check_access(address: str) -> None:
     """Check that the page gives pictures and nodes, and no other file, to those who know its token only."""
-
-    def status(name: str, root: str = address) -> int:
-        parts = urllib.parse.urlsplit(root)
-        with closing(http.client.HTTPConnection(parts.netloc)) as connection:
-            connection.request("GET", f"{parts.path}{name}")  # sent as it is written
-            return connection.getresponse().status
-
     for name in ("planes/plane_000_mean.png?1", "planes/node_r0_c0.png", "node/0/0"):
-        assert status(name) == 200, name
+        assert answer_to(address + name).status == 200, name
     for name in (
         *("planes/status.json", "planes/", "planes/../state", "node/-1/0", "node/0/x", "planes/plane_999_mean.png"),
         *("planes/plane_000_mean.png%0a", "planes/..%2f..%2fetc%2fpasswd", "planes/%2e%2e/plane_000_mean.png"),
     ):
-        assert status(name) == 404, name
+        assert answer_to(address + name).status == 404, name
     token = urllib.parse.urlsplit(address).path
-    assert status("planes/plane_000_mean.png", address.replace(token, "/" + "x" * (len(token) - 2) + "/")) == 404
+    elsewhere = address.replace(token, "/" + "x" * (len(token) - 2) + "/")
+    assert answer_to(elsewhere + "planes/plane_000_mean.png").status == 404
 
 
 @pytest.mark.deep

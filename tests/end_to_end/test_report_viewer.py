@@ -280,11 +280,7 @@ def _page_of(numbers: NDArray[np.float32], folder: Path) -> str:
     packed = pack(numbers, 1e-3)
     picture: dict[str, Any] = {"kind": "light", "title": "PMLEM", "words": "500 mm", "place": 0, "unit": "e⁻ per pixel"}
     picture |= {"low": packed.low, "step": packed.step, "bins": 1, "pitch": 0.5, "origin": (-10.0, 20.0)}
-    shown: dict[str, Any] = {
-        "pictures": [{**picture, "src": smaller_uri(packed.png)}],
-        "places": ["500 mm"],
-        "quantity": "depth",
-    }
+    shown: dict[str, Any] = {"pictures": [{**picture, "src": smaller_uri(packed.png)}], "places": ["500 mm"]}
     shown |= {"scales": {"light": {"black": 0.0, "white": 2.0, "name": "planes"}}}
     shown |= {"quantity": "depth", "length": "mm", "binned": False, "first": (0, 0)}
     templates = Path(pages.__path__[0]) / "templates"

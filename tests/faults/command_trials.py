@@ -102,7 +102,7 @@ def _frames(present: dict[str, bytes]) -> set[str]:
 
 
 class Bench:
-    """Where commands are tried: each finds its own inputs, untouched, at the same place every time."""
+    """Folders in which commands are tried: each finds its own untouched inputs at the same place every time."""
 
     def __init__(self, folder: Path, process: ProcessPoolExecutor) -> None:
         self._inputs, self._trials, self._process = folder / "inputs", folder / "trials", process

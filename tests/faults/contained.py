@@ -51,7 +51,7 @@ type State = Mapping[str, tuple[object, ...]]
 
 @dataclass(frozen=True)
 class Ended:
-    """How a child ended: its exit code, of a signal negative, what it printed, and if it left no process behind."""
+    """End of a child: its exit code, negative for a signal, its output, and whether it left no process behind."""
 
     code: int
     out: str

@@ -55,7 +55,7 @@ class Fault:
 
 
 class Outcome(NamedTuple):
-    """How a command ended, how often the fault struck, and a file changed outside the folder."""
+    """End of a command, number of times that the fault struck, and a file changed outside the folder."""
 
     ended: Ended
     injected: int
@@ -64,13 +64,14 @@ class Outcome(NamedTuple):
 
 # What takes long and touches no file. A trial takes its result from the commands that were run first, as long as the
 # arguments are the same to the byte.
-_CALIBRATION, _PAGES = "faintfield.pipelines.calibration", "faintfield.pipelines.pages"
+_CALIBRATION, _WORKFLOWS = "faintfield.pipelines.calibration", "faintfield.pipelines.workflows"
 _COMPUTATIONS = (
     "faintfield.calib.detection.detect_boards",
     "faintfield.rig.simulation.lab.lab_experiment",
     *(f"{_CALIBRATION}.geometry.{name}" for name in ("calibrate_geometry", "stage_report", "transfer_sigma_at")),
-    *(f"{_CALIBRATION}.noise.calibrate", f"{_PAGES}.emva_page.emva_page", f"{_PAGES}.noise_page.draw_page"),
-    *(f"{_PAGES}.geometry_page.{name}" for name in ("geometry_page", "node_drawing", "sigma_maps")),
+    *(f"{_CALIBRATION}.noise.calibrate", f"{_WORKFLOWS}.noise.emva_page", f"{_WORKFLOWS}.noise.draw_page"),
+    f"{_WORKFLOWS}.geometry.geometry_page",
+    *(f"faintfield.pipelines.pages.geometry_page.{name}" for name in ("node_drawing", "sigma_maps")),
 )
 
 

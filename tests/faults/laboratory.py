@@ -20,7 +20,7 @@ from faintfield.rig.settings import RigSettings
 from faintfield.rig.simulation.controller.bench import Bench, PtyLink
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.stages.protocol import Point
-from tests.faults.capturing import FRAMES, SMALL_RIG, Unattended
+from tests.faults.capturing import FRAMES, SMALL_RIG, Operator
 from tests.rig.stages.benches import Controller
 from tests.rig.stages.socket_link import SocketLink
 
@@ -109,7 +109,7 @@ class Lab:
                 camera = TruthfulCamera(bench)
                 rig = Rig(bench.stage(traffic=session.journal), camera, bench.clock, lambda kind, sweep: None)
                 prepare(bench, camera)
-                Capture(session, rig, operator or Unattended(), lambda path: None).run()
+                Capture(session, rig, operator or Operator(), lambda path: None).run()
         except RigError as failure:
             return failure
         finally:

@@ -23,7 +23,7 @@ from faintfield.pipelines.formats.toml_files import write_toml
 from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
 from tests.calib.noise.darkroom import specimen
-from tests.faults.capturing import SMALL_RIG, Unattended, capture_small
+from tests.faults.capturing import SMALL_RIG, Operator, capture_small
 from tests.pipelines.noise_sets import take_set, write_frames
 from tests.pipelines.sessions import captured, rig_toml
 from tests.simulated_boards import simulate_board_set
@@ -174,7 +174,7 @@ def _sealed_session(folder: Path) -> None:
 def _open_session(folder: Path) -> None:
     """Capture ten frames of a session, and leave it."""
     write_toml(folder / "rig.toml", _SMALL_RIG)
-    leave = mock.patch.object(Unattended, "show_frame", side_effect=[*(None,) * 9, LookupError])
+    leave = mock.patch.object(Operator, "show_frame", side_effect=[*(None,) * 9, LookupError])
     with leave, suppress(LookupError):
         capture_small(folder / "session", _SMALL_RIG)
 

@@ -28,7 +28,7 @@ type Arguments = list[Any]
 
 
 class Operation(NamedTuple):
-    """What can be done to a file: how its arguments are drawn, and the function that applies them."""
+    """Operation on a file: the function that draws its arguments, and the one that applies them."""
 
     draw: Callable[[Random, Path], Arguments]
     apply: Callable[..., None]

@@ -83,7 +83,8 @@ class Bench:
         call = rng.choice(self._kind.calls).words
         edits: list[tuple[str, str, list[Any]]] = []
         for _ in range(rng.choice([1, 1, 1, 1, 2, 3])):
-            matching = [sorted(filter(mutation_operations.can_be_mutated, place.glob(it))) for it in self._kind.files]
+            candidates = (place.glob(pattern) for pattern in self._kind.files)
+            matching = [sorted(filter(mutation_operations.can_be_mutated, paths)) for paths in candidates]
             if not any(matching):
                 break  # the operations before left none
             path = rng.choice(rng.choice([paths for paths in matching if paths]))
@@ -170,6 +171,8 @@ def main(kind: str, seeds: str) -> int:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 3 or sys.argv[1] not in KINDS:
+        sys.exit(f"usage: python -m tests.faults.mutations KIND SEED|FIRST:LAST; the kinds are {', '.join(KINDS)}")
     if not os.environ.items() >= ONE_THREAD.items():
         words = [sys.executable, "-m", "tests.faults.mutations", *sys.argv[1:]]
         os.execve(sys.executable, words, os.environ | ONE_THREAD)

@@ -11,13 +11,14 @@ from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.grblhal import SimulatedGrblHal
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.simulation.controller.wire import ByteFilter
+from tests.rig.stages.benches import firmware
 
 type Nature = Literal["wire", "controller", "mechanics"]
 
 
 @dataclass(frozen=True)
 class Fault:
-    """What can go wrong: the part affected, and what makes it happen on a bench.
+    """Fault of a stage: the part affected, and the function that causes it on a bench.
 
     Faults of the mechanics show in no report; only a drift check finds them. `kind` is that of the controllers that can
     have it.
@@ -46,7 +47,7 @@ def _flip(data: bytes) -> bytes:
     return data[:middle] + bytes([data[middle] ^ 0x04]) + data[middle + 1 :] if data else data
 
 
-def _filter_once(filters: list[ByteFilter], change: ByteFilter, applies: Callable[[bytes], bool] = bool) -> None:
+def filter_once(filters: list[ByteFilter], change: ByteFilter, applies: Callable[[bytes], bool] = bool) -> None:
     """Change only the next bytes to which `applies`."""
 
     def once(data: bytes) -> bytes:
@@ -69,15 +70,15 @@ def _silence(bench: Bench, filters: list[ByteFilter], duration_s: float) -> None
 
 
 def _to_controller(change: ByteFilter) -> Callable[[Bench], None]:
-    return lambda bench: _filter_once(bench.wire.filters_to_controller, change)
+    return lambda bench: filter_once(bench.wire.filters_to_controller, change)
 
 
 def _to_host(change: ByteFilter) -> Callable[[Bench], None]:
-    return lambda bench: _filter_once(bench.wire.filters_to_host, change)
+    return lambda bench: filter_once(bench.wire.filters_to_host, change)
 
 
 def _lose_ok(bench: Bench) -> None:
-    _filter_once(bench.wire.filters_to_host, lambda data: b"", lambda data: data.strip() == b"ok")
+    filter_once(bench.wire.filters_to_host, lambda data: b"", lambda data: data.strip() == b"ok")
 
 
 def _babble(bench: Bench) -> None:
@@ -86,7 +87,7 @@ def _babble(bench: Bench) -> None:
         bench.clock.after(0.01 * line, lambda: bench.firmware.say("<Jog|MPos:0.0"))
 
 
-def _restart_unseen(bench: Bench) -> None:
+def restart_unseen(bench: Bench) -> None:
     bench.firmware.restart()
     _silence(bench, bench.wire.filters_to_host, bench.firmware.boot_s + 0.1)
 
@@ -105,18 +106,18 @@ def _keep_host_busy(bench: Bench) -> None:
     bench.host_busy_until_s = bench.clock.now_s() + 1.0
 
 
-def _await_button(firmware: SimulatedMarlin) -> None:
-    firmware.wait_for_button()
-    firmware.clock.after(10.0, firmware.press_button)
+def _await_button(marlin: SimulatedMarlin) -> None:
+    marlin.wait_for_button()
+    marlin.clock.after(10.0, marlin.press_button)
 
 
-def _stick(bench: Bench) -> None:
+def stick(bench: Bench) -> None:
     bench.true_position()
     bench.firmware.mechanics.axes[0].stuck = True
 
 
 def _stick_briefly(bench: Bench) -> None:
-    _stick(bench)
+    stick(bench)
 
     def free() -> None:
         bench.true_position()
@@ -125,7 +126,7 @@ def _stick_briefly(bench: Bench) -> None:
     bench.clock.after(2.0, free)
 
 
-def _lose_steps(axis: int, by_mm: float) -> Callable[[Bench], None]:
+def lose_steps(axis: int, by_mm: float) -> Callable[[Bench], None]:
     def strike(bench: Bench) -> None:
         bench.true_position()
         bench.firmware.mechanics.axes[axis].slip_mm += by_mm
@@ -140,31 +141,19 @@ def _push_by_pendant(bench: Bench) -> None:
     bench.firmware.mechanics.queue((x + inward, y + inward), 20.0, 500.0)
 
 
-def _on[Kind: SimulatedGrbl | SimulatedMarlin](
-    kind: type[Kind], act: Callable[[Kind], None]
-) -> Callable[[Bench], None]:
-    """Return what calls `act` with the controller of a bench, which must be of this kind."""
-
-    def strike(bench: Bench) -> None:
-        assert isinstance(bench.firmware, kind)
-        act(bench.firmware)
-
-    return strike
-
-
-def _early_idle(bench: Bench) -> None:
+def report_idle_early(bench: Bench) -> None:
     """Report idle once while the stage moves."""
-    _filter_once(bench.wire.filters_to_host, lambda data: data.replace(b"<Jog", b"<Idle"), lambda data: b"<Jog" in data)
+    filter_once(bench.wire.filters_to_host, lambda data: data.replace(b"<Jog", b"<Idle"), lambda data: b"<Jog" in data)
 
 
-def _lose_settings(firmware: SimulatedGrbl) -> None:
-    firmware.settings.update({130: "200.000", 131: "200.000", 22: "0"})
-    firmware.restart()
+def _lose_settings(grbl: SimulatedGrbl) -> None:
+    grbl.settings.update({130: "200.000", 131: "200.000", 22: "0"})
+    grbl.restart()
 
 
-def _stop_briefly(firmware: SimulatedGrblHal) -> None:
-    firmware.press_emergency_stop()
-    firmware.clock.after(4.0, firmware.release_emergency_stop)
+def _stop_briefly(hal: SimulatedGrblHal) -> None:
+    hal.press_emergency_stop()
+    hal.clock.after(4.0, hal.release_emergency_stop)
 
 
 def _damage_every_line(bench: Bench) -> None:
@@ -193,19 +182,21 @@ _COMMON = (
     Fault("port gone for three seconds", "wire", unplug_for(3.0)),
     Fault("computer busy", "wire", _keep_host_busy),
     Fault("restart", "controller", lambda bench: bench.firmware.restart()),
-    Fault("restart unseen", "controller", _restart_unseen),
+    Fault("restart unseen", "controller", restart_unseen),
     Fault("busy for ever", "controller", lambda bench: setattr(bench.firmware.mechanics, "endless", True)),
     Fault("slow homing", "controller", lambda bench: setattr(bench.firmware, "homing_slowdown", 40.0)),
     Fault("moved by pendant", "controller", _push_by_pendant),
-    Fault("axis stuck", "mechanics", _stick),
+    Fault("axis stuck", "mechanics", stick),
     Fault("axis stuck for a moment", "mechanics", _stick_briefly),
-    Fault("steps lost towards the switch", "mechanics", _lose_steps(0, 0.8)),
-    Fault("steps lost the other way", "mechanics", _lose_steps(1, -0.8)),
+    Fault("steps lost towards the switch", "mechanics", lose_steps(0, 0.8)),
+    Fault("steps lost the other way", "mechanics", lose_steps(1, -0.8)),
 )
 
 
-def _of[Kind: SimulatedGrbl | SimulatedMarlin](name: str, kind: type[Kind], act: Callable[[Kind], None]) -> Fault:
-    return Fault(name, "controller", _on(kind, act), kind)
+def _of[Kind: SimulatedGrbl | SimulatedMarlin](
+    name: str, kind: type[Kind], act: Callable[[Kind], None], nature: Nature = "controller"
+) -> Fault:
+    return Fault(name, nature, lambda bench: act(firmware(bench, kind)), kind)
 
 
 _GRBL = (
@@ -213,14 +204,14 @@ _GRBL = (
     _of("hold button", SimulatedGrbl, SimulatedGrbl.pause),
     _of("door open", SimulatedGrbl, methodcaller("open_door")),
     _of("settings lost", SimulatedGrbl, _lose_settings),
-    Fault("idle reported too early", "wire", _early_idle, SimulatedGrbl),
+    Fault("idle reported too early", "wire", report_idle_early, SimulatedGrbl),
     _of("emergency stop", SimulatedGrblHal, SimulatedGrblHal.press_emergency_stop),
     _of("emergency stop for a moment", SimulatedGrblHal, _stop_briefly),
 )
 _MARLIN = (
     _of("killed", SimulatedMarlin, methodcaller("kill", "MINTEMP triggered")),
     _of("button awaited for a moment", SimulatedMarlin, _await_button),
-    Fault("motors released", "mechanics", _on(SimulatedMarlin, SimulatedMarlin.release_motors), SimulatedMarlin),
+    _of("motors released", SimulatedMarlin, SimulatedMarlin.release_motors, "mechanics"),
 )
 
 FAULTS = (*_COMMON, *_GRBL, *_MARLIN)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from faintfield.rig.cameras.protocol import Exposure
-from faintfield.rig.capture.guide import Answer, Prompt, Status
 from faintfield.rig.capture.take import DriftChecks
 from faintfield.rig.errors import CameraError, CaptureStopped
 from faintfield.rig.session.disk import encode_exposure
@@ -20,37 +19,26 @@ from faintfield.rig.session.verify import verify
 from faintfield.rig.settings import DriftSettings, StepSettings
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
-from tests.faults.capturing import FRAMES, SMALL_RIG, Unattended
+from tests.faults.capturing import DRIFTING, FRAMES, Operator, events
 from tests.faults.laboratory import ON_TARGET_MM, Lab, at_exposures, error_mm
-from tests.faults.stage_faults import unplug_for
-from tests.rig.stages.benches import CONTROLLERS, Controller
+from tests.faults.stage_faults import lose_steps, unplug_for
+from tests.rig.stages.benches import CONTROLLERS, Controller, firmware, keep_host_busy, on_homing
 
-DRIFTING = msgspec.structs.replace(SMALL_RIG, drift=DriftSettings())
 GRBL, _, MARLIN = CONTROLLERS
 
 
 def test_cause_of_failed_recovery_is_recorded(tmp_path: Path) -> None:
     lab = Lab(tmp_path / "session", GRBL)
-    told: list[str] = []
-
-    class Watching(Unattended):
-        def show_status(self, status: Status) -> None:
-            told.extend(status.warnings)
-
-    assert lab.run(at_exposures([3], unplug_for(90.0)), Watching()) is None
+    operator = Operator()
+    assert lab.run(at_exposures([3], unplug_for(90.0)), operator) is None
     lab.assert_true_positions()
-    with Journal(lab.folder / "journal.sqlite", read_only=True) as journal:
-        (failed,) = journal.events("recovery_failed")
+    (failed,) = events(lab.folder, "recovery_failed")
     assert failed.frame == 2
     assert failed.detail["device"] == "stage"
     assert failed.detail["error"] == "StageLost"
     assert "unplugged" in str(failed.detail["message"])
-    assert any("the stage was not recovered: " in warning and "unplugged" in warning for warning in told)
-
-
-def slip(bench: Bench, by_mm: float = -3.0) -> None:
-    """Let an axis lose steps."""
-    bench.firmware.mechanics.axes[0].slip_mm += by_mm
+    warnings = [warning for status in operator.statuses for warning in status.warnings]
+    assert any("the stage was not recovered: " in warning and "unplugged" in warning for warning in warnings)
 
 
 def fail(bench: Bench) -> None:
@@ -59,16 +47,7 @@ def fail(bench: Bench) -> None:
 
 def busy_at_homing(bench: Bench, numbers: Container[int]) -> None:
     """Let the computer be busy while some homings end."""
-    homings: list[bool] = []
-
-    def count(data: bytes) -> bytes:
-        if b"$H" in data or b"G28" in data:
-            homings.append(True)
-            if len(homings) in numbers:
-                bench.clock.after(0.3, lambda: setattr(bench, "host_busy_until_s", bench.clock.now_s() + 2.0))
-        return data
-
-    bench.wire.filters_to_controller.append(count)
+    on_homing(bench, lambda homing: keep_host_busy(bench, 2.0) if homing in numbers else None)
 
 
 @pytest.mark.parametrize("controller", [GRBL, MARLIN])
@@ -77,9 +56,9 @@ def test_busy_computer_ends_no_capture(tmp_path: Path, controller: Controller) -
 
     assert lab.run(at_exposures([2], lambda bench: busy_at_homing(bench, (1, 3)))) is None
     lab.assert_true_positions()
-    with Journal(lab.folder / "journal.sqlite", read_only=True) as journal:
-        assert len(journal.events("suspect")) == 2
-        assert all("answers were delayed" in str(event.detail["message"]) for event in journal.events("suspect"))
+    suspects = events(lab.folder, "suspect")
+    assert len(suspects) == 2
+    assert all("answers were delayed" in str(event.detail["message"]) for event in suspects)
 
 
 def test_always_busy_computer_ends_resumable_capture(tmp_path: Path) -> None:
@@ -92,20 +71,20 @@ def test_always_busy_computer_ends_resumable_capture(tmp_path: Path) -> None:
     assert len(verify(lab.folder).suspect) == 6
 
 
+def groups_of_frames(folder: Path) -> list[int | None]:
+    groups = read_homing_groups(folder).groups
+    return [groups[committed.intent] for _, committed, _ in taken_frames(folder)]
+
+
 def test_homing_begins_a_group(tmp_path: Path) -> None:
     lab = Lab(tmp_path / "session", GRBL)
 
-    def alarm(bench: Bench) -> None:
-        assert isinstance(bench.firmware, SimulatedGrbl)
-        bench.firmware.alarm(3)
-
-    assert lab.run(at_exposures([5], alarm)) is None
+    assert lab.run(at_exposures([5], lambda bench: firmware(bench, SimulatedGrbl).alarm(3))) is None
     groups = read_homing_groups(lab.folder)
     # The fifth exposure failed; the stage was homed before the sixth
     assert groups.groups == {intent: 1 if intent < 5 else 2 for intent in range(1, FRAMES + 2) if intent != 5}
     assert groups.spread_mm is None
-    by_frame = [groups.groups[committed.intent] for _, committed, _ in taken_frames(lab.folder)]
-    assert by_frame == [1] * 4 + [2] * (FRAMES - 4)
+    assert groups_of_frames(lab.folder) == [1] * 4 + [2] * (FRAMES - 4)
 
 
 def test_resumed_session_begins_a_homing_group(tmp_path: Path) -> None:
@@ -119,7 +98,7 @@ def test_resumed_session_begins_a_homing_group(tmp_path: Path) -> None:
 def test_spread_of_the_switches_is_that_of_checks(tmp_path: Path) -> None:
     lab = Lab(tmp_path / "session", MARLIN, DRIFTING)
 
-    assert lab.run(at_exposures([2], lambda bench: slip(bench, -0.2))) is None
+    assert lab.run(at_exposures([2], lose_steps(0, -0.2))) is None
     with Journal(lab.folder / "journal.sqlite", read_only=True) as journal:
         away_mm = np.array([check.away_mm for check in journal.details("drift_check", DriftCheck)])
         groups = homing_groups(journal)
@@ -128,23 +107,23 @@ def test_spread_of_the_switches_is_that_of_checks(tmp_path: Path) -> None:
     assert groups.spread_mm == pytest.approx(np.std(away_mm, axis=0, ddof=1))
     assert groups.spread_mm[0] == pytest.approx(0.2 / 2**0.5, rel=0.01)
     # Each check homes, so that each step of the plan is a group of its own
-    assert [groups.groups[it.intent] for _, it, _ in taken_frames(lab.folder)] == [1] * 6 + [2] * 6 + [3] * 4
+    assert groups_of_frames(lab.folder) == [1] * 6 + [2] * 6 + [3] * 4
 
 
 def test_frames_without_a_confirming_check_are_suspect(tmp_path: Path) -> None:
     lab = Lab(tmp_path / "session", GRBL, DRIFTING)
 
     def slip_and_stop(bench: Bench) -> None:
-        slip(bench)
+        lose_steps(0, -3.0)(bench)
         bench.clock.after(5.0, bench.firmware.restart)
 
     assert lab.run(at_exposures([8], slip_and_stop)) is None
     verdict = verify(lab.folder)
     # The check after the first step confirms its frames; the next homing was not preceded by a check
-    taken = taken_frames(lab.folder)
-    wrong = {it.file for frame, it, path in taken if error_mm(path, frame.stop.target) > ON_TARGET_MM}
+    frames = taken_frames(lab.folder)
+    wrong = {committed.file for frame, committed, path in frames if error_mm(path, frame.stop.target) > ON_TARGET_MM}
     assert wrong
-    assert wrong <= set(verdict.suspect) < {it.file for _, it, _ in taken[6:12]}
+    assert wrong <= set(verdict.suspect) < {committed.file for _, committed, _ in frames[6:12]}
 
 
 def test_frames_before_an_interrupted_check_are_suspect(tmp_path: Path) -> None:
@@ -167,48 +146,39 @@ def test_check_waits_for_last_frame_of_node(tmp_path: Path) -> None:
     )
     lab = Lab(tmp_path / "session", GRBL, every_two)
     assert lab.run() is None
-    groups = read_homing_groups(lab.folder).groups
-    assert [groups[it.intent] for _, it, _ in taken_frames(lab.folder)] == [1] * 6 + [2] * 6 + [3] * 6
+    assert groups_of_frames(lab.folder) == [1] * 6 + [2] * 6 + [3] * 6
     assert verify(lab.folder).suspect == ()
 
 
-SLIP = at_exposures([9], slip)  # in the second step of the plan
+SLIP = at_exposures([9], lose_steps(0, -3.0))  # in the second step of the plan
 
 
 def test_lost_steps_repeat_their_frames(tmp_path: Path) -> None:
     lab = Lab(tmp_path / "session", GRBL, DRIFTING)
     assert lab.run(SLIP) is None
     lab.assert_true_positions()
+    (suspect,) = events(lab.folder, "suspect")
+    assert "lost its scale" in str(suspect.detail["message"])
     with Journal(lab.folder / "journal.sqlite", read_only=True) as journal:
-        suspects = journal.events("suspect")
-        assert len(suspects) == 1
-        assert "lost its scale" in str(suspects[0].detail["message"])
-        # Everything since the last good check, which was at the end of the first step
-        assert [it.frame for it in journal.committed() if it.void is not None] == list(range(6, 12))
+        void = [committed.frame for committed in journal.committed() if committed.void is not None]
+    # Everything since the last good check, which was at the end of the first step
+    assert void == list(range(6, 12))
     assert verify(lab.folder).superseded == 6
 
 
 def test_stage_that_keeps_losing_steps_is_given_up(tmp_path: Path) -> None:
     lab = Lab(tmp_path / "session", GRBL, DRIFTING)
 
-    assert isinstance(lab.run(at_exposures(range(2, 100, 6), slip)), CaptureStopped)
-    with Journal(lab.folder / "journal.sqlite", read_only=True) as journal:
-        assert len(journal.events("suspect")) == 3
+    assert isinstance(lab.run(at_exposures(range(2, 100, 6), lose_steps(0, -3.0))), CaptureStopped)
+    assert len(events(lab.folder, "suspect")) == 3
     assert lab.run() is None
     # The frames in doubt when the capture was given up are present and stay marked
     assert verify(lab.folder).problems == ()
 
 
-class Keeping(Unattended):
-    """A person who wants to keep suspect frames."""
-
-    def ask(self, prompt: Prompt) -> Answer:
-        return "keep" if prompt.key == "drift" else prompt.unattended
-
-
 def test_frames_kept_despite_lost_steps_stay_suspect(tmp_path: Path) -> None:
     lab = Lab(tmp_path / "session", GRBL, DRIFTING)
-    assert lab.run(SLIP, Keeping()) is None
+    assert lab.run(SLIP, Operator({"drift": ["keep"]})) is None
     verdict = verify(lab.folder)
     assert verdict.problems == ()
     assert verdict.suspect == tuple(committed.file for _, committed, _ in taken_frames(lab.folder)[6:12])

@@ -70,9 +70,9 @@ def calls_on(bench: Bench, name: str, kind: str, words: str) -> list[int]:
     bench.undisturbed(name)
     diary = bench.folder(name).with_suffix(".calls").read_text().splitlines()
     of_kind = [line for line in diary if line.split()[0] == str(KINDS.index(kind))]
-    found = [nth for nth, line in enumerate(of_kind, 1) if words in line and not line.endswith(UNFINISHED)]
-    assert found
-    return found
+    numbers = [nth for nth, line in enumerate(of_kind, 1) if words in line and not line.endswith(UNFINISHED)]
+    assert numbers
+    return numbers
 
 
 @pytest.mark.deep

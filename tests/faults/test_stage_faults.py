@@ -15,13 +15,12 @@ from faintfield.rig.session.session import is_sealed, taken_frames
 from faintfield.rig.session.verify import verify
 from faintfield.rig.settings import DriftSettings
 from faintfield.rig.simulation.controller.bench import Bench, PtyLink
-from tests.faults.capturing import SMALL_RIG
+from tests.faults.capturing import DRIFTING, SMALL_RIG
 from tests.faults.laboratory import ON_TARGET_MM, Lab, MakeLink, Prepare, TruthfulCamera, at_exposures, error_mm
 from tests.faults.stage_faults import FAULTS, Fault, faults_of, unplug_for
 from tests.rig.stages.benches import CONTROLLERS, Controller
 from tests.rig.stages.socket_link import SocketLink
 
-DRIFTING = msgspec.structs.replace(SMALL_RIG, drift=DriftSettings())
 FRAMES_ON_GRID = 12  # of SMALL_RIG; the last frames, at the centre, are dark
 FAULTS_PER_CAPTURE = 6
 LONGEST_S = 900.0  # of the simulated clock

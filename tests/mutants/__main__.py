@@ -189,6 +189,9 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes at a time")
     parser.add_argument("--least", type=float, default=0.0, help="exit with 1 if a smaller share (%%) is noticed")
     options = parser.parse_args()
+    unknown = [name for name in options.modules if name.partition("/")[0] not in _TESTS or not (_ROOT / name).exists()]
+    if unknown:
+        parser.error(f"{unknown[0]}: is no folder or file of recon, calib or rig")
     _WORK.mkdir(parents=True, exist_ok=True)
     mutants = sample_of(all_mutants(options.modules), options.sample, options.seed)
     laboratory = Laboratory(options.jobs)
@@ -207,6 +210,8 @@ def main() -> int:
     count, total = sum(noticed), len(noticed)
     low, high = wilson(count, total)
     print(f"noticed {count} of {total}: {count / total:.0%}, 95 % interval {low:.0%} to {high:.0%}")
+    if count < total:
+        print("docs/mutants.md says what to do with the others")
     share = 100 * count / total
     if share < options.least:
         print(f"the tests notice {share:.0f} % of the wrong changes, fewer than {options.least:.0f} %")

@@ -1,7 +1,7 @@
 """Sets and records of results as a person writes them."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.formats.digests import DIGEST_KEY
 from faintfield.pipelines.formats.image_files import write_frame
+from faintfield.pipelines.formats.sets.elemental_set import load_set
+from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
+from faintfield.recon.likelihood.images import ElementalImages
 
 
 class View(NamedTuple):
@@ -49,6 +52,26 @@ def write_set(
     }
     (folder / "elemental.toml").write_text(tomli_w.dumps(settings))
     return folder
+
+
+def channels_of(folder: Path) -> dict[str, ElementalImages]:
+    """Return the images of a set by the names of their colours."""
+    elemental_set = load_set(folder)
+    return {layout.name: load_channel(elemental_set, layout) for layout in channel_layouts(elemental_set)}
+
+
+FITTED = {
+    "offset_dn": {"value": 100.0, "se": 0.1},
+    "gain_dn_per_e": {"value": 2.0, "se": 0.01},
+    "read_noise_e": {"value": 3.0, "se": 0.02},
+    "dark_current_e_per_s": {"value": 0.2, "se": 0.01},
+}
+
+
+def write_fitted_noise(folder: Path, values: Mapping[str, float] | None = None, **others: Any) -> None:
+    """Write `noise.json` with these values, by default FITTED, as `faintfield noise` does."""
+    fitted = FITTED | {name: {"value": value, "se": 0.0} for name, value in (values or {}).items()}
+    (folder / "noise.json").write_text(json.dumps(fitted | others))
 
 
 def write_by_hand(path: Path, record: dict[str, Any]) -> None:

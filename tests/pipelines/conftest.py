@@ -18,20 +18,23 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from faintfield.pipelines.cli import run
-from faintfield.pipelines.commands.run import run as run_session
 from faintfield.pipelines.formats.image_files import encoded
-from faintfield.pipelines.reconstruction import penalised, surface, surface_depths, surface_files
+from faintfield.pipelines.reconstruction.depth import search as surface_depths
 from faintfield.pipelines.reconstruction.options import Options
+from faintfield.pipelines.reconstruction.planes import penalised
+from faintfield.pipelines.reconstruction.surface import files as surface_files
+from faintfield.pipelines.reconstruction.surface import reconstruct as surface
 from faintfield.recon.surface.estimate import SurfaceEstimate
 from tests.pipelines.by_hand import View, write_set
-from tests.pipelines.sessions import captured, rig_toml
-from tests.pipelines.surfaces import Searches, found_at_once
+from tests.pipelines.sessions import captured, rig_toml, steps_run
+from tests.pipelines.surfaces import Searches, found_at_once, write_example
 
 type Command = Callable[..., CompletedProcess[str]]
 type SetMaker = Callable[..., Path]
 type Edit = Callable[[Path, Callable[[dict[str, Any]], object]], Path]
 
 SMALL = ("--size-px", 96, 72, "--rows", 3, "--columns", 3)
+LARGER = ("--size-px", 96, 72, "--rows", 5, "--columns", 5)
 
 
 @contextmanager
@@ -73,6 +76,13 @@ def done(faintfield: Command) -> Command:
         return ended
 
     return call
+
+
+def assert_refused(ended: CompletedProcess[str], failure: str, *words: str) -> None:
+    """Assert that a command ended by this failure, with these words in its message."""
+    assert ended.returncode == 1, ended.stderr
+    assert f"faintfield: {failure}: " in ended.stderr
+    assert all(word in ended.stderr for word in words), ended.stderr
 
 
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
@@ -125,6 +135,26 @@ def simulated_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def bright_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A set of more views and light than the small one, to be read only."""
+    words = (*LARGER, "--snr", 2)
+    return made_once(tmp_path_factory, "bright", lambda folder: run_undrawn("simulate", folder / "set", *words)) / "set"
+
+
+@pytest.fixture(scope="session")
+def dark_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A set of more views than the small one, as dark as that, to be read only."""
+    return made_once(tmp_path_factory, "dark", lambda folder: run_undrawn("simulate", folder / "set", *LARGER)) / "set"
+
+
+@pytest.fixture(scope="session")
+def colour_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small set of a Bayer camera, to be read only."""
+    words = ("--size-px", 64, 48, "--rows", 3, "--columns", 3, "--colour", "bayer", "--snr", 20)
+    return made_once(tmp_path_factory, "colour", lambda folder: run_undrawn("simulate", folder / "set", *words)) / "set"
+
+
+@pytest.fixture(scope="session")
 def sweep(simulated_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A sweep of five planes, to be read only."""
     words = ("reconstruct", simulated_scene, "--sweep-mm", "500:700:5", "--method", "backprojection", "--out")
@@ -145,8 +175,8 @@ def calibrated_session(recorded_session: Path, tmp_path_factory: pytest.TempPath
     def make(folder: Path) -> None:
         shutil.copytree(recorded_session, folder / "session")
         with drawing_nothing():
-            outcome = run_session(folder / "session", options=Options(depth_mm=[700.0], method=["backprojection"]))
-        assert [step.step for step in outcome.steps if step.ran] == ["noise", "geometry", "reconstruct"]
+            steps = steps_run(folder / "session", Options(depth_mm=[700.0], method=["backprojection"]))
+        assert steps == ["noise", "geometry", "reconstruct"]
 
     return made_once(tmp_path_factory, "calibrated", make) / "session"
 
@@ -182,9 +212,9 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> Searches:
 
 
 @pytest.fixture(scope="session")
-def small_options() -> tuple[object, ...]:
-    """The options that make `simulate` fast."""
-    return SMALL
+def written_surface(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A surface in mm made by hand, to be read only."""
+    return made_once(tmp_path_factory, "surface", lambda folder: write_example(folder / "out")) / "out"
 
 
 @pytest.fixture

@@ -4,6 +4,10 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
 GOLDEN = Path(__file__).parent / "golden"
 
 
@@ -13,9 +17,29 @@ def read_record(folder: Path, name: str = "reconstruction.json") -> dict[str, An
     return record
 
 
+def files_in(folder: Path, *without: str) -> dict[str, bytes]:
+    """Return the contents of all files below a folder, by their names relative to it."""
+    paths = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*") if path.is_file()}
+    return {name: path.read_bytes() for name, path in paths.items() if name not in without}
+
+
 def plane_files(folder: Path) -> dict[str, bytes]:
     """Return the contents of the files of all planes below a folder."""
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("plane_*")}
+
+
+def flip_last_bit(path: Path) -> None:
+    """Damage a file, or mend it again."""
+    content = path.read_bytes()
+    path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+
+
+def check_proposal(light: NDArray[Any], proposal: NDArray[Any], moved: NDArray[Any], moved_sigma: float) -> None:
+    """Non-negative light and proposal, and their difference in positive units of noise."""
+    assert light.dtype == proposal.dtype == moved.dtype == np.float32
+    assert min(light.min(), proposal.min()) >= 0
+    assert ((light - proposal) * moved >= 0).all()
+    assert moved_sigma == pytest.approx(np.sqrt(np.mean(np.square(moved))), rel=0.02)
 
 
 def form(value: Any) -> Any:
@@ -27,10 +51,10 @@ def form(value: Any) -> Any:
         assert (value["value"] is None) == ("why" in value)
         return "quantity"
     if isinstance(value, dict):
-        return [(key, form(one)) for key, one in value.items()]
+        return [(key, form(item)) for key, item in value.items()]
     if isinstance(value, list):
-        forms = [form(one) for one in value]
-        return [one for index, one in enumerate(forms) if one not in forms[:index]]
+        forms = [form(item) for item in value]
+        return [kind for index, kind in enumerate(forms) if kind not in forms[:index]]
     return type(value).__name__
 
 

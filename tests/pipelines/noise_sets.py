@@ -48,12 +48,23 @@ def take_set(
 
 def measure_sensor(folder: Path, out: Path | None = None) -> NoiseRecord:
     """Call `faintfield noise` without drawing its pages, which take nearly all of the time."""
-    pages = "faintfield.pipelines.pages"
+    workflow = "faintfield.pipelines.workflows.noise"
     with (
-        mock.patch(f"{pages}.noise_page.draw_page", return_value=b"page"),
-        mock.patch(f"{pages}.emva_page.emva_page", return_value="page"),
+        mock.patch(f"{workflow}.draw_page", return_value=b"page"),
+        mock.patch(f"{workflow}.emva_page", return_value="page"),
     ):
         return noise(folder, out=out)
+
+
+def check_noise_of_eq_6(electrons: NDArray[Any], expected: NDArray[np.float64], read_e2: float) -> NDArray[np.float64]:
+    """Assert that electrons scatter as Poisson counts and read noise do; return the normalised residuals."""
+    variance = expected + read_e2
+    normalised = np.asarray((electrons - expected) / np.sqrt(variance))
+    assert abs(normalised.mean()) < 4 / np.sqrt(normalised.size)
+    # A nearly normal number's square has the variance 2, and a Poisson count of mean μ adds μ / variance² to it
+    deviation = np.sqrt(np.mean(2 + expected / variance**2) / normalised.size)
+    assert abs(np.mean(normalised**2) - 1) < 4 * deviation
+    return normalised
 
 
 def deviation_of_snr(snr: float, mean_e: NDArray[np.float64], read_e2: float, region: NDArray[np.bool_]) -> float:

@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from faintfield.pipelines.cli import run
+from faintfield.pipelines.commands.run import run as run_session
+from faintfield.pipelines.reconstruction.options import Options
 
 _RIG = """
 [stage]
@@ -59,6 +61,11 @@ def rig_toml(
     return "\n".join(
         [_RIG.format(rows=rows, columns=columns, pitch_mm=pitch_mm, camera=camera, checks=checks), *tables]
     )
+
+
+def steps_run(session: Path, options: Options) -> list[str]:
+    """Return the steps that `faintfield run` had to do."""
+    return [step.step for step in run_session(session, options=options).steps if step.ran]
 
 
 def captured(folder: Path, text: str) -> Path:

@@ -14,7 +14,7 @@ from faintfield.pipelines.formats.results.surface import (
     SurfaceOptions,
     SurfaceRecord,
 )
-from faintfield.pipelines.reconstruction.surface_files import SurfaceMaps, write_surface
+from faintfield.pipelines.reconstruction.surface.files import SurfaceMaps, write_surface
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.surface.estimate import SurfaceEstimate
 from faintfield.recon.surface.pinhole_views import PinholeViews

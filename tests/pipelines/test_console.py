@@ -1,19 +1,19 @@
 """Output of commands: bars and lines on a terminal or off one, and the log of `--log FILE`."""
 
 import io
+import itertools
 import logging
 import re
-import threading
-import time
 from pathlib import Path
+from queue import Queue
 
 import pytest
 from rich.console import Console
 
 from faintfield.pipelines import cli, console
 from faintfield.pipelines.console import _Report, _reports, conceal, inform, progress, working
-from tests.pipelines.conftest import Command
-from tests.pipelines.refusals import assert_refused
+from tests.patience import HANG_S
+from tests.pipelines.conftest import Command, assert_refused
 
 
 def test_lines_are_due_after_2_and_12_s() -> None:
@@ -29,20 +29,22 @@ def test_lines_are_due_after_2_and_12_s() -> None:
     assert report.wait_s() == pytest.approx(32 - 24.9)
 
 
-def test_part_speaks_for_whole_unless_short(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(console, "_FIRST_LINE_S", 0.05)
-    monkeypatch.setattr(console, "_NEXT_LINE_S", 0.05)
+def test_part_speaks_for_whole_unless_short(monkeypatch: pytest.MonkeyPatch) -> None:
+    lines, seconds = Queue[str](), itertools.count(0.0, 20.0)  # each reading of the clock is 20 s after the last
+
+    def report(label: str, total: int | None = None) -> _Report:
+        return _Report(label, total, clock=lambda: 0.0 if label == "short" else next(seconds))
+
+    monkeypatch.setattr(console, "inform", lines.put)
+    monkeypatch.setattr(console, "_Report", report)
     for _ in progress([1], "whole"):
+        with working("short"):
+            assert lines.get(timeout=HANG_S).startswith("whole: 0 of 1, ")
         with working("part"):
-            time.sleep(0.3)
-    lines = capfd.readouterr().err.splitlines()
-    parts = [line for line in lines if line.startswith("part: ")]
-    assert len(parts) >= 2
-    assert len(lines) - len(parts) <= 1  # before the part has spoken
-    for _ in progress(range(60), "whole"):
-        with working("part"):
-            time.sleep(0.005)
-    assert "whole: " in capfd.readouterr().err
+            while not lines.get(timeout=HANG_S).startswith("part: "):
+                pass
+            lines.get(timeout=HANG_S)  # a line of the whole may have been on its way
+            assert all(lines.get(timeout=HANG_S).startswith("part: ") for _ in range(5))
     with pytest.raises(ZeroDivisionError), working("failing"):
         raise ZeroDivisionError
     assert _reports == []
@@ -58,30 +60,6 @@ def test_bar_goes_on_while_a_part_works(monkeypatch: pytest.MonkeyPatch) -> None
         pass
     assert "[alone]" in screen.getvalue()
     assert "[part]" not in screen.getvalue()
-
-
-def test_line_due_at_the_end_disturbs_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    speaking, removed = threading.Event(), threading.Event()
-
-    class Reports(list[_Report]):
-        def remove(self, report: _Report, /) -> None:
-            super().remove(report)
-            removed.set()
-
-    def line(_: _Report) -> str:
-        speaking.set()
-        removed.wait(0.2)  # for ever, if the thread is waited for before its report is removed
-        return "late"
-
-    failures: list[threading.ExceptHookArgs] = []
-    monkeypatch.setattr(threading, "excepthook", failures.append)
-    monkeypatch.setattr(console, "_reports", Reports())
-    monkeypatch.setattr(console, "_FIRST_LINE_S", 0.0)
-    monkeypatch.setattr(_Report, "line", line)
-    with working("ending"):
-        speaking.wait()
-    assert failures == []
-    assert removed.is_set()
 
 
 _LINE = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z (INFO|WARNING|ERROR) (.*)")

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -64,6 +65,7 @@ def _commands(parent: App, before: str = "") -> Iterator[str]:
 
 
 def test_version_and_help_load_nothing_heavy() -> None:
+    assert {name for name in HEAVY if find_spec(name) is None} <= {"napari"}  # all names are those of packages
     commands = list(_commands(app))
     assert {"run", "demo", "stage test", "import grid", "export zarr"} <= {*commands}
     lines = _complaint(_LOADED_BY_EACH, *commands).split("\n")[:-1]

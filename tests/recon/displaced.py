@@ -1,41 +1,50 @@
 """Views displaced beside one another, whose weights on the samples are known in closed form."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.occlusion import Occluders
 from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.operator.scene_operator import SceneOperator
+from faintfield.recon.solver.pmlem import PmlemIterate
 
 SHAPE = (96, 112)
 
 
 def views_displaced_by(
-    shifts: Image,
-    shape: tuple[int, int] = SHAPE,
-    *,
-    width: int = 0,
-    dtype: type[np.float32] | type[np.float64] = np.float32,
+    shifts: Image, shape: tuple[int, int] = SHAPE, *, margin: int = 1, width: int = 0, **options: Any
 ) -> PlaneOperator:
-    """Return views of one pixel per sample, displaced by `shifts` (view, 2) down and right, of `width` columns."""
-    rays, grid = _rays(shape, width), PlaneGrid(shape, 1.0, (0.0, 0.0))
-    return PlaneOperator(_homographies(shifts), rays, grid, workers=1, dtype=dtype)
+    """Return views of one pixel per sample, displaced by `shifts` (view, 2) down and right, of `width` columns.
+
+    They show `margin` samples beyond each edge of the plane, or fewer than the plane has if it is negative.
+    """
+    rays = pixel_rays((shape[0], width or shape[1]), margin)
+    return PlaneOperator(homographies(shifts), rays, PlaneGrid(shape, 1.0, (0.0, 0.0)), **{"workers": 1, **options})
 
 
 def planes_displaced_by(
-    shifts: Sequence[Image],
-    shape: tuple[int, int] = SHAPE,
-    *,
-    occluders: Occluders | None = None,
-    dtype: type[np.float32] | type[np.float64] = np.float32,
+    shifts: Sequence[Image], shape: tuple[int, int] = SHAPE, *, margin: int = 1, **options: Any
 ) -> SceneOperator:
     """Return several planes of one shape, each displaced by its own shifts (view, 2) in the views."""
-    homographies = np.stack([_homographies(of_plane) for of_plane in shifts])
+    of_planes = np.stack([homographies(of_plane) for of_plane in shifts])
     grids = [PlaneGrid(shape, 1.0, (0.0, 0.0))] * len(shifts)
-    return SceneOperator(homographies, _rays(shape), grids, occluders=occluders, workers=1, dtype=dtype)
+    return SceneOperator(of_planes, pixel_rays(shape, margin), grids, **{"workers": 1, **options})
+
+
+def pixel_rays(shape: tuple[int, int], margin: int = 0) -> Image:
+    """Return rays (row, column, 2) through samples of pitch one, and through a margin around them."""
+    rows, columns = (np.arange(-margin, size + margin, dtype=float) for size in shape)
+    return np.stack(np.meshgrid(columns, rows), axis=-1)
+
+
+def homographies(shifts: Image) -> Image:
+    """Return the homographies (view, 3, 3) of views displaced by `shifts` (view, 2) down and right."""
+    result = np.stack([np.eye(3)] * len(shifts))
+    result[:, :2, 2] = shifts[:, ::-1]
+    return result
 
 
 def dark_images(operator: SceneOperator, background_e: float, variance_e2: float) -> ElementalImages:
@@ -44,7 +53,7 @@ def dark_images(operator: SceneOperator, background_e: float, variance_e2: float
 
 
 def noisy_images(
-    operator: SceneOperator, samples: Image, background_e: float, variance_e2: float, seed: int
+    operator: SceneOperator, samples: Image, background_e: float, variance_e2: float, seed: int | np.random.Generator
 ) -> ElementalImages:
     """Return images of planes with the noise of light and of the sensor."""
     generator = np.random.default_rng(seed)
@@ -63,19 +72,14 @@ def pieces(size: int) -> Image:
 def dark_views(truth: Image, seed: int) -> tuple[PlaneOperator, ElementalImages]:
     """Return 49 views of a square plane with Poisson light and the read noise of the paper's camera."""
     generator = np.random.default_rng(seed)
-    homographies = _homographies(generator.uniform(-2, 2, (49, 2))[:, ::-1])
-    rays = _rays(truth.shape)[1:-1, 1:-1]
-    operator = PlaneOperator(homographies, rays, PlaneGrid(truth.shape, 1.0, (0.0, 0.0)))
-    electrons = generator.poisson(operator.forward(truth)) + generator.normal(0, 3.46, operator.images_shape)
-    return operator, ElementalImages(electrons.astype(np.float32), 0.0, 12.0)
+    shifts = generator.uniform(-2, 2, (49, 2))[:, ::-1]
+    operator = views_displaced_by(shifts, (truth.shape[0], truth.shape[1]), margin=0, workers=None)
+    return operator, noisy_images(operator, truth, 0.0, 12.0, generator)
 
 
-def _rays(shape: tuple[int, ...], width: int = 0) -> Image:
-    columns, rows = np.meshgrid(np.arange(-1.0, (width or shape[1]) + 1), np.arange(-1.0, shape[0] + 1))
-    return np.stack([columns, rows], axis=-1)
-
-
-def _homographies(shifts: Image) -> Image:
-    homographies = np.stack([np.eye(3)] * len(shifts))
-    homographies[:, :2, 2] = shifts[:, ::-1]
-    return homographies
+def run_until(iterates: Iterator[PmlemIterate], tolerance: float, most: int) -> PmlemIterate:
+    """Return the first iterate that is certified within a tolerance, or the one after `most` passes."""
+    for iterate in iterates:
+        if iterate.certificate.distance <= tolerance or iterate.passes >= most:
+            break
+    return iterate

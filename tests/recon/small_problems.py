@@ -18,6 +18,7 @@ from faintfield.recon.operator.occlusion import Occluders
 from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.operator.scene_operator import SceneOperator
 from faintfield.recon.solver.data_fit import SceneProblem
+from tests.recon.displaced import pixel_rays, views_displaced_by
 
 SHAPE = (9, 12)
 DETECTOR = (11, 14)  # a sample more on each side
@@ -77,8 +78,7 @@ class DenseProblem(Likelihood):
     """Data of one plane, the operator under test, and the same operator as a matrix."""
 
     operator: PlaneOperator
-    homographies: Image
-    rays: Image
+    shifts: Image  # (view, 2), down and right
 
 
 def problem(
@@ -95,17 +95,14 @@ def problem(
     """Return a bright box on a dark plane, in views that are displaced by up to half a sample."""
     generator = np.random.default_rng(seed)
     shifts = generator.uniform(-0.5, 0.5, (views, 2))
-    columns, rows = np.meshgrid(np.arange(-1.0, SHAPE[1] + 1), np.arange(-1.0, SHAPE[0] + 1))
-    homographies = np.stack([np.eye(3)] * views)
-    homographies[:, :2, 2] = shifts[:, ::-1]
-    rays, grid = np.stack([columns, rows], axis=-1), PlaneGrid(SHAPE, 1.0, (0.0, 0.0))
-    operator = PlaneOperator(homographies, rays, grid, dtype=dtype, workers=1)
-    matrix = np.concatenate([_bilinear(rows.ravel() + down, columns.ravel() + right) for down, right in shifts])
+    operator = views_displaced_by(shifts, SHAPE, dtype=dtype)
+    columns, rows = pixel_rays(SHAPE, 1).reshape(-1, 2).T
+    matrix = np.concatenate([_bilinear(rows + down, columns + right) for down, right in shifts])
     mean = (matrix @ box(low, high).ravel()).reshape(views, *DETECTOR)
     electrons = generator.poisson(mean + background_e) + generator.normal(0, np.sqrt(variance_e2), mean.shape)
     pixel_likelihood = PixelLikelihood(likelihood, level_e=3.0 if likelihood == "least-squares" else 0.0)
     images = ElementalImages(electrons, background_e, variance_e2, likelihood=pixel_likelihood)
-    return DenseProblem(images, matrix, operator, homographies, rays)
+    return DenseProblem(images, matrix, operator, shifts)
 
 
 def box(low: float, high: float) -> Image:
@@ -122,7 +119,7 @@ def two_planes(
     homographies = np.stack([np.eye(3)] * 2 * VIEWS).reshape(2, VIEWS, 3, 3)
     homographies[0, :, :2, 2] = generator.uniform(-2.5, 2.5, (VIEWS, 2))
     homographies[1, :, :2, 2] = generator.uniform(-0.5, 0.5, (VIEWS, 2))
-    rays = np.stack(np.meshgrid(np.arange(float(SIZE)), np.arange(float(SIZE))), axis=-1)
+    rays = pixel_rays((SIZE, SIZE))
     opacities = [generator.uniform(0, 0.8, grid.shape) for grid in TWO_GRIDS]
     hiding = Occluders(opacities, [500.0, 700.0]) if occluded else None
     operator = SceneOperator(homographies, rays, TWO_GRIDS, occluders=hiding, dtype=np.float64, workers=1)
@@ -135,22 +132,11 @@ def two_planes(
 
 
 def shifted_views(views: int, *, unseen_columns: int = 0, **options: Any) -> PlaneOperator:
-    """Return views at scale one, all but the first displaced by up to half a sample; it leaves out the last columns."""
-    last_column = SHAPE[1] - unseen_columns if unseen_columns else SHAPE[1] + 1
-    columns, rows = np.meshgrid(np.arange(-1.0, last_column), np.arange(-1.0, SHAPE[0] + 1))
-    homographies = np.stack([np.eye(3)] * views)
-    homographies[1:, :2, 2] = np.random.default_rng(1).uniform(-0.5, 0.5, (views - 1, 2))
-    rays, grid = np.stack([columns, rows], axis=-1), PlaneGrid(SHAPE, 1.0, (0.0, 0.0))
-    return PlaneOperator(homographies, rays, grid, **{"dtype": np.float64, "workers": 1, **options})
-
-
-def drawn_images(
-    operator: PlaneOperator, plane: Image, background_e: float = 0.3, variance_e2: float = 12.0
-) -> ElementalImages:
-    generator = np.random.default_rng(2)
-    counts = generator.poisson(operator.forward(plane) + background_e)
-    read_noise = generator.normal(0, np.sqrt(variance_e2), operator.images_shape)
-    return ElementalImages(counts + read_noise, background_e, variance_e2)
+    """Return views at scale one, all but the first displaced by up to half a sample."""
+    shifts = np.zeros((views, 2))
+    shifts[1:] = np.random.default_rng(1).uniform(-0.5, 0.5, (views - 1, 2))[:, ::-1]
+    width = SHAPE[1] - 1 - unseen_columns if unseen_columns else SHAPE[1]
+    return views_displaced_by(shifts, SHAPE, width=width, **{"dtype": np.float64, **options})
 
 
 def _bilinear(rows: Image, columns: Image) -> Image:

@@ -31,6 +31,13 @@ FAR, NEAR, UNMOVED = 1 / 600, 1 / 500, 1 / 560
 EDGES_PX = (17.5, 57.5, 12.5, 46.5)
 READ_VARIANCE_E2 = 2.0
 
+# Light in electrons per pixel: its detail, 40 % of it, has about 1.4 times the noise's deviation
+LEVEL_E = 20.0
+
+# 1/depth of the search, fewer than `equal_steps` would take, for speed
+FARTHEST, NEAREST = 1 / 650, 1 / 465
+DEPTHS = np.linspace(FARTHEST, NEAREST, 24)
+
 
 def matrices() -> NDArray[np.float64]:
     """Return matrices from (x, y, 1, 1/depth) to the ray of each view (view, 3, 4)."""
@@ -57,12 +64,14 @@ def expected_light(level_e: float) -> NDArray[np.float64]:
     return level_e * np.array(views)
 
 
-def drawn_views(level_e: float, seed: int = 5) -> PinholeViews:
-    """Return the views with Poisson light and read noise."""
+def drawn_views(level_e: float) -> PinholeViews:
+    return noisy_views_of(expected_light(level_e), 5)
+
+
+def noisy_views_of(light: NDArray[np.floating], seed: int) -> PinholeViews:
+    """Return views with Poisson light and read noise."""
     generator = np.random.default_rng(seed)
-    light = expected_light(level_e)
-    counted = generator.poisson(light) + generator.normal(0, READ_VARIANCE_E2**0.5, light.shape)
-    return views_of(counted)
+    return views_of(generator.poisson(light) + generator.normal(0, READ_VARIANCE_E2**0.5, light.shape))
 
 
 def views_of(light: NDArray[np.floating]) -> PinholeViews:

@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 from scipy.stats import norm, poisson
 
 from faintfield.recon.likelihood.images import ElementalImages, PixelLikelihood, read_noise_share
-from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.prediction import (
     depth_resolution_mm,
     depth_sigma_mm,
@@ -20,6 +18,7 @@ from faintfield.recon.prediction import (
     smallest_contrast,
 )
 from faintfield.recon.solver.data_fit import DataFit
+from tests.recon.displaced import views_displaced_by
 
 
 def summed_information(mean_e: float, read_noise_e: float) -> float:
@@ -65,21 +64,15 @@ def test_views_with_less_light_say_less() -> None:
     np.testing.assert_array_equal(information_of_views(1.0, 0.0, 0.0, np.array([1.0, 0.0])), [1.0, 0.0])
 
 
-def placed_operator(views: int, generator: np.random.Generator, size: int = 24) -> PlaneOperator:
-    """The plane itself, and views in which it is moved by any part of a sample, pixels as wide as samples."""
-    shifts = np.tile(np.eye(3), (views, 1, 1))
-    shifts[1:, :2, 2] = generator.uniform(-2, 2, (views - 1, 2))
-    rows, columns = np.mgrid[: size + 4, : size + 4] - 2.0
-    return PlaneOperator(shifts, np.dstack([columns, rows]), PlaneGrid((size, size), 1.0, (0.0, 0.0)))
-
-
 @pytest.mark.parametrize(
     ("light_e", "read_noise_e", "name"),
     [(0.97, 3.46, "shifted-poisson"), (0.5, 0.3, "poisson-gaussian"), (2.0, 0.0, "poisson")],
 )
 def test_maximum_likelihood_scatters_as_predicted(light_e: float, read_noise_e: float, name: str) -> None:
     generator = np.random.default_rng(11)
-    operator = placed_operator(30, generator)
+    # The plane itself, and views in which it is moved by any part of a sample
+    shifts = np.concatenate([np.zeros((1, 2)), generator.uniform(-2, 2, (29, 2))])
+    operator = views_displaced_by(shifts, (24, 24), margin=2)
     start = np.full(operator.samples_shape, light_e, np.float32)
     expected = operator.forward(start)
     share = read_noise_share(light_e, read_noise_e)

@@ -22,7 +22,7 @@ from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.solver.initialization import mean_light_e, universal_penalty_weight
 from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.solver.pmlem import pmlem
-from tests.recon.displaced import noisy_images, views_displaced_by
+from tests.recon.displaced import noisy_images, run_until, views_displaced_by
 
 SHAPE, VIEWS = (72, 88), 49
 LIT = np.s_[8:64, 8:80]
@@ -85,10 +85,7 @@ def vetoed(of: Scene, images: ElementalImages, proposal: Image) -> Image:
         penalty_weight=of.weight,
         dual=replace(problem.dual(), proposal=proposal),
     )
-    for iterate in iterates:
-        if iterate.certificate.distance <= 0.01 or iterate.passes >= 30:
-            break
-    return iterate.plane
+    return run_until(iterates, 0.01, 30).plane
 
 
 def along(change: NDArray[np.floating], structure: Image) -> float:

@@ -15,8 +15,8 @@ from faintfield.rig.plan import MAX_FRAMES, CapturePlan, CaptureStep, Grid, cent
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
+from faintfield.rig.stages.motion import StageWorkspace
 from faintfield.rig.stages.protocol import Box, MotionLimits, Point
-from faintfield.rig.stages.workspace import StageWorkspace
 
 GRID = Grid(7, 7, 50.0, Point(10.0, 10.0))
 STEPS = (
@@ -100,13 +100,13 @@ def test_path_reaches_every_stop_from_below() -> None:
 
 
 def test_plan_outside_or_through_keep_out_is_refused() -> None:
-    plan_of().check(StageWorkspace(TRAVEL))
+    StageWorkspace(TRAVEL).check_path(plan_of().path())
     with pytest.raises(OutsideTravel):
-        plan_of().check(StageWorkspace(Box((0.0, 300.0), (0.0, 400.0))))
+        StageWorkspace(Box((0.0, 300.0), (0.0, 400.0))).check_path(plan_of().path())
     with pytest.raises(OutsideTravel):  # a node at the edge leaves no room to come from below
-        plan_of(Grid(7, 7, 50.0, Point(0.0, 0.0))).check(StageWorkspace(TRAVEL))
+        StageWorkspace(TRAVEL).check_path(plan_of(Grid(7, 7, 50.0, Point(0.0, 0.0))).path())
     with pytest.raises(KeepOutCrossed):
-        plan_of().check(StageWorkspace(TRAVEL, (Box((30.0, 35.0), (5.0, 15.0)),)))
+        StageWorkspace(TRAVEL, (Box((30.0, 35.0), (5.0, 15.0)),)).check_path(plan_of().path())
 
 
 @pytest.mark.parametrize(("controller", "origin"), [(SimulatedGrbl, -350.0), (SimulatedMarlin, 10.0)])
@@ -118,7 +118,7 @@ def test_predicted_time_is_the_time_taken(
     stage.connect()
     start = stage.home().position.point
     plan = plan_of(Grid(7, 7, 50.0, Point(origin, origin)), (CaptureStep("dark_scene", (0.1,)),))
-    plan.check(stage.workspace(), start)
+    stage.workspace().check_path(plan.path(start))
     predicted_s = plan.duration_s(stage.identify().motion, stage.feed_mm_per_s(), start)
     started_s = bench.clock.now_s()
     for stop in plan.stops:

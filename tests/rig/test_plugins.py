@@ -118,7 +118,7 @@ def test_built_in_backends_are_those_with_settings() -> None:
 
 def test_camera_of_another_package(packages: Path, tmp_path: Path) -> None:
     settings = read_rig(rig_file(tmp_path))
-    assert settings.camera == PluginSettings("sky", {"folder": "frames"}, ("RG", "GB"))
+    assert settings.camera == PluginSettings("sky", {"folder": "frames"}, mosaic=("RG", "GB"))
     assert settings.mosaic == ("RG", "GB")
     guarded = open_rig(settings).camera
     assert isinstance(guarded, plugins.PluginCamera)

@@ -5,7 +5,7 @@ over frames is known from the scatter of the frames, and is taken out.
 """
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -13,13 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from faintfield.calib.noise.intervals import root
-from faintfield.calib.noise.result import Estimate
+from faintfield.calib.noise.estimate import Estimate, root
 from faintfield.calib.noise.series.statistics import Series
-from faintfield.calib.noise.strips import map_of, mean_over, over_strips, total_of
-
-type Array = NDArray[np.float64]
-type Mask = NDArray[np.bool_]
+from faintfield.calib.noise.strips import Array, Mask, map_of, mean_over, over_strips, total_of
 
 # Width of the box whose mean is subtracted from bright images before their histogram is taken.
 _BOX_PX = 5
@@ -35,32 +31,26 @@ _QUANTILE = float(stats.norm.ppf(0.975))
 
 @dataclass(frozen=True)
 class TemporalNoise:
-    """Variances of what temporal noise leaves in a mean image: of each pixel, and of the mean of a row and a column.
+    """Temporal noise that is left in a mean image.
 
-    Those that end in `_se` are their standard errors: of few frames, the noise is known no better than the pattern.
+    Attributes
+    ----------
+    variances, errors : array (3,)
+        Variance of a pixel, of the mean of a row and of that of a column, and their standard errors: of few frames, the
+        noise is known no better than the pattern.
     """
 
-    pixel: float
-    row: float
-    column: float
-    pixel_se: float = 0.0
-    row_se: float = 0.0
-    column_se: float = 0.0
+    variances: Array
+    errors: Array
 
     def scaled(self, factor: float) -> "TemporalNoise":
-        """Return the variances of an image that is multiplied by √factor."""
-        return TemporalNoise(*(getattr(self, field.name) * factor for field in fields(self)))
+        """Return the noise of an image that is multiplied by √factor."""
+        return TemporalNoise(self.variances * factor, self.errors * factor)
 
     def __add__(self, other: "TemporalNoise") -> "TemporalNoise":
-        """Return the variances of a sum or difference of images."""
-        return TemporalNoise(
-            self.pixel + other.pixel,
-            self.row + other.row,
-            self.column + other.column,
-            math.hypot(self.pixel_se, other.pixel_se),
-            math.hypot(self.row_se, other.row_se),
-            math.hypot(self.column_se, other.column_se),
-        )
+        """Return the noise of a sum or difference of images."""
+        errors = np.array([*map(math.hypot, self.errors, other.errors)])
+        return TemporalNoise(self.variances + other.variances, errors)
 
 
 @dataclass(frozen=True)
@@ -81,8 +71,7 @@ def temporal_noise(series: Series, used: Mask) -> TemporalNoise:
     rows, columns = (size - 1 for size in used.shape)
     row, column = series.row_noise_dn2 * (1 + 1 / rows), series.column_noise_dn2 * (1 + 1 / columns)
     variances = np.array([within, row, column]) / series.frames
-    errors = variances * np.sqrt(2 / (again * np.array([pixels, rows, columns])))
-    return TemporalNoise(*variances.tolist(), *errors.tolist())
+    return TemporalNoise(variances, variances * np.sqrt(2 / (again * np.array([pixels, rows, columns]))))
 
 
 def nonuniformity(image: NDArray[Any], used: Mask, noise: TemporalNoise, scale: float = 1.0) -> Nonuniformity:
@@ -95,9 +84,10 @@ def nonuniformity(image: NDArray[Any], used: Mask, noise: TemporalNoise, scale: 
     freedom = used.sum() * _freedom_share(used)
     across = used.sum() / rows.size, used.sum() / columns.size
     scatter = squares / freedom
-    pixel, pixel_se = scatter - noise.pixel, math.hypot(scatter * math.sqrt(2 / freedom), noise.pixel_se)
-    row, row_se = _of_means(rows, noise.row + pixel / across[0], noise.row_se)
-    column, column_se = _of_means(columns, noise.column + pixel / across[1], noise.column_se)
+    (of_pixel, of_row, of_column), errors = noise.variances.tolist(), noise.errors.tolist()
+    pixel, pixel_se = scatter - of_pixel, math.hypot(scatter * math.sqrt(2 / freedom), errors[0])
+    row, row_se = _of_means(rows, of_row + pixel / across[0], errors[1])
+    column, column_se = _of_means(columns, of_column + pixel / across[1], errors[2])
     total_se = float(np.sqrt(pixel_se**2 + row_se**2 + column_se**2))
     return Nonuniformity(
         total=root(pixel + row + column, total_se, _QUANTILE, scale),
@@ -116,7 +106,6 @@ def _of_means(means: Array, noise: float, noise_se: float) -> tuple[float, float
 
 
 def _freedom_share(used: Mask) -> float:
-    """Return the share of degrees of freedom left when rows and columns are taken out."""
     return max(float(used.sum()) - sum(used.shape) + 1, 1.0) / float(used.sum())
 
 
@@ -127,7 +116,7 @@ def _parts(image: NDArray[Any], used: Mask) -> tuple[Array, Array, float]:
     def deviation(rows: slice) -> Array:
         return np.where(used[rows], image[rows] - np.float64(mean), 0.0)
 
-    sums = over_strips(lambda rows: ((it := deviation(rows)).sum(1), it.sum(0)), used.shape)
+    sums = over_strips(lambda rows: ((part := deviation(rows)).sum(1), part.sum(0)), used.shape)
     of_rows, of_columns = zip(*sums, strict=True)
     per_row, per_column = used.sum(1), used.sum(0)
     row = np.concatenate(of_rows) / np.maximum(per_row, 1)

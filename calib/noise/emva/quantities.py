@@ -14,14 +14,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
-from faintfield.calib.noise.intervals import interval
+from faintfield.calib.noise.estimate import Estimate, interval
 from faintfield.calib.noise.likelihood.rounding import ROUNDING_DN2
-from faintfield.calib.noise.result import Estimate
-
-type Array = NDArray[np.float64]
+from faintfield.calib.noise.strips import Array
 
 _QUANTILE = float(stats.norm.ppf(0.975))
 
@@ -42,9 +39,7 @@ def threshold_e(gain_dn_per_e: float, noise_e: float) -> float:
     return float(np.sqrt(noise_e**2 + ROUNDING_DN2 / gain_dn_per_e**2 + 0.25) + 0.5)
 
 
-def snr(
-    charge_e: Array, gain_dn_per_e: float, noise_e: float, dsnu_e: float = 0.0, prnu: float = 0.0
-) -> NDArray[np.float64]:
+def snr(charge_e: Array, gain_dn_per_e: float, noise_e: float, dsnu_e: float = 0.0, prnu: float = 0.0) -> Array:
     """Return the signal-to-noise ratio of charges μ_e = η μ_p, eq. (6).
 
     With `dsnu_e` and `prnu` it is the total one, which counts the differences between pixels as noise too.
@@ -64,7 +59,7 @@ class Inputs:
     whys : dict of str
         Why the others have no value.
     covariance : array (quantity, quantity)
-        Of the values; scaled so that 1.96 standard errors are the half width of each interval.
+        Covariance of the values, scaled so that 1.96 standard errors are the half width of each interval.
     """
 
     values: dict[str, float]
@@ -79,8 +74,8 @@ class Inputs:
         order = list(self.values)
         at = [order.index(name) for name in needs]
         covariance = self.covariance[np.ix_(at, at)]
-        found, se = propagate(formula, np.array([self.values[name] for name in needs]), covariance)
-        return interval(found, se, _QUANTILE, positive=True)
+        value, se = propagate(formula, np.array([self.values[name] for name in needs]), covariance)
+        return interval(value, se, _QUANTILE, positive=True)
 
 
 def propagate(formula: Callable[..., float], values: Array, covariance: Array) -> tuple[float, float]:
@@ -113,15 +108,15 @@ def gather_inputs(
     covariance : tuple (names, array)
         Covariance of those of the first three that have values, possibly with others.
     full_well : bool
-        What saturates is the full well, not the converter.
+        The full well saturates, not the converter.
     charge_error : float
         Relative error of the charge of flats beside that of the gain: the bend of the response is not known exactly.
     """
     names = [name for name in ("gain_dn_per_e", "read_noise_e", "dark_current_e_per_s") if name in covariance[0]]
     derived = ("quantum_efficiency", "saturation_e") if "gain_dn_per_e" in names else ()
     names += [name for name in derived if estimates[name].value is not None]
-    values = {name: _number(estimates[name].value) for name in names}
-    errors = np.array([_error(estimates[name]) for name in names])
+    values = {name: estimates[name].value or 0.0 for name in names}
+    errors = np.array([np.ptp(estimates[name].ci95 or (0.0, 0.0)) / (2 * _QUANTILE) for name in names])
     known = [name for name in names if name in covariance[0]]
     at = [list(covariance[0]).index(name) for name in known]
     part = np.asarray(covariance[1])[np.ix_(at, at)]
@@ -139,21 +134,8 @@ def gather_inputs(
         own = math.hypot(own, 0.0 if from_efficiency else charge_error * values[names[index]])
         matrix[index, :index] = matrix[:index, index] = factor * matrix[source, :index]
         matrix[index, index] = factor**2 * matrix[source, source] + own**2
-    whys = {name: it.why or "" for name, it in estimates.items() if it.value is None}
+    whys = {name: estimate.why or "" for name, estimate in estimates.items() if estimate.value is None}
     return Inputs(values, whys, matrix)
-
-
-def _number(value: float | None) -> float:
-    """Return a value that is known to be one."""
-    assert value is not None
-    return value
-
-
-def _error(estimate: Estimate) -> float:
-    """Return the standard error of a normal law with the interval of an estimate."""
-    if estimate.ci95 is None:
-        return estimate.se or 0.0
-    return (estimate.ci95[1] - estimate.ci95[0]) / (2 * _QUANTILE)
 
 
 def derived_quantities(inputs: Inputs, exposure_s: float) -> dict[str, Estimate]:
@@ -162,7 +144,7 @@ def derived_quantities(inputs: Inputs, exposure_s: float) -> dict[str, Estimate]
     Parameters
     ----------
     inputs : Inputs
-        What they follow from.
+        Gain, noise, efficiency and capacity with their covariance.
     exposure_s : float
         Exposure of the dark noise.
 

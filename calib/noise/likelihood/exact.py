@@ -12,14 +12,14 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri
 
-from faintfield.calib.errors import PoorFit
+from faintfield.calib.errors import NotIdentifiable, PoorFit
 from faintfield.calib.noise.likelihood.gaussian import flat_log_likelihood
 from faintfield.calib.noise.likelihood.marginal import PARAMETERS, Counts, MarginalLikelihood
-from faintfield.calib.noise.likelihood.maximum import NoiseFit
+from faintfield.calib.noise.likelihood.maximum import Bend, NoiseFit
 from faintfield.calib.noise.likelihood.moments import Moments
-
-type Array = NDArray[np.float64]
+from faintfield.calib.noise.strips import Array, Mask
 
 # The log-likelihood of darks and flats together at given parameters, with gradient and information.
 type _Objective = Callable[[Array], tuple[float, Array, Array]]
@@ -36,16 +36,8 @@ _MIN_GAIN, _MIN_STEP_LENGTH = 1e-3, 1e-4
 _TRIED_DCNU, _MIN_RISE = (0.08, 0.3), 4.0
 
 
-@dataclass(frozen=True)
-class Bent:
-    """The bend of the response: its coefficients, and their covariance."""
-
-    values: dict[str, float]
-    covariance: Array
-
-
 def fit_exact(
-    counts: Counts, start: dict[str, float], moments: Moments, bent: Bent, *, exact: bool, try_spread: bool
+    counts: Counts, start: dict[str, float], moments: Moments, bend: Bend, *, exact: bool, try_spread: bool
 ) -> NoiseFit:
     """Maximize the likelihood (4), times that of the flats' photon transfer if there are flats.
 
@@ -59,7 +51,7 @@ def fit_exact(
         Initial values of `PARAMETERS`; they also decide the grids.
     moments : Moments
         Statistics of the flat series, if there are any, with the scatter of their noise.
-    bent : Bent
+    bend : Bend
         Response of the flats, which darks do not reach.
     exact : bool
         Use the Poisson sum, eq. (2), rather than the censored normal law, eq. (3).
@@ -81,28 +73,22 @@ def fit_exact(
         darks = MarginalLikelihood(counts, start, exact=exact, spread=spread)
 
         def evaluate(x: Array) -> tuple[float, Array, Array]:
-            dark, flat = darks.evaluate(x), _flat_part(x, moments, bent)
+            dark, flat = darks.evaluate(x), _flat_part(x, moments, bend)
             return dark[0] + flat[0], dark[1] + flat[1], dark[2] + flat[2]
 
         return evaluate
 
-    even = _maximize(objective(spread=False), np.array([start[name] for name in PARAMETERS]), ~_IS_DCNU)
-    if not try_spread:
-        return _with_bend(even.fit(), bent)
-    spread = objective(spread=True)
-    tried = [np.where(_IS_DCNU, dcnu, even.x) for dcnu in _TRIED_DCNU]
-    rises = [spread(x)[0] - even.log_likelihood for x in tried]
-    if max(rises) < _MIN_RISE:
-        return _with_bend(even.fit(), bent)
-    return _with_bend(_maximize(spread, tried[int(np.argmax(rises))], np.ones_like(_IS_DCNU)).fit(), bent)
-
-
-def _with_bend(fit: NoiseFit, bent: Bent) -> NoiseFit:
-    """Return a fit with the bend of the response among its values."""
-    size = len(fit.values)
-    covariance = np.zeros((size + len(bent.values),) * 2)
-    covariance[:size, :size], covariance[size:, size:] = fit.covariance, bent.covariance
-    return NoiseFit(fit.values | bent.values, covariance, fit.log_likelihood)
+    maximum = _maximize(objective(spread=False), np.array([start[name] for name in PARAMETERS]), ~_IS_DCNU)
+    if try_spread:
+        spread = objective(spread=True)
+        starts = [np.where(_IS_DCNU, dcnu, maximum.x) for dcnu in _TRIED_DCNU]
+        rises = [spread(x)[0] - maximum.log_likelihood for x in starts]
+        if max(rises) >= _MIN_RISE:
+            maximum = _maximize(spread, starts[int(np.argmax(rises))], np.ones_like(_IS_DCNU))
+    size, fit = len(PARAMETERS), maximum.fit()
+    covariance = np.zeros((size + len(bend.values),) * 2)
+    covariance[:size, :size], covariance[size:, size:] = fit.covariance, bend.covariance
+    return NoiseFit(fit.values | bend.values, covariance, fit.log_likelihood)
 
 
 @dataclass(frozen=True)
@@ -139,7 +125,7 @@ class _Maximum:
         return NoiseFit(values, jacobian @ self.covariance @ jacobian.T, self.log_likelihood)
 
 
-def _maximize(objective: _Objective, begin: Array, free: NDArray[np.bool_]) -> _Maximum:
+def _maximize(objective: _Objective, begin: Array, free: Mask) -> _Maximum:
     """Climb over the free parameters by scoring steps, halved where they overshoot; the others are zero."""
     x = np.where(free, begin, 0.0)
     best = objective(x)
@@ -148,29 +134,23 @@ def _maximize(objective: _Objective, begin: Array, free: NDArray[np.bool_]) -> _
         step[free] = np.linalg.lstsq(best[2][np.ix_(free, free)], best[1][free])[0]
         step *= min(1.0, 1.0 / max(float(np.abs(step).max()), 1e-12))
         if best[1] @ step < _MIN_GAIN:
-            covariance = np.zeros_like(best[2])
-            covariance[np.ix_(free, free)] = _inverse(best[2][np.ix_(free, free)])
+            # The logarithm of a dark current near zero has next to no information, but the dark current has an error.
+            information, covariance = best[2][np.ix_(free, free)], np.zeros_like(best[2])
+            root = np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
+            scale = np.outer(root, root)
+            covariance[np.ix_(free, free)] = np.linalg.pinv(information / scale) / scale
             return _Maximum(x, covariance, best[0])
         length = 1.0
-        while (tried := objective(x + length * step))[0] < best[0] and length > _MIN_STEP_LENGTH:
+        while (trial := objective(x + length * step))[0] < best[0] and length > _MIN_STEP_LENGTH:
             length /= 2
-        x, best = x + length * step, tried
+        x, best = x + length * step, trial
     raise PoorFit(
         f"the likelihood of the dark values did not settle in {_MAX_STEPS} steps; check that the darks were taken "
         "with the lens covered, or record flats, which fix the gain"
     )
 
 
-def _inverse(information: Array) -> Array:
-    """Return the inverse of the information, where that of one parameter may be much smaller than that of others.
-
-    The logarithm of a dark current near zero has next to none, but the dark current itself has an error.
-    """
-    scale = np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
-    return np.asarray(np.linalg.pinv(information / np.outer(scale, scale)) / np.outer(scale, scale))
-
-
-def _flat_part(x: Array, moments: Moments, bent: Bent) -> tuple[float, Array, Array]:
+def _flat_part(x: Array, moments: Moments, bend: Bend) -> tuple[float, Array, Array]:
     """Return the flats' ln L, gradient and Fisher information by `PARAMETERS`, the bend integrated out.
 
     Its normal law times a likelihood that is normal near its coefficients leaves ½ gᵀ M g, with the gradient g by the
@@ -179,25 +159,83 @@ def _flat_part(x: Array, moments: Moments, bent: Bent) -> tuple[float, Array, Ar
     size, flats = len(PARAMETERS), moments.flats
     if not flats.frames.size:
         return 0.0, np.zeros(size), np.zeros((size, size))
-    s, b = ca.SX.sym("s", size), ca.SX.sym("b", len(bent.values))
+    s, b = ca.SX.sym("s", size), ca.SX.sym("b", len(bend.values))
     values = {"log_gain": s[0], "log_read_dn2": 2 * (s[0] + s[1]), "offset_dn": s[4]}
-    units = np.sqrt(np.diag(bent.covariance))
-    values |= {name: bent.values[name] + b[k] * units[k] for k, name in enumerate(bent.values)}
+    units = np.sqrt(np.diag(bend.covariance))
+    values |= {name: bend.values[name] + b[k] * units[k] for k, name in enumerate(bend.values)}
     log_likelihood, log_variances, half_freedom = flat_log_likelihood(values, flats, moments.freedom, moments.excess)
     logs = ca.vertcat(*log_variances)
     by_bend, weight = ca.jacobian(logs, b), ca.diag(ca.DM(half_freedom))
-    if bent.values:
-        prior = ca.DM(np.linalg.pinv(bent.covariance / np.outer(units, units)))
+    if bend.values:
+        prior = ca.DM(np.linalg.pinv(bend.covariance / np.outer(units, units)))
         precision = prior + by_bend.T @ weight @ by_bend
         slope = ca.gradient(log_likelihood, b)
         log_likelihood = log_likelihood + 0.5 * slope.T @ ca.solve(precision, slope)
     else:
         precision = ca.SX(0, 0)
     outputs = [log_likelihood, ca.gradient(log_likelihood, s), ca.jacobian(logs, s), by_bend, precision]
-    found = ca.Function("flats", [s, b], outputs)(x, np.zeros(len(bent.values)))
-    value, gradient, by_series, bends, inverse = (np.array(part) for part in found)
+    results = ca.Function("flats", [s, b], outputs)(x, np.zeros(len(bend.values)))
+    value, gradient, by_series, bends, inverse = (np.array(part) for part in results)
     information = (by_series.T * np.array(half_freedom)) @ by_series
-    if bent.values:
+    if bend.values:
         cross = (by_series.T * np.array(half_freedom)) @ bends
         information -= cross @ np.linalg.solve(inverse, cross.T)
     return float(value[0, 0]), gradient.ravel(), information
+
+
+def gaussian_start(gaussian: NoiseFit) -> dict[str, float]:
+    """Return initial values for the exact likelihood from the Gaussian fit."""
+    values = gaussian.values
+    signal = max(values["dark_signal_dn_per_s"], 1e-6)
+    return {
+        "log_gain": values["log_gain"],
+        "log_read_e": 0.5 * values["log_read_dn2"] - values["log_gain"],
+        "log_dark_e_per_s": float(np.log(signal)) - values["log_gain"],
+        "dcnu": float(np.sqrt(max(values.get("dcnu_dn2_per_s2", 0.0), 0.0)) / signal),
+        "offset_dn": values["offset_dn"],
+        "log_dsnu_dn": 0.5 * float(np.log(max(values["dsnu_dn2"], 1e-2))),
+    }
+
+
+def censored_start(counts: Counts) -> dict[str, float]:
+    """Return initial values for the censored likelihood from quantiles above the floor.
+
+    Raises
+    ------
+    NotIdentifiable
+        There are no two exposures at which a twentieth of the values is above the black level.
+    """
+    series = zip(counts.exposure_s, counts.values_dn, strict=True)
+    normals = [(t, *law) for t, values in series if (law := _normal_above(values, counts.floor_dn or 0))]
+    if len({t for t, *_ in normals}) < 2:
+        raise NotIdentifiable(
+            f"the darks are cut off at the black level: of {len(counts.exposure_s)} exposures {len(normals)} have a "
+            "twentieth of their values above it, 2 are needed; raise the camera's black offset and record them again"
+        )
+    exposure, centre, spread2 = zip(*normals, strict=True)
+    slope, offset = np.polyfit(exposure, centre, 1)
+    slope = max(float(slope), 1e-6)
+    excess, both = np.polyfit(exposure, spread2, 1)
+    gain = float(np.clip(excess / slope, 0.05, 50.0))
+    read2 = max(0.7 * float(both), 0.1)
+    return {
+        "log_gain": float(np.log(gain)),
+        "log_read_e": 0.5 * float(np.log(read2)) - float(np.log(gain)),
+        "log_dark_e_per_s": float(np.log(slope / gain)),
+        "dcnu": 0.05,
+        "offset_dn": float(offset),
+        "log_dsnu_dn": 0.5 * float(np.log(max(0.3 * float(both), 0.1))),
+    }
+
+
+def _normal_above(values: NDArray[np.int32], floor_dn: int) -> tuple[float, float] | None:
+    """Return mean and variance of the normal law through two quantiles above the floor, None with too few values."""
+    hidden = float((values == floor_dn).mean())
+    if hidden > 0.95:
+        return None
+    low, high = max(0.5, hidden + 0.2 * (1 - hidden)), max(0.84, hidden + 0.8 * (1 - hidden))
+    # Half a DN of dither smooths the steps of the rounding.
+    dithered = values + np.linspace(-0.5, 0.5, values.size).reshape(values.shape)
+    below, above = np.quantile(dithered, [low, high])
+    sigma = float((above - below) / (ndtri(high) - ndtri(low)))
+    return float(below - sigma * ndtri(low)), sigma**2

@@ -16,7 +16,6 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from faintfield.calib.noise.likelihood.moments import NO_EXCESS, Excess, FlatMoments, Moments
 from faintfield.calib.noise.likelihood.response import (
@@ -27,6 +26,7 @@ from faintfield.calib.noise.likelihood.response import (
     level_log_likelihood,
 )
 from faintfield.calib.noise.likelihood.rounding import ROUNDING_DN2
+from faintfield.calib.noise.strips import Array
 
 
 def main_quantities(values: Mapping[str, float]) -> dict[str, tuple[float, dict[str, float]]]:
@@ -42,7 +42,7 @@ def main_quantities(values: Mapping[str, float]) -> dict[str, tuple[float, dict[
     }
 
 
-def dark_variances_dn2(values: Mapping[str, Any], exposure_s: NDArray[np.float64]) -> list[Any]:
+def dark_variances_dn2(values: Mapping[str, Any], exposure_s: Array) -> list[Any]:
     """Return the pixel noise of each dark series, eq. (1); parameters may be numbers or casadi expressions.
 
     A negative dark signal, which is drift of the black level, has no shot noise.
@@ -52,7 +52,7 @@ def dark_variances_dn2(values: Mapping[str, Any], exposure_s: NDArray[np.float64
     return [_exp(values["log_read_dn2"]) + gain * slope * t + ROUNDING_DN2 for t in exposure_s]
 
 
-def flat_variances_dn2(values: Mapping[str, Any], mean_dn: NDArray[np.float64]) -> list[Any]:
+def flat_variances_dn2(values: Mapping[str, Any], mean_dn: Array) -> list[Any]:
     """Return the pixel noise of each flat series: eq. (1), with the local gain of the response, eq. (5)."""
     if not mean_dn.size:
         return []
@@ -69,8 +69,7 @@ def flat_log_likelihood(
     for index, v in enumerate(flat_variances_dn2(values, flats.mean_dn)):
         weight = flats.evenness[index]
         degrees = (flats.frames[index] - 1) * freedom * weight
-        rounding2 = 0.0 if flats.rounding2 is None else flats.rounding2[index]
-        grown = excess.dispersion(degrees, rounding2, flat=True)
+        grown = excess.dispersion(degrees, flats.rounding2[index], flat=True)
         total -= _chi_squared(degrees / grown, flats.within_dn2[index] * weight / grown, v)
         log_variances.append(ca.log(v))
         half_freedom.append(0.5 * degrees / grown)
@@ -91,7 +90,6 @@ def level_variances_dn2(values: Mapping[str, Any], moments: Moments) -> list[Any
 
 
 def _exp(value: Any) -> Any:
-    """Return exp of a number or a casadi expression."""
     return ca.exp(value) if isinstance(value, ca.SX) else float(np.exp(value))
 
 
@@ -99,16 +97,15 @@ def negative_log_likelihood(values: Mapping[str, Any], moments: Moments) -> Any:
     """Return −ln L as a casadi expression, up to a constant that depends on the frames alone."""
     darks = moments.darks
     dark_v = dark_variances_dn2(values, darks.exposure_s)
-    total = _between(values, dark_v, moments) + _line(values, dark_v, moments)
+    total = _wishart_cost(values, dark_v, moments) + _dark_level_cost(values, dark_v, moments)
     for j, v in enumerate(dark_v):
         freedom = (darks.frames[j] - 1) * moments.freedom
-        rounding2 = 0.0 if darks.rounding2 is None else darks.rounding2[j]
-        grown = moments.excess.dispersion(freedom, rounding2, flat=False)
+        grown = moments.excess.dispersion(freedom, darks.rounding2[j], flat=False)
         total += _chi_squared(freedom / grown, darks.within_dn2[j] / grown, v)
-    return total - _light(values, moments)
+    return total - _flat_log_likelihood(values, moments)
 
 
-def _light(values: Mapping[str, Any], moments: Moments) -> Any:
+def _flat_log_likelihood(values: Mapping[str, Any], moments: Moments) -> Any:
     """Return ln L of the flats: of their noise, and of their levels where these tell the bend of the response."""
     flats = moments.flats
     total = flat_log_likelihood(values, flats, moments.freedom, moments.excess)[0]
@@ -122,7 +119,7 @@ def _light(values: Mapping[str, Any], moments: Moments) -> Any:
     return total + level_log_likelihood(values, flats.light, flats.mean_dn, flats.exposure_s, variances)
 
 
-def _line(values: Mapping[str, Any], dark_v: list[Any], moments: Moments) -> Any:
+def _dark_level_cost(values: Mapping[str, Any], dark_v: list[Any], moments: Moments) -> Any:
     """Return −ln of the restricted likelihood (REML) of the frames' levels about the straight line μ + d t.
 
     Offset and slope are integrated out; otherwise the two degrees of freedom that they take would make the jitter too
@@ -147,7 +144,7 @@ def _chi_squared(freedom: float, squares: Any, variance: Any) -> Any:
     return 0.5 * (freedom * ca.log(variance) + squares / variance)
 
 
-def _between(values: Mapping[str, Any], dark_v: list[Any], moments: Moments) -> Any:
+def _wishart_cost(values: Mapping[str, Any], dark_v: list[Any], moments: Moments) -> Any:
     """Return −ln of the Wishart likelihood of the scatter of pixel means, covariance A + s² 11ᵀ + q² ttᵀ.
 
     A is diagonal with v_j/n_j. Woodbury's identity reduces it to 2 × 2 matrices, whatever the number of series. Series
@@ -168,12 +165,11 @@ def _between(values: Mapping[str, Any], dark_v: list[Any], moments: Moments) -> 
     log_det = ca.log(determinant) - sum(ca.log(w) for w in weight)
     trace = sum(w * scatter[j, j] for j, w in enumerate(weight)) - correction
     # What rounding may make of the noise, it may make of the means, too: the pixels share its error.
-    rounding2 = 0.0 if moments.darks.rounding2 is None else float(moments.darks.rounding2[several].max(initial=0.0))
+    rounding2 = float(moments.darks.rounding2[several].max(initial=0.0))
     return 0.5 * (moments.freedom * log_det + trace) / (1 + 0.5 * moments.freedom * rounding2)
 
 
-def _quadratic(weight: list[Any], a: NDArray[np.float64], b: NDArray[np.float64], scatter: NDArray[np.float64]) -> Any:
+def _quadratic(weight: list[Any], a: Array, b: Array, scatter: Array) -> Any:
     """Return aᵀ W S W b with W = diag(weight)."""
-    left = ca.vertcat(*[w * a[j] for j, w in enumerate(weight)])
-    right = ca.vertcat(*[w * b[j] for j, w in enumerate(weight)])
+    left, right = (ca.vertcat(*[w * side[j] for j, w in enumerate(weight)]) for side in (a, b))
     return ca.mtimes([left.T, ca.DM(scatter), right])

@@ -4,13 +4,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from faintfield.calib.noise.compiled import compiled
 from faintfield.calib.noise.series.statistics import Series
-from faintfield.calib.noise.strips import over_strips
-
-type Array = NDArray[np.float64]
+from faintfield.calib.noise.strips import Array, Mask, compiled, over_strips
 
 # Blocks of pixels along each side of a frame.
 BLOCKS = 8
@@ -66,7 +62,7 @@ class SeriesNoise:
         return measured[enough] / (expected[enough] * freedom), count[enough] * freedom
 
 
-def group_noise(series: Series, used: NDArray[np.bool_], floor_dn: float, blocks: tuple[int, int]) -> SeriesNoise:
+def group_noise(series: Series, used: Mask, floor_dn: float, blocks: tuple[int, int]) -> SeriesNoise:
     """Return the sums of a series; a flat's pixels count as no darker than `floor_dn`."""
     nodes = np.zeros(1)
     if series.conditions.kind == "flat":
@@ -77,10 +73,7 @@ def group_noise(series: Series, used: NDArray[np.bool_], floor_dn: float, blocks
     by_row = np.zeros((len(used), 2 + nodes.size))
 
     def work(rows: slice) -> tuple[Array, Array]:
-        by_block, by_column = (
-            np.zeros((blocks[0] * blocks[1], 2 + nodes.size)),
-            np.zeros((used.shape[1], 2 + nodes.size)),
-        )
+        by_block, by_column = (np.zeros((size, 2 + nodes.size)) for size in (blocks[0] * blocks[1], used.shape[1]))
         _sum_groups(
             series.within_dn2[rows], used[rows], series.pattern_dn[rows], series.row_dn[rows] + series.levels_dn.mean(),
             series.column_dn, nodes, row_of[rows] * blocks[1], column_of, by_block, by_row[rows], by_column,

@@ -19,7 +19,6 @@ The scores s_i = ∇ ln L_i are posterior means (Fisher's identity).
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import casadi as ca
 import numpy as np
@@ -27,7 +26,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.special import gammaln
 
-type Array = NDArray[np.float64]
+from faintfield.calib.noise.strips import Array
 
 # The parameters of a mass function, and those of the likelihood, in this order.
 MASS_PARAMETERS = ("log_gain", "log_read_e", "log_dark_e_per_s", "dcnu")
@@ -108,11 +107,9 @@ class MarginalLikelihood:
         At the true parameters of many frames the sum is the Fisher information.
         """
         tables = [mass(x[: len(MASS_PARAMETERS)]) for mass in self._masses]
-        log_mass = self._by_offset([(table.log_mass, table.log_tail) for table in tables])
-        slopes = [
-            self._by_offset([(table.mass_slope[parameter], table.tail_slope[parameter]) for table in tables])
-            for parameter in range(len(MASS_PARAMETERS))
-        ]
+        log_mass = self._by_offset([logs for logs, _ in tables])
+        parameters = range(len(MASS_PARAMETERS))
+        slopes = [self._by_offset([by_parameter[:, index] for _, by_parameter in tables]) for index in parameters]
         total, gradient = 0.0, np.zeros(len(PARAMETERS))
         products = np.zeros((len(PARAMETERS), len(PARAMETERS)))
         for first in range(0, self._counts.shape[0], _CHUNK_PX):
@@ -122,7 +119,7 @@ class MarginalLikelihood:
             products += scores.T @ scores
         return total, gradient, products
 
-    def _by_offset(self, tables: Sequence[tuple[Array, Array]]) -> Array:
+    def _by_offset(self, tables: Sequence[Array]) -> Array:
         """Return tables of masses and tails over u, one per series, as one table over (value, offset × node)."""
         blocks = []
         for (mass, tail), values in zip(tables, self._values, strict=True):
@@ -180,27 +177,9 @@ def _count(indices: Sequence[NDArray[np.int64]], sizes: Sequence[int]) -> sparse
     return sparse.coo_array((ones, (pixel.ravel(), column.ravel())), shape=(column.shape[1], firsts[-1])).tocsr()
 
 
-@dataclass(frozen=True)
-class MassTable:
-    """ln P and its derivatives on a grid of u = y − o, for one exposure.
-
-    Attributes
-    ----------
-    log_mass, log_tail : array (u, node)
-        ln P(y | o), and ln P(≤ y | o), which is the mass of the floor.
-    mass_slope, tail_slope : array (parameter, u, node)
-        Their derivatives by `MASS_PARAMETERS`.
-    """
-
-    log_mass: NDArray[np.float64]
-    log_tail: NDArray[np.float64]
-    mass_slope: NDArray[np.float64]
-    tail_slope: NDArray[np.float64]
-
-
 def mass_function(
-    u_dn: NDArray[np.float64], exposure_s: float, max_charge_e: float, *, exact: bool, spread: bool
-) -> Callable[[NDArray[np.float64]], MassTable]:
+    u_dn: Array, exposure_s: float, max_charge_e: float, *, exact: bool, spread: bool
+) -> Callable[[Array], tuple[Array, Array]]:
     """Return the mass function of one exposure, differentiated by casadi.
 
     Parameters
@@ -211,15 +190,14 @@ def mass_function(
         Exposure time t.
     max_charge_e : float
         Largest λ at which the function will be evaluated; the Poisson sum extends well above it.
-    exact : bool
-        Use eq. (2) rather than (3).
-    spread : bool
-        Let pixels differ in dark current, with several nodes rather than one.
+    exact, spread : bool
+        As for `MarginalLikelihood`; a spread needs several nodes.
 
     Returns
     -------
     callable
-        Function from the values of `MASS_PARAMETERS` to a `MassTable`.
+        Function from the values of `MASS_PARAMETERS` to ln P(y | o) and ln P(≤ y | o), which is the mass of the floor,
+        as one array (mass or tail, u, node), and their derivatives (mass or tail, parameter, u, node).
     """
     x = ca.MX.sym("x", len(MASS_PARAMETERS))
     gain, read, dark = ca.exp(x[0]), ca.exp(x[1]), ca.exp(x[2])
@@ -233,23 +211,21 @@ def mass_function(
         mass.append(ca.log(ca.fmax(upper - lower, _MIN_PROBABILITY)))
         tail.append(ca.log(ca.fmax(upper, _MIN_PROBABILITY)))
     table = ca.vertcat(*mass, *tail)
-    return partial(_tabulate, ca.Function("mass", [x], [table, ca.jacobian(table, x)]), (2, len(mass), u_dn.size))
+    function, shape = ca.Function("mass", [x], [table, ca.jacobian(table, x)]), (2, len(mass), u_dn.size)
+
+    def tabulate(values: Array) -> tuple[Array, Array]:
+        logs, slopes = (np.array(part) for part in function(values))
+        return logs.reshape(shape).transpose(0, 2, 1), slopes.reshape(*shape, x.numel()).transpose(0, 3, 2, 1)
+
+    return tabulate
 
 
-def _tabulate(function: ca.Function, shape: tuple[int, int, int], values: NDArray[np.float64]) -> MassTable:
-    """Return the table at some values of `MASS_PARAMETERS`; `shape` is (mass or tail, node, u)."""
-    logs, slopes = (np.array(part) for part in function(values))
-    logs = logs.reshape(shape).transpose(0, 2, 1)
-    slopes = slopes.reshape(*shape, len(MASS_PARAMETERS)).transpose(0, 3, 2, 1)
-    return MassTable(logs[0], logs[1], slopes[0], slopes[1])
-
-
-def _normal_tail(u_dn: NDArray[np.float64], charge: ca.MX, gain: ca.MX, read: ca.MX) -> ca.MX:
+def _normal_tail(u_dn: Array, charge: ca.MX, gain: ca.MX, read: ca.MX) -> ca.MX:
     """Return Φ((u − g λ) / s), eq. (3)."""
     return _ndtr((ca.MX(u_dn) - gain * charge) / (gain * ca.sqrt(read**2 + charge)))
 
 
-def _poisson_tail(u_dn: NDArray[np.float64], charge: ca.MX, gain: ca.MX, read: ca.MX, max_charge_e: float) -> ca.MX:
+def _poisson_tail(u_dn: Array, charge: ca.MX, gain: ca.MX, read: ca.MX, max_charge_e: float) -> ca.MX:
     """Return Σ_k P(k; λ) Φ((u − g k) / gσ), eq. (2)."""
     k = np.arange(int(max_charge_e + 8 * np.sqrt(max_charge_e) + 10))
     poisson = ca.exp(ca.DM(k) * ca.log(charge) - charge - ca.DM(gammaln(k + 1.0)))
@@ -258,5 +234,4 @@ def _poisson_tail(u_dn: NDArray[np.float64], charge: ca.MX, gain: ca.MX, read: c
 
 
 def _ndtr(z: ca.MX) -> ca.MX:
-    """Return the normal distribution function Φ."""
     return ca.MX(0.5 * (1 + ca.erf(z / np.sqrt(2.0))))

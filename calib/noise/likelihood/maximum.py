@@ -6,7 +6,6 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
 from faintfield.calib.errors import PoorFit
@@ -14,6 +13,7 @@ from faintfield.calib.noise.likelihood.gaussian import negative_log_likelihood
 from faintfield.calib.noise.likelihood.moments import Excess, Moments
 from faintfield.calib.noise.likelihood.response import BENDS
 from faintfield.calib.noise.likelihood.rounding import ROUNDING_DN2
+from faintfield.calib.noise.strips import Array
 
 # IPOPT prints nothing only with all of these. It also tries points with a negative variance, and backs off by itself.
 _QUIET: dict[str, Any] = {"ipopt.print_level": 0, "print_time": False, "ipopt.sb": "yes", "show_eval_warnings": False}
@@ -30,6 +30,14 @@ _SPREADS = ("dsnu_dn2", "dcnu_dn2_per_s2")
 # Largest jitter that counts as zero, over the one that the levels can show: IPOPT stops a little above its bound, where
 # the likelihood may be curved the wrong way.
 _NO_JITTER = 1e-4
+
+
+@dataclass(frozen=True)
+class Bend:
+    """Coefficients κ₁, κ₂ … of the response by their names, and their covariance."""
+
+    values: dict[str, float]
+    covariance: Array
 
 
 @dataclass(frozen=True)
@@ -53,12 +61,19 @@ class NoiseFit:
     """
 
     values: dict[str, float]
-    covariance: NDArray[np.float64]
+    covariance: Array
     log_likelihood: float
-    sources: tuple[tuple[NDArray[np.float64], int], ...] = ()
-    plain_covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
+    sources: tuple[tuple[Array, int], ...] = ()
+    plain_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
-    def quantile(self, gradient: NDArray[np.float64]) -> float:
+    @property
+    def bend(self) -> Bend:
+        """Bend of the response."""
+        at = [index for index, name in enumerate(self.values) if name in BENDS]
+        values = {name: value for name, value in self.values.items() if name in BENDS}
+        return Bend(values, self.covariance[np.ix_(at, at)])
+
+    def quantile(self, gradient: Array) -> float:
         """Return the half width of a 95 % interval, in standard errors, of a linear combination of the parameters.
 
         The scatter between series is known from few of them only. Student's t has Satterthwaite's degrees of freedom
@@ -70,6 +85,10 @@ class NoiseFit:
         if not spread > 1e-6 * variance**2:
             return float(stats.norm.ppf(0.975))
         return float(stats.t.ppf(0.975, variance**2 / spread))
+
+    def quantile_of(self, name: str) -> float:
+        """Return `quantile` of one parameter."""
+        return self.quantile(np.array([float(parameter == name) for parameter in self.values]))
 
     def standard_error(self, name: str) -> float:
         """Return the standard error of one parameter, infinite for one that was not fitted."""
@@ -117,20 +136,7 @@ class GaussianProblem:
         PoorFit
             IPOPT did not converge.
         """
-        at, minimum = self._minimize(list(astuple(excess)), near or {})
-        values = dict(zip(self._start, (at * self._units).tolist(), strict=True))
-        return NoiseFit(values, self.covariance(values, excess), -minimum)
-
-    def covariance(self, values: Mapping[str, float], excess: Excess) -> NDArray[np.float64]:
-        """Return the inverse of the Hessian of −ln L at given parameters, in their order."""
-        at = np.array([*values.values()]) / self._units
-        free = np.array([name != "jitter_dn2" or at[i] > _NO_JITTER for i, name in enumerate(values)])
-        hessian = np.array(self._hessian(at, list(astuple(excess))))
-        return _inverse_on(hessian, free) * np.outer(self._units, self._units)
-
-    def _minimize(self, excess: list[float], near: Mapping[str, float]) -> tuple[NDArray[np.float64], float]:
-        """Return the minimum in units of the parameters, and the value there."""
-        solver, units, start = self._solver, self._units, self._start | dict(near)
+        solver, units, start = self._solver, self._units, self._start | dict(near or {})
         # The spreads over pixels may be negative, as unbiased differences of variances can be. A bound at zero would
         # push what contradicts it (pickup whose phase turns from frame to frame, for example) into the read noise.
         limits = np.array([_LIMITS.get(name, (-np.inf, np.inf)) for name in start]) / units[:, None]
@@ -138,18 +144,25 @@ class GaussianProblem:
         # avoid that.
         for share in (1.0, 0.1, 0.01):
             first = [value * (share if name in _SPREADS else 1.0) for name, value in start.items()]
-            found = solver(x0=(first / units).tolist(), p=excess, lbx=limits[:, 0], ubx=limits[:, 1])
+            minimum = solver(x0=(first / units).tolist(), p=list(astuple(excess)), lbx=limits[:, 0], ubx=limits[:, 1])
             if solver.stats()["success"]:
-                return np.array(found["x"]).ravel(), float(found["f"])
+                values = dict(zip(start, (np.array(minimum["x"]).ravel() * units).tolist(), strict=True))
+                return NoiseFit(values, self.covariance(values, excess), -float(minimum["f"]))
         raise PoorFit(
             f"the noise likelihood has no maximum: IPOPT stopped with {solver.stats()['return_status']} after "
             f"{solver.stats()['iter_count']} iterations; check that the darks were taken with the lens covered"
         )
 
-
-def fit_gaussian(moments: Moments, *, bends: int = 0) -> NoiseFit:
-    """Maximize the likelihood of the moments, with the scatter that they state; see `GaussianProblem`."""
-    return GaussianProblem(moments, bends).fit(moments.excess)
+    def covariance(self, values: Mapping[str, float], excess: Excess) -> Array:
+        """Return the inverse of the Hessian of −ln L at given parameters, in their order; huge if undetermined."""
+        at = np.array([*values.values()]) / self._units
+        free = np.array([name != "jitter_dn2" or at[i] > _NO_JITTER for i, name in enumerate(values)])
+        hessian = np.array(self._hessian(at, list(astuple(excess))))
+        eigenvalues, vectors = np.linalg.eigh(hessian[np.ix_(free, free)])
+        inverse = np.where(eigenvalues > 1e-9, 1.0 / np.maximum(eigenvalues, 1e-9), 1e12)
+        covariance = np.zeros_like(hessian)
+        covariance[np.ix_(free, free)] = (vectors * inverse) @ vectors.T
+        return covariance * np.outer(self._units, self._units)
 
 
 def _start(moments: Moments, bends: int) -> tuple[dict[str, float], dict[str, float]]:
@@ -170,31 +183,14 @@ def _start(moments: Moments, bends: int) -> tuple[dict[str, float], dict[str, fl
     if repeated.size > 1:
         start["dcnu_dn2_per_s2"], scale["dcnu_dn2_per_s2"] = 0.01 * read / longest**2, read / longest**2
     if flats.frames.size or repeated.size > 1:
-        start["log_gain"], scale["log_gain"] = float(np.log(_start_gain(moments, read, float(line[0])))), 1.0
+        # Excess variance over signal, of the brightest flat or the longest dark.
+        k = int(flats.mean_dn.argmax()) if flats.frames.size else int((darks.exposure_s * measured).argmax())
+        series = flats if flats.frames.size else darks
+        excess = series.within_dn2[k] / max((series.frames[k] - 1) * moments.freedom, 1) - read
+        signal = flats.mean_dn[k] - darks.mean_dn.min() if flats.frames.size else float(line[0]) * darks.exposure_s[k]
+        gain = float(np.clip(excess / signal if signal > 0 else 1.0, 1e-2, 1e2))
+        start["log_gain"], scale["log_gain"] = float(np.log(gain)), 1.0
     for power, name in enumerate(BENDS[:bends], 1):
         brightest = float(flats.mean_dn.max()) - float(line[1])
         start[name], scale[name] = 0.0, 0.01 / brightest**power
     return start, scale
-
-
-def _start_gain(moments: Moments, read_dn2: float, slope_dn_per_s: float) -> float:
-    """Return an initial gain: excess variance over signal, from the brightest flat or the longest dark."""
-    darks, flats = moments.darks, moments.flats
-    if flats.frames.size:
-        k = int(flats.mean_dn.argmax())
-        excess = flats.within_dn2[k] / ((flats.frames[k] - 1) * moments.freedom) - read_dn2
-        signal = flats.mean_dn[k] - darks.mean_dn.min()
-    else:
-        k = int((darks.exposure_s * (darks.frames > 1)).argmax())
-        excess = darks.within_dn2[k] / max((darks.frames[k] - 1) * moments.freedom, 1) - read_dn2
-        signal = slope_dn_per_s * darks.exposure_s[k]
-    return float(np.clip(excess / signal if signal > 0 else 1.0, 1e-2, 1e2))
-
-
-def _inverse_on(hessian: NDArray[np.float64], free: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the inverse of the Hessian over the free parameters, with a huge variance in undetermined directions."""
-    covariance = np.zeros_like(hessian)
-    values, vectors = np.linalg.eigh(hessian[np.ix_(free, free)])
-    inverse = np.where(values > 1e-9, 1.0 / np.maximum(values, 1e-9), 1e12)
-    covariance[np.ix_(free, free)] = (vectors * inverse) @ vectors.T
-    return covariance

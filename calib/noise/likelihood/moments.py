@@ -12,13 +12,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from faintfield.calib.noise.likelihood.groups import BLOCKS, SeriesNoise, group_noise
 from faintfield.calib.noise.likelihood.response import Light, known_light
 from faintfield.calib.noise.likelihood.rounding import dark_roundings, flat_rounding
 from faintfield.calib.noise.series.statistics import Series
-from faintfield.calib.noise.strips import total_of
+from faintfield.calib.noise.strips import Array, Mask, mean_over, total_of
 
 
 @dataclass(frozen=True)
@@ -38,17 +37,17 @@ class DarkMoments:
         Squared deviations of the frames' mean levels from the series' level, summed over frames.
     scatter_dn2 : array (series, series)
         S, the products of the pixels' patterns in two series, summed over pixels.
-    rounding2 : array (series,), optional
+    rounding2 : array (series,)
         Square of the relative error of the noise that rounding may make; see `calib.noise.likelihood.rounding`.
     """
 
-    exposure_s: NDArray[np.float64]
-    frames: NDArray[np.float64]
-    mean_dn: NDArray[np.float64]
-    within_dn2: NDArray[np.float64]
-    level_scatter_dn2: NDArray[np.float64]
-    scatter_dn2: NDArray[np.float64]
-    rounding2: NDArray[np.float64] | None = None
+    exposure_s: Array
+    frames: Array
+    mean_dn: Array
+    within_dn2: Array
+    level_scatter_dn2: Array
+    scatter_dn2: Array
+    rounding2: Array
 
 
 @dataclass(frozen=True)
@@ -62,31 +61,29 @@ class FlatMoments:
     evenness : array (series,)
         ⟨s⟩²/⟨s²⟩ of the signal s over the pixels: the factor on the degrees of freedom where brighter pixels are
         noisier than others.
-    exposure_s, level_scatter_dn2 : array (series,)
+    rounding2, exposure_s, level_scatter_dn2 : array (series,)
         As for the darks.
     light : Light
-        What is known of their light.
+        Light of the flats, as far as it is known.
     range_dn, bend_se : float
         Signal at the end of the range, and the standard error of the bend there before it is measured.
-    rounding2 : array (series,), optional
-        As for the darks.
     """
 
-    frames: NDArray[np.float64]
-    mean_dn: NDArray[np.float64]
-    within_dn2: NDArray[np.float64]
-    evenness: NDArray[np.float64]
-    exposure_s: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    frames: Array
+    mean_dn: Array
+    within_dn2: Array
+    evenness: Array
+    rounding2: Array
+    exposure_s: Array = field(default_factory=lambda: np.zeros(0))
     light: Light = field(default_factory=lambda: known_light([]))
-    level_scatter_dn2: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    level_scatter_dn2: Array = field(default_factory=lambda: np.zeros(0))
     range_dn: float = np.inf
     bend_se: float = np.inf
-    rounding2: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
 class Excess:
-    """Scatter that the model of the pixels does not explain; see `calib.noise.misfit.goodness`.
+    """Scatter that the model of the pixels does not explain; see `calib.noise.fit.scatter`.
 
     Attributes
     ----------
@@ -129,7 +126,7 @@ class Moments:
     noise: tuple[SeriesNoise, ...] = ()
 
 
-def gather_moments(darks: Sequence[Series], flats: Sequence[Series], used: NDArray[np.bool_]) -> Moments:
+def gather_moments(darks: Sequence[Series], flats: Sequence[Series], used: Mask) -> Moments:
     """Sum the statistics of the series over the pixels in use.
 
     Parameters
@@ -142,16 +139,18 @@ def gather_moments(darks: Sequence[Series], flats: Sequence[Series], used: NDArr
     rows, columns = used.shape
     pixels = float(used.sum())
     freedom = max(pixels - rows - columns + 1.0, 1.0)
-    mean_dn = [_mean_dn(item, used) for item in (*darks, *flats)]
+    mean_dn = [mean_over(item.mean_of, used) for item in (*darks, *flats)]
     floor_dn = min(mean_dn[: len(darks)])
     noise = tuple(group_noise(item, used, floor_dn, (BLOCKS, BLOCKS)) for item in (*darks, *flats))
     roundings = dark_roundings(darks, used)
 
-    def work(strip: slice) -> NDArray[np.float64]:
+    def work(strip: slice) -> Array:
         at = used[strip]
         patterns = np.array([dark.pattern_dn[strip][at] for dark in darks], np.float64)
         return patterns @ patterns.T
 
+    pairs = zip(noise, roundings, strict=False)  # the darks come first
+    within_dn2 = [item.within_dn2 - rounding.excess_dn2 * (item.frames - 1) * freedom for item, rounding in pairs]
     return Moments(
         pixels=pixels,
         freedom=freedom,
@@ -159,12 +158,7 @@ def gather_moments(darks: Sequence[Series], flats: Sequence[Series], used: NDArr
             exposure_s=np.array([series.conditions.dark_time_s for series in darks]),
             frames=np.array([series.frames for series in darks], np.float64),
             mean_dn=np.array(mean_dn[: len(darks)]),
-            within_dn2=np.array(
-                [
-                    group.within_dn2 - rounding.excess_dn2 * (group.frames - 1) * freedom
-                    for group, rounding in zip(noise, roundings, strict=False)
-                ]
-            ),
+            within_dn2=np.array(within_dn2),
             level_scatter_dn2=np.array([series.levels_dn.var() * series.frames for series in darks]),
             scatter_dn2=total_of(work, used.shape),
             rounding2=np.array([rounding.error**2 for rounding in roundings]),
@@ -183,15 +177,10 @@ def gather_moments(darks: Sequence[Series], flats: Sequence[Series], used: NDArr
     )
 
 
-def _mean_dn(series: Series, used: NDArray[np.bool_]) -> float:
-    """Return the mean over frames and the pixels in use."""
-    return float(total_of(lambda rows: series.mean_of(rows).sum(where=used[rows]), used.shape)) / float(used.sum())
-
-
-def _evenness(flat: Series, dark: Series, used: NDArray[np.bool_]) -> float:
+def _evenness(flat: Series, dark: Series, used: Mask) -> float:
     """Return ⟨s⟩²/⟨s²⟩ of the signal s of a flat over a dark."""
 
-    def work(rows: slice) -> NDArray[np.float64]:
+    def work(rows: slice) -> Array:
         signal = (flat.mean_of(rows) - dark.mean_of(rows))[used[rows]]
         return np.array([signal.sum(), signal @ signal])
 

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from faintfield.calib.noise.series.statistics import Series
-
-type Array = NDArray[np.float64]
+from faintfield.calib.noise.strips import Array
 
 # κ₁, κ₂, … by their names in a fit.
 BENDS = tuple(f"nonlinearity_per_dn{power}" for power in ("", "2", "3", "4", "5"))
@@ -28,9 +27,6 @@ BENDS = tuple(f"nonlinearity_per_dn{power}" for power in ("", "2", "3", "4", "5"
 # Standard error of the bend at the end of the range before it is measured: where the light of the flats tells it, and
 # where nothing does. The second is the model error of an unbent sensor: 95 % of cameras bend by less than twice that.
 MEASURED_BEND_SE, UNKNOWN_BEND_SE = 0.3, 0.012
-
-# Largest range that counts, over the brightest flat, since 16 bits may hold 12; no converter has fewer than 8.
-_RANGE_OVER_BRIGHTEST, _MIN_RANGE_DN = 2.0, 255.0
 
 # A light must span this factor to show a bend; so many levels beyond its scales give 1, 2, 3, 4 coefficients.
 _MIN_SPAN, _LEVELS_FOR_BENDS = 2.0, (2, 4, 7, 11)
@@ -59,10 +55,10 @@ def charge_slope(values: Mapping[str, Any], signal_dn: Any) -> Any:
 
 def _polynomial(coefficients: Sequence[Any], x: Any) -> Any:
     """Return c₁ x + c₂ x² and so on."""
-    found: Any = 0.0
+    total: Any = 0.0
     for coefficient in reversed(coefficients):
-        found = (coefficient + found) * x
-    return found
+        total = (coefficient + total) * x
+    return total
 
 
 @dataclass(frozen=True)
@@ -103,15 +99,10 @@ def known_light(flats: Sequence[Series]) -> Light:
         amount = np.array([flat.conditions.exposure_s for flat in flats], float)
         group = np.unique([flat.conditions.level for flat in flats], return_inverse=True)[1].astype(int)
     for index in np.unique(group):
-        among = amount[group == index]
-        if np.unique(among).size < 3 or among.min() <= 0 or among.max() < _MIN_SPAN * among.min():
+        amounts = amount[group == index]
+        if np.unique(amounts).size < 3 or amounts.min() <= 0 or amounts.max() < _MIN_SPAN * amounts.min():
             group[group == index] = -1
     return Light(amount, group)
-
-
-def bend_range_dn(brightest_dn: float, saturation_dn: float) -> float:
-    """Return the signal that the size of a bend refers to: the end of the range, near the brightest flat at most."""
-    return float(min(saturation_dn, max(_RANGE_OVER_BRIGHTEST * brightest_dn, _MIN_RANGE_DN)))
 
 
 def level_design(light: Light, signal_dn: Array, bends: int) -> Array:
@@ -132,22 +123,27 @@ def scatter_of_levels(light: Light, signal_dn: Array, variance_dn2: Array, bends
     and Paule, Analytical Chemistry 42, 1194, 1970).
     """
     use, design = light.group >= 0, level_design(light, signal_dn, bends)
-    s, variance = signal_dn[use], variance_dn2[use]
+    s = signal_dn[use]
+    return scatter_of_line(design, s, variance_dn2[use], s**2, design.shape[0] - design.shape[1])
+
+
+def scatter_of_line(design: Array, target: Array, variance: Array, scale2: Array, freedom: int) -> tuple[float, float]:
+    """Return the scatter of a target about its linear fit beyond `variance`, over `scale2`, and Σ r²/variance."""
 
     def deviance(excess: float) -> float:
-        root = np.sqrt(variance + excess * s**2)
-        found = np.linalg.lstsq(design / root[:, None], s / root)[0]
-        return float(np.sum(((s - design @ found) / root) ** 2))
+        root = np.sqrt(variance + excess * scale2)
+        coefficients = np.linalg.lstsq(design / root[:, None], target / root)[0]
+        return float(np.sum(((target - design @ coefficients) / root) ** 2))
 
-    return grown_variance(deviance, design.shape[0] - design.shape[1]), deviance(0.0)
+    return grown_variance(deviance, freedom), deviance(0.0)
 
 
-def grown_variance(deviance: Callable[[float], float], freedom: float, start: float = 1e-12) -> float:
+def grown_variance(deviance: Callable[[float], float], freedom: float) -> float:
     """Return the excess variance at which a falling deviance equals its degrees of freedom; 0 if chance makes it."""
     usual = _USUAL_CHANCE if freedom >= _FEW_FREEDOM else _CHANCE_OF_FEW
     if freedom < 1 or stats.chi2.sf(deviance(0.0), freedom) > usual:
         return 0.0
-    low, high = 0.0, start
+    low, high = 0.0, 1e-12
     while deviance(high) > freedom:
         low, high = high, 4 * high
     for _ in range(50):
@@ -205,7 +201,7 @@ def level_log_likelihood(
 def bend_log_prior(values: Mapping[str, Any], range_dn: float, bend_se: float) -> Any:
     """Return ln of the normal density of the bends at the end of the range, of standard error `bend_se`."""
     at_end = [values[name] * range_dn**power for power, name in enumerate(BENDS, 1) if name in values]
-    return -0.5 * sum((bend / bend_se) ** 2 for bend in at_end) if at_end else 0.0
+    return -0.5 * sum((bend / bend_se) ** 2 for bend in at_end)
 
 
 def signal_of_charge(values: Mapping[str, float], charge: Array, range_dn: float) -> Array:
@@ -237,7 +233,7 @@ class FittedLevels:
     Attributes
     ----------
     light : Light
-        Of all flat series.
+        Light of all flat series.
     signal_dn, variance_dn2 : array (series,)
         Mean signal, dark signal removed, and the variance of its error.
     full_dn : float

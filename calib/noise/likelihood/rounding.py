@@ -13,10 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from faintfield.calib.noise.series.statistics import Series
-from faintfield.calib.noise.strips import total_of
+from faintfield.calib.noise.strips import Array, Mask, total_of
 
 # Variance in DN² that rounding to whole DN adds on average over the phases.
 ROUNDING_DN2 = 1 / 12
@@ -44,16 +43,8 @@ class Rounding:
     error: float
 
 
-def flat_rounding(series: Series, used: NDArray[np.bool_]) -> Rounding:
-    """Return the rounding of a series whose pixels have means of any phase.
-
-    Parameters
-    ----------
-    series : Series
-        Statistics of its frames.
-    used : array (row, column), bool
-        Pixels in use.
-    """
+def flat_rounding(series: Series, used: Mask) -> Rounding:
+    """Return the rounding of a series whose pixels `used`, (row, column), have means of any phase."""
     if series.frames < 2:
         return Rounding(0.0, 0.0)
     total = _variance_dn2(series, used)
@@ -61,7 +52,7 @@ def flat_rounding(series: Series, used: NDArray[np.bool_]) -> Rounding:
     return Rounding(0.0, float(_amplitude(max(total - ROUNDING_DN2, 0.0)) * np.exp(-2 * np.pi**2 * pattern) / total))
 
 
-def dark_roundings(darks: Sequence[Series], used: NDArray[np.bool_]) -> list[Rounding]:
+def dark_roundings(darks: Sequence[Series], used: Mask) -> list[Rounding]:
     """Return the rounding of every dark series; the arguments are as for `flat_rounding`."""
     roundings = [flat_rounding(dark, used) for dark in darks]
     if max(rounding.error for rounding in roundings) < _NEGLIGIBLE:
@@ -75,20 +66,8 @@ def dark_roundings(darks: Sequence[Series], used: NDArray[np.bool_]) -> list[Rou
     return [min(both, key=lambda rounding: rounding.error) for both in zip(roundings, measured, strict=True)]
 
 
-def _dark_rounding(series: Series, phase_dn: NDArray[np.float64], frames: float, used: NDArray[np.bool_]) -> Rounding:
-    """Return the rounding of a dark series by the means of its pixels.
-
-    Parameters
-    ----------
-    series : Series
-        Statistics of its frames.
-    phase_dn : array (pixel,)
-        Offsets of the pixels in use about their mean.
-    frames : float
-        Number of frames that determine an offset.
-    used : array (row, column), bool
-        Pixels in use.
-    """
+def _dark_rounding(series: Series, phase_dn: Array, frames: float, used: Mask) -> Rounding:
+    """Return the rounding by the offsets `phase_dn` (pixel,) about their mean, each determined by so many frames."""
     if series.frames < 2:
         return Rounding(0.0, np.inf)
     total = _variance_dn2(series, used)
@@ -101,8 +80,8 @@ def _dark_rounding(series: Series, phase_dn: NDArray[np.float64], frames: float,
     for _ in range(3):  # the amplitude depends on the noise before rounding
         noise = max(variance - ROUNDING_DN2, 0.0)
         # Rounding also draws means towards whole numbers
-        drawn = np.exp(-2 * np.pi**2 * noise) / np.pi * np.sin(2 * np.pi * (phase_dn + level.mean()))
-        wave = np.exp(2j * np.pi * (phase_dn + drawn)).mean() * np.exp(2j * np.pi * level).mean()
+        shift = np.exp(-2 * np.pi**2 * noise) / np.pi * np.sin(2 * np.pi * (phase_dn + level.mean()))
+        wave = np.exp(2j * np.pi * (phase_dn + shift)).mean() * np.exp(2j * np.pi * level).mean()
         excess = -_amplitude(noise) * float(np.clip(wave.real * sharpening, -1.0, 1.0))
         variance = max(total - excess, ROUNDING_DN2)
     # What the pixels' means leave open: their noise, their number and the second harmonic
@@ -110,17 +89,15 @@ def _dark_rounding(series: Series, phase_dn: NDArray[np.float64], frames: float,
     return Rounding(excess, float(_amplitude(noise) * left / total))
 
 
-def _variance_dn2(series: Series, used: NDArray[np.bool_]) -> float:
+def _variance_dn2(series: Series, used: Mask) -> float:
     """Return the mean variance of the pixels over the frames; their levels, rows and columns took a share of it."""
     pixels = used.sum()
     total = total_of(lambda rows: series.within_dn2[rows].sum(where=used[rows], dtype=np.float64), used.shape)
     return max(float(total) / pixels / (series.frames - 1) / max(1 - sum(used.shape) / pixels, 0.1), 1e-6)
 
 
-def _pattern_dn2(series: Series, used: NDArray[np.bool_]) -> float:
-    """Return the variance over the pixels of their means without rows and columns."""
-
-    def work(rows: slice) -> NDArray[np.float64]:
+def _pattern_dn2(series: Series, used: Mask) -> float:
+    def work(rows: slice) -> Array:
         pattern = series.pattern_dn[rows][used[rows]].astype(np.float64)
         return np.array([pattern.sum(), pattern @ pattern])
 
@@ -129,5 +106,4 @@ def _pattern_dn2(series: Series, used: NDArray[np.bool_]) -> float:
 
 
 def _amplitude(noise_dn2: float) -> float:
-    """Return a(σ) for a variance of noise before rounding."""
     return float((4 * noise_dn2 + 1 / np.pi**2) * np.exp(-2 * np.pi**2 * noise_dn2))

@@ -12,10 +12,8 @@ with 120 frames, where the gains of pixels differ by 1 %. But all pixels togethe
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from faintfield.calib.noise.likelihood.response import charge_dn, charge_slope
 from faintfield.calib.noise.likelihood.rounding import ROUNDING_DN2
@@ -23,10 +21,7 @@ from faintfield.calib.noise.maps.photo_response import Response
 from faintfield.calib.noise.maps.read_noise import kept_of
 from faintfield.calib.noise.maps.seams import Seam, find_seams, share_of_seam
 from faintfield.calib.noise.series.statistics import Series
-from faintfield.calib.noise.strips import map_of, maps_of, mean_over, total_of, variance_over
-
-type Array = NDArray[np.float64]
-type Map = NDArray[np.floating]
+from faintfield.calib.noise.strips import Array, Map, Mask, map_of, maps_of, mean_over, total_of, variance_over
 
 # Standard errors from which a share is real, and a scatter; up to which a share counts as 1; at which a pixel is cut.
 _MIN_SIGMA, _MIN_SCATTER_SIGMA, _ONE_SIGMA, _CLIP_SIGMA = 3.0, 4.0, 2.0, 5.0
@@ -54,11 +49,6 @@ class PixelGain:
     seams: tuple[Seam, ...]
     share: float
 
-    @property
-    def of_regions(self) -> Map:
-        """Gain of the region of each pixel over the mean."""
-        return _gain_of_regions(self.seams, self.relative.shape)
-
 
 def photon_transfer(
     flats: Sequence[Series], offset_dn: Map, read_dn: Map, values: Mapping[str, float]
@@ -76,9 +66,9 @@ def photon_transfer(
     """
     gain = float(np.exp(values["log_gain"]))
 
-    def noise(one: Series, rows: slice) -> tuple[Array, Array]:
+    def noise(flat: Series, rows: slice) -> tuple[Array, Array]:
         """Return shot noise and all noise of some rows of a flat."""
-        signal = one.mean_of(rows) - offset_dn[rows]
+        signal = flat.mean_of(rows) - offset_dn[rows]
         slope2 = np.square(charge_slope(values, signal))
         shot = gain * np.maximum(charge_dn(values, signal), 0.0) / slope2
         return shot, shot + np.square(read_dn[rows], dtype=np.float64) / slope2 + ROUNDING_DN2
@@ -86,21 +76,21 @@ def photon_transfer(
     kept = [kept_of(lambda rows, flat=flat: noise(flat, rows)[1], ~flat.suspect) for flat in flats]  # type: ignore[misc]
 
     def work(rows: slice) -> tuple[Array, Array]:
-        found, information = np.zeros((2, *offset_dn[rows].shape))
+        gains, information = np.zeros((2, *offset_dn[rows].shape))
         for flat, of_strip in zip(flats, kept, strict=True):
             shot, variance = noise(flat, rows)
             share = shot / variance
             weight = 0.5 * (flat.frames - 1) * share
-            found += weight * (flat.within_dn2[rows] / ((flat.frames - 1) * of_strip(rows, variance)) - 1)
+            gains += weight * (flat.within_dn2[rows] / ((flat.frames - 1) * of_strip(rows, variance)) - 1)
             information += weight * share
-        return found / np.maximum(information, 1e-12), information
+        return gains / np.maximum(information, 1e-12), information
 
-    found, information = maps_of(work, offset_dn.shape, (np.float32, np.float32))
-    return found, information
+    epsilon, information = maps_of(work, offset_dn.shape, (np.float32, np.float32))
+    return epsilon, information
 
 
 def measure_gain(
-    transfer: tuple[Map, Map], usable: NDArray[np.bool_], even: Response, response: Callable[[Map], Response]
+    transfer: tuple[Map, Map], usable: Mask, even: Response, response: Callable[[Map], Response]
 ) -> tuple[PixelGain | None, str]:
     """Return the gain of every pixel, or None and the reason why the frames do not determine it.
 
@@ -115,19 +105,31 @@ def measure_gain(
     response : callable
         Returns it given relative gains (row, column) by which the signals are divided first.
     """
-    found, information = transfer
+    measured, information = transfer
     shape = usable.shape
     weight = map_of(lambda rows: np.where(usable[rows], information[rows], 0.0), shape)
-    mean = _weighted(weight, lambda rows: found[rows])
+
+    def sums(rows: slice) -> Array:
+        weights = weight[rows].astype(np.float64)
+        return np.array([(weights * measured[rows]).sum(), weights.sum()])
+
+    total, weights = total_of(sums, shape)
+    mean = float(total / weights)
 
     def clipped(rows: slice) -> Array:
         limit = _CLIP_SIGMA / np.sqrt(np.maximum(information[rows], 1e-12))
-        return np.clip(np.subtract(found[rows], mean, dtype=np.float64), -limit, limit)
+        return np.clip(np.subtract(measured[rows], mean, dtype=np.float64), -limit, limit)
 
     epsilon = map_of(clipped, shape)
     seams = _gain_seams(epsilon, weight, even)
-    known = response(_gain_of_regions(seams, shape)) if seams else even
-    seams = tuple(_refined(seam, known, weight) for seam in seams)
+    known = response(gain_of_regions(seams, shape)) if seams else even
+    # The response is smoothed and shrunk across a seam, so that the first value of its step is a little too small.
+    seams = tuple(
+        replace(seam, effect=(1 + share_of_seam(seam, *_over_mean(known, weight))[0]) * seam.effect)
+        if seam.of_response
+        else seam
+        for seam in seams
+    )
 
     def part(rows: slice) -> Array:
         relative = np.divide(known.relative[rows], np.maximum(known.vignetting[rows], 1e-6), dtype=np.float64)
@@ -160,24 +162,12 @@ def measure_gain(
 
 
 def _of_regions(seams: Sequence[Seam], rows: slice) -> Array:
-    """Return by how much the gain of the region of each pixel of some rows differs from the mean."""
     return np.asarray(sum((seam.of(rows) for seam in seams), np.zeros((1, 1))))
 
 
-def _gain_of_regions(seams: Sequence[Seam], shape: tuple[int, ...]) -> Map:
+def gain_of_regions(seams: Sequence[Seam], shape: tuple[int, ...]) -> Map:
     """Return the gain of the region of each pixel over the mean (row, column)."""
     return map_of(lambda rows: 1 + _of_regions(seams, rows), shape)
-
-
-def _weighted(weight: Map, values_of: Callable[[slice], NDArray[Any]]) -> float:
-    """Return the weighted mean of what a function returns for some rows."""
-
-    def work(rows: slice) -> Array:
-        weights = weight[rows].astype(np.float64)
-        return np.array([(weights * values_of(rows)).sum(), weights.sum()])
-
-    total, weights = total_of(work, weight.shape)
-    return float(total / weights)
 
 
 def _gain_seams(epsilon: Map, weight: Map, response: Response) -> tuple[Seam, ...]:
@@ -185,33 +175,22 @@ def _gain_seams(epsilon: Map, weight: Map, response: Response) -> tuple[Seam, ..
 
     The response tells the size of a step ten times better than photon transfer, but not whether gain makes it.
     """
-    found = {seam.lines: seam for seam in find_seams(epsilon, weight)}
+    seams = {seam.lines: seam for seam in find_seams(epsilon, weight)}
     for seam in find_seams(*_over_mean(response, weight)):
         share, se = share_of_seam(seam, epsilon, weight)
         if share > _MIN_SIGMA * se:
             whole = abs(share - 1) < _ONE_SIGMA * se
             measured = replace(seam, effect=share * seam.effect, se=se * seam.difference)
-            found[seam.lines] = replace(seam, of_response=True) if whole else measured
-    return tuple(seam for seam in found.values() if seam.difference > _MIN_SEAM)
+            seams[seam.lines] = replace(seam, of_response=True) if whole else measured
+    return tuple(seam for seam in seams.values() if seam.difference > _MIN_SEAM)
 
 
-def _over_mean(response: Response, weight: Map) -> tuple[Map, NDArray[np.bool_], float]:
+def _over_mean(response: Response, weight: Map) -> tuple[Map, Mask, float]:
     """Return the response over its mean, the pixels that count, and the inverse variance of each."""
     counts = map_of(lambda rows: weight[rows] > 0, weight.shape, bool)
     mean = mean_over(lambda rows: response.relative[rows], counts)
     relative = map_of(lambda rows: response.relative[rows] / mean, weight.shape)
     return relative, counts, max(response.prnu, 1e-4) ** -2
-
-
-def _refined(seam: Seam, response: Response, weight: Map) -> Seam:
-    """Return a seam of the whole response with what is left of it in the response divided by its gains.
-
-    The response is smoothed and shrunk across a seam, so that the first value of a step is a little too small.
-    """
-    if not seam.of_response:
-        return seam
-    left, _ = share_of_seam(seam, *_over_mean(response, weight))
-    return replace(seam, effect=(1 + left) * seam.effect)
 
 
 def _share(epsilon: Callable[[slice], Array], part: Callable[[slice], Array], weight: Map) -> tuple[float, float]:
@@ -229,7 +208,7 @@ def _share(epsilon: Callable[[slice], Array], part: Callable[[slice], Array], we
     return (float(np.clip(share, 0.0, 1.0)) if share > _MIN_SIGMA * se else 0.0), se
 
 
-def _scatter(rest: Callable[[slice], Array], information: Map, usable: NDArray[np.bool_]) -> tuple[float, float]:
+def _scatter(rest: Callable[[slice], Array], information: Map, usable: Mask) -> tuple[float, float]:
     """Return the variance of ε beyond chance, 0 if it is not significant, and its standard error."""
     chance = mean_over(lambda rows: 1 / information[rows].astype(np.float64), usable)
     se = chance * float(np.sqrt(2 / usable.sum()))
@@ -238,12 +217,11 @@ def _scatter(rest: Callable[[slice], Array], information: Map, usable: NDArray[n
 
 
 def _why(information: float, response: Response, share_se: float, scatter_se: float) -> str:
-    """Return why pixels have no gain of their own, and what to record."""
-    found = (
+    why = (
         f"photon transfer tells the gain of one pixel to ±{information**-0.5:.0%}, and nothing shows that "
         f"gains differ; differences of {np.sqrt(_MIN_SCATTER_SIGMA * scatter_se):.1%} would show"
     )
     if not np.isfinite(share_se) or _MIN_SIGMA * share_se < 1:
-        return found
+        return why
     more = (_MIN_SIGMA * share_se) ** 2
-    return f"{found}, or those that make the response ({response.prnu:.1%}) with {more:.1f} times as many flats"
+    return f"{why}, or those that make the response ({response.prnu:.1%}) with {more:.1f} times as many flats"

@@ -1,25 +1,21 @@
 """Maps of the pixels in the order in which they are measured: noise, offset, response to light, gain."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.calib.noise.fitting import NoiseLikelihood, SeriesFit
+from faintfield.calib.noise.estimate import Estimate
+from faintfield.calib.noise.fit.series_fit import NoiseLikelihood, SeriesFit
 from faintfield.calib.noise.likelihood.response import charge_dn, charge_slope
-from faintfield.calib.noise.maps.gain import PixelGain, measure_gain, photon_transfer
+from faintfield.calib.noise.maps.defects import noisy_pixels, telegraph_pixels, variance_ratio
+from faintfield.calib.noise.maps.gain import PixelGain, gain_of_regions, measure_gain, photon_transfer
+from faintfield.calib.noise.maps.levels import PixelLevels, line_pattern, pixel_levels
 from faintfield.calib.noise.maps.photo_response import Response, measure_response
-from faintfield.calib.noise.maps.pixels import PixelLevels, line_pattern, noisy_pixels, pixel_levels, variance_ratio
 from faintfield.calib.noise.maps.read_noise import PixelReadNoise, measure_read_noise
 from faintfield.calib.noise.maps.seams import Seam, find_seams
-from faintfield.calib.noise.maps.telegraph import telegraph_pixels
-from faintfield.calib.noise.result import Estimate, NoiseMaps
-from faintfield.calib.noise.room import new_map
-from faintfield.calib.noise.strips import map_of, total_of
-
-type Array = NDArray[np.float64]
-type Map = NDArray[np.floating]
+from faintfield.calib.noise.strips import Array, Map, Mask, map_of, new_map, total_of
 
 # A step of the offsets is named from this fraction of the read noise, telegraph pixels from this share of all.
 _NOTABLE_STEP, _NOTABLE_SHARE = 0.1, 1e-4
@@ -28,33 +24,68 @@ _CENSORED = NoiseLikelihood.CENSORED
 
 
 @dataclass(frozen=True)
+class NoiseMaps:
+    """Maps per pixel, arrays (row, column) of float32; None if the frames do not determine them.
+
+    Attributes
+    ----------
+    offset_dn, offset_variance_dn2 : array
+        Posterior mean of the offset, and the variance of its error.
+    dark_current_e_per_s, dark_current_variance_e2_per_s2 : array, optional
+        Posterior mean of the dark current, and the variance of its error.
+    read_noise_e, read_noise_se_e : array, optional
+        Posterior mean of the read noise, and its standard error.
+    gain_dn_per_e, gain_se_dn_per_e : array, optional
+        Gain, and the standard error of its difference from the mean gain. Maps in electrons are in those of this gain.
+    relative_response, relative_response_se : array, optional
+        Photo response in electrons over its mean, vignetting and PRNU, and its standard error.
+    vignetting : array, optional
+        Smooth part of the photo response.
+    unusable : array, bool
+        Pixels that are hot, noisy or dead.
+    absent : dict of str
+        Why there is no map of the gain or of the read noise, by the name of the map.
+    """
+
+    offset_dn: NDArray[np.float32]
+    offset_variance_dn2: NDArray[np.float32]
+    unusable: Mask
+    dark_current_e_per_s: NDArray[np.float32] | None = None
+    dark_current_variance_e2_per_s2: NDArray[np.float32] | None = None
+    read_noise_e: NDArray[np.float32] | None = None
+    read_noise_se_e: NDArray[np.float32] | None = None
+    gain_dn_per_e: NDArray[np.float32] | None = None
+    gain_se_dn_per_e: NDArray[np.float32] | None = None
+    relative_response: NDArray[np.float32] | None = None
+    relative_response_se: NDArray[np.float32] | None = None
+    vignetting: NDArray[np.float32] | None = None
+    absent: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Pixels:
     """Measurements of the pixels.
 
     Attributes
     ----------
-    read : PixelReadNoise
-        Their read noise.
+    read, levels : PixelReadNoise, PixelLevels
+        Read noise; offset and dark signal.
     variance_ratio : array (row, column)
-        Their variance over that of the model.
+        Variance over that of the model.
     telegraph, noisy : array (row, column), bool
         Pixels that jump between two levels; pixels that are too noisy to be of use.
-    levels : PixelLevels
-        Their offset and dark signal.
     response, response_e : Response, optional
-        Their response to light in DN, and in electrons of the pixels' own gain; None without flats.
-    gain : PixelGain, optional
-        Their gain over the mean; None if the frames do not determine it.
-    gain_why : str
-        Why there is no gain per pixel.
+        Response to light in DN, and in electrons of the pixels' own gain; None without flats.
+    gain, gain_why : PixelGain, str
+        Gain over the mean; None if the frames do not determine it, and the reason.
     offset_seams : tuple of Seam
         Regions whose offsets differ.
     """
 
     read: PixelReadNoise
     variance_ratio: NDArray[np.float32]
-    telegraph: NDArray[np.bool_]
-    noisy: NDArray[np.bool_]
+    telegraph: Mask
+    noisy: Mask
     levels: PixelLevels
     response: Response | None
     response_e: Response | None
@@ -85,16 +116,8 @@ class Pixels:
         return warnings
 
 
-def measure_pixels(fitted: SeriesFit, hot: NDArray[np.bool_], outlying: NDArray[np.bool_]) -> Pixels:
-    """Measure the pixels.
-
-    Parameters
-    ----------
-    fitted : SeriesFit
-        The fit of what the pixels have in common.
-    hot, outlying : array (row, column), bool
-        Pixels with a large dark signal; pixels with more noise than chance allows.
-    """
+def measure_pixels(fitted: SeriesFit, hot: Mask, outlying: Mask) -> Pixels:
+    """Measure the pixels, of which some are hot and some have more noise than chance allows (row, column)."""
     read, telegraph = _read_noise(fitted, hot)
     ratio = variance_ratio(fitted.darks, fitted.dark_noise_dn2)[0]
     noisy = noisy_pixels(outlying & ~hot, ratio, telegraph)
@@ -113,15 +136,18 @@ def measure_pixels(fitted: SeriesFit, hot: NDArray[np.bool_], outlying: NDArray[
             response_e = _response(fitted, levels, usable, gain.relative)
         if gain is not None and gain.seams:
             # A step of the gain is no spread of the pixels, and no smooth part of the response takes it out
-            even = _response(fitted, levels, usable, gain.of_regions)
+            even = _response(fitted, levels, usable, gain_of_regions(gain.seams, usable.shape))
             response = replace(response, prnu=even.prnu, prnu_se=even.prnu_se, why_no_prnu=even.why_no_prnu)
-    seams = () if fitted.likelihood is _CENSORED else _offset_seams(fitted, levels, read, usable)
-    return Pixels(read, ratio, telegraph, noisy, levels, response, response_e, gain, why, seams)
+    seams = []
+    if fitted.likelihood is not _CENSORED:
+        read_dn = float(np.median(read.read_noise_dn))
+        spread_dn2 = max(fitted.fit.values["dsnu_dn2"], 0.0) + read_dn**2 / sum(dark.frames for dark in fitted.darks)
+        seams = find_seams(levels.offset_dn, usable, 1 / spread_dn2)
+        seams = [seam for seam in seams if seam.difference > _NOTABLE_STEP * read_dn]
+    return Pixels(read, ratio, telegraph, noisy, levels, response, response_e, gain, why, tuple(seams))
 
 
-def noise_maps(
-    fitted: SeriesFit, estimates: Mapping[str, Estimate], pixels: Pixels, unusable: NDArray[np.bool_]
-) -> NoiseMaps:
+def noise_maps(fitted: SeriesFit, estimates: Mapping[str, Estimate], pixels: Pixels, unusable: Mask) -> NoiseMaps:
     """Return the maps; those in electrons only where the gain is known."""
     mean_gain = estimates["gain_dn_per_e"].value
     levels, read = pixels.levels, pixels.read
@@ -158,7 +184,7 @@ def noise_maps(
     return NoiseMaps(unusable=unusable, absent=absent, **single)
 
 
-def _read_noise(fitted: SeriesFit, hot: NDArray[np.bool_]) -> tuple[PixelReadNoise, NDArray[np.bool_]]:
+def _read_noise(fitted: SeriesFit, hot: Mask) -> tuple[PixelReadNoise, Mask]:
     """Return the read noise of every pixel, and the telegraph pixels; the sensor's own if values are cut off."""
     read_dn2, noise_dn2 = float(np.exp(fitted.fit.values["log_read_dn2"])), fitted.dark_noise_dn2
     if fitted.likelihood is _CENSORED:
@@ -168,7 +194,7 @@ def _read_noise(fitted: SeriesFit, hot: NDArray[np.bool_]) -> tuple[PixelReadNoi
     return read, telegraph_pixels(fitted.darks, read, noise_dn2) & ~hot
 
 
-def _levels(fitted: SeriesFit, read: PixelReadNoise, hot: NDArray[np.bool_]) -> PixelLevels:
+def _levels(fitted: SeriesFit, read: PixelReadNoise, hot: Mask) -> PixelLevels:
     """Return offset and dark signal of every pixel; the sensor's own if values are cut off."""
     values = fitted.fit.values
     if fitted.likelihood is _CENSORED:
@@ -182,7 +208,7 @@ def _levels(fitted: SeriesFit, read: PixelReadNoise, hot: NDArray[np.bool_]) -> 
     return pixel_levels(fitted.darks, values, noise_dn2, line_pattern(fitted.darks, values["dsnu_dn2"]), hot)
 
 
-def _response(fitted: SeriesFit, levels: PixelLevels, usable: NDArray[np.bool_], relative_gain: Map | None) -> Response:
+def _response(fitted: SeriesFit, levels: PixelLevels, usable: Mask, relative_gain: Map | None) -> Response:
     """Return the photo response, the signals divided by the relative gains of the pixels if there are any."""
     values, flats, shape = fitted.fit.values, fitted.flats, usable.shape
     total = new_map(shape)
@@ -203,13 +229,3 @@ def _response(fitted: SeriesFit, levels: PixelLevels, usable: NDArray[np.bool_],
         for v, flat, mean in zip(fitted.flat_noise_dn2, flats, means, strict=True)
     )
     return measure_response(total, sum(noise), usable)
-
-
-def _offset_seams(
-    fitted: SeriesFit, levels: PixelLevels, read: PixelReadNoise, usable: NDArray[np.bool_]
-) -> tuple[Seam, ...]:
-    """Return regions whose offsets differ notably."""
-    read_dn = float(np.median(read.read_noise_dn))
-    spread_dn2 = max(fitted.fit.values["dsnu_dn2"], 0.0) + read_dn**2 / sum(dark.frames for dark in fitted.darks)
-    seams = find_seams(levels.offset_dn, usable, 1 / spread_dn2)
-    return tuple(seam for seam in seams if seam.difference > _NOTABLE_STEP * read_dn)

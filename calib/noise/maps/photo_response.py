@@ -8,13 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from faintfield.calib.noise.intervals import interval
-from faintfield.calib.noise.result import Estimate
-from faintfield.calib.noise.strips import map_of, maps_of, mean_over, over_strips, thinned, variance_over
-
-type Array = NDArray[np.float64]
-type Map = NDArray[np.floating]
-type Mask = NDArray[np.bool_]
+from faintfield.calib.noise.estimate import Estimate, interval
+from faintfield.calib.noise.strips import (
+    Array,
+    Map,
+    Mask,
+    map_of,
+    maps_of,
+    mean_over,
+    over_strips,
+    thinned,
+    variance_over,
+)
 
 # Response below which a pixel is dead, over the lower quartile of its neighbourhood. At an edge of the light, and at
 # its corners, more than a quarter of the neighbours are as dim as the pixel.
@@ -60,7 +65,7 @@ class Response:
     relative_se: Map
     prnu: float
     prnu_se: float
-    dead: NDArray[np.bool_]
+    dead: Mask
     why_no_prnu: str = ""
 
     def prnu_estimate(self, quantile: float) -> Estimate:
@@ -105,12 +110,9 @@ def measure_response(signal_dn: Map, noise_dn2: float, usable: Mask) -> Response
     error2 = (spread2 + mean_noise) * np.sqrt(2 / usable.sum())
 
     def work(rows: slice) -> tuple[Map, Map]:
-        chance = noise(rows)
+        chance, smooth = noise(rows), vignetting[rows]
         kept = spread2 / (spread2 + chance)
-        return (
-            vignetting[rows] * (1 + np.where(usable[rows], kept * pixel(rows), 0.0)),
-            vignetting[rows] * np.sqrt(kept * chance),
-        )
+        return smooth * (1 + np.where(usable[rows], kept * pixel(rows), 0.0)), smooth * np.sqrt(kept * chance)
 
     relative, relative_se = maps_of(work, raw.shape, (raw.dtype,) * 2)
     return Response(
@@ -125,20 +127,18 @@ def measure_response(signal_dn: Map, noise_dn2: float, usable: Mask) -> Response
 
 
 def _why_colour(raw: Map, usable: Mask) -> str:
-    """Return that the pixels respond as colour filters in periods of 2 × 2 do, "" if they do not."""
     phases = [np.s_[row::2, column::2] for row, column in np.ndindex(2, 2)]
     middle = [float(np.median(raw[at][usable[at]])) for at in phases if usable[at].any()]
     if max(middle) <= _MAX_ALTERNATE * max(min(middle), 1e-6):
         return ""
-    found = ", ".join(f"{value:.2f}" for value in middle)
+    means = ", ".join(f"{value:.2f}" for value in middle)
     return (
-        f"pixels of even and odd rows and columns respond by {found} of the mean (a ratio of {_MAX_ALTERNATE:g} is the "
+        f"pixels of even and odd rows and columns respond by {means} of the mean (a ratio of {_MAX_ALTERNATE:g} is the "
         'limit), as colour filters make them: state them, for example mosaic = ["RG", "GB"]'
     )
 
 
 def _why_uneven(vignetting: Map, usable: Mask) -> str:
-    """Return that the light is too uneven for PRNU, "" if it is not."""
     dim, bright = np.quantile(thinned(vignetting, usable), (_TAIL, 1 - _TAIL))
     if bright <= _MAX_UNEVEN * max(dim, 1e-6):
         return ""
@@ -207,9 +207,9 @@ def _surface(response: Map, usable: Mask) -> Callable[[slice], Array]:
     # Products of matrices have threads of their own
     sums = sum((work(slice(first, first + _ROWS)) for first in range(0, len(usable), _ROWS)), np.zeros(650))
     moments, weighted = sums[:625].reshape(5, 5, 5, 5).transpose(0, 2, 1, 3), sums[625:].reshape(5, 5)
-    found = np.zeros((5, 5))
-    found[low] = np.linalg.lstsq(moments[low][:, low], weighted[low])[0]
-    return lambda rows: np.maximum(of_rows[rows] @ found @ of_columns.T, _MIN_SURFACE)
+    surface = np.zeros((5, 5))
+    surface[low] = np.linalg.lstsq(moments[low][:, low], weighted[low])[0]
+    return lambda rows: np.maximum(of_rows[rows] @ surface @ of_columns.T, _MIN_SURFACE)
 
 
 def _running_mean(response: Map, usable: Mask, window: int) -> Map:
@@ -235,8 +235,8 @@ def _kept_share(usable: Mask) -> Callable[[slice], Array]:
     weight = _box(usable.astype(np.float32), window)
 
     def share(rows: slice) -> Array:
-        taken = 2 * np.outer(own[0][rows], own[1]) - np.outer(squares[0][rows], squares[1])
-        return np.asarray(np.maximum(1 - taken / np.maximum(weight[rows], 1e-6), 0.05))
+        loss = 2 * np.outer(own[0][rows], own[1]) - np.outer(squares[0][rows], squares[1])
+        return np.asarray(np.maximum(1 - loss / np.maximum(weight[rows], 1e-6), 0.05))
 
     return share
 

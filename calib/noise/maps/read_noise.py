@@ -21,9 +21,18 @@ from scipy import stats
 
 from faintfield.calib.noise.maps.seams import find_seams
 from faintfield.calib.noise.series.statistics import Series, any_suspect, robust_sigma
-from faintfield.calib.noise.strips import map_of, maps_of, mean_over, over_strips, thinned, total_of, variance_over
-
-type Array = NDArray[np.float64]
+from faintfield.calib.noise.strips import (
+    Array,
+    Map,
+    Mask,
+    map_of,
+    maps_of,
+    mean_over,
+    over_strips,
+    thinned,
+    total_of,
+    variance_over,
+)
 
 # Pixels differ, and so do rows and columns, if chance makes as much scatter with less probability than this.
 _MAX_CHANCE = 1e-3
@@ -46,23 +55,23 @@ _CLIP_SIGMA = 3.0
 
 @dataclass(frozen=True)
 class PixelReadNoise:
-    """Read noise of every pixel, arrays (row, column).
+    """Read noise of every pixel.
 
     Attributes
     ----------
-    read_noise_dn, se_dn : array
+    read_noise_dn, se_dn : array (row, column)
         Posterior mean and standard deviation; without the error that all pixels share (see `read_noise_dn` of the fit).
     resolved : bool
-        Whether the pixels differ. If not, `se_dn` is the difference that would have gone unnoticed.
+        The pixels differ. If not, `se_dn` is the difference that would have gone unnoticed.
     """
 
-    read_noise_dn: NDArray[np.floating]
-    se_dn: NDArray[np.floating]
+    read_noise_dn: Map
+    se_dn: Map
     resolved: bool
 
 
 def measure_read_noise(
-    darks: Sequence[Series], read_dn2: float, noise_dn2: Sequence[float], usable: NDArray[np.bool_]
+    darks: Sequence[Series], read_dn2: float, noise_dn2: Sequence[float], usable: Mask
 ) -> PixelReadNoise:
     """Return the posterior read noise of every pixel.
 
@@ -81,45 +90,43 @@ def measure_read_noise(
     freedom = np.array([series.frames - 1.0 for series in darks])
     even = np.broadcast_to((1 - 1 / shape[0]) * (1 - 1 / shape[1]), shape)
     shot_dn2 = np.maximum(np.asarray(noise_dn2) - read_dn2, 0.0)
-    found = _measure(darks, read_dn2, shot_dn2, even, usable)
-    if not found.resolved:
-        return found
+    first = _measure(darks, read_dn2, shot_dn2, even, usable)
+    if not first.resolved:
+        return first
     # Now that the pixels' noise is known, so is what the means of rows and columns took from it and brought to it.
     shot, regular = float(freedom @ shot_dn2 / freedom.sum()), ~any_suspect(darks)
 
     def total(rows: slice) -> Array:
-        return np.asarray(np.square(found.read_noise_dn[rows], dtype=np.float64) + shot)
+        return np.asarray(np.square(first.read_noise_dn[rows], dtype=np.float64) + shot)
 
     of_strip = kept_of(total, regular)
     kept = map_of(lambda rows: (variance := total(rows), of_strip(rows, variance) / variance)[1], shape)
     return _measure(darks, read_dn2, shot_dn2, kept, usable)
 
 
-def kept_variance(variance: Array, regular: NDArray[np.bool_]) -> Array:
-    """Return the variances (row, column) of pixels once the means of rows and columns are subtracted.
+def kept_of(variance_of: Callable[[slice], Array], regular: Mask) -> Callable[[slice, Array], Array]:
+    """Return the variances of pixels (row, column) once the means of rows and columns are subtracted.
 
     Parameters
     ----------
-    variance : array (row, column)
-        Variance of each pixel, whose noise is its own.
+    variance_of : callable
+        Returns the variances of some rows of pixels, whose noise is their own.
     regular : array (row, column), bool
         Pixels of which the means are taken.
+
+    Returns
+    -------
+    callable
+        Function of some rows and their variances.
     """
-    return kept_of(lambda rows: variance[rows], regular)(slice(None), variance)
-
-
-def kept_of(variance_of: Callable[[slice], Array], regular: NDArray[np.bool_]) -> Callable[[slice, Array], Array]:
-    """Return `kept_variance` as a function of some rows and their variances, of which `variance_of` gives all."""
     sums = total_of(lambda rows: variance_of(rows).sum(0, where=regular[rows]), regular.shape)
     per_column, per_row = (np.maximum(regular.sum(axis), 1) for axis in (0, 1))
 
     def kept(rows: slice, variance: Array) -> Array:
         counts = regular[rows]
         variance = np.where(counts, 1 - 2 / per_column, 1.0) * variance + sums / per_column**2
-        in_row = per_row[rows, None]
-        return np.asarray(
-            np.where(counts, 1 - 2 / in_row, 1.0) * variance + variance.sum(1, keepdims=True, where=counts) / in_row**2
-        )
+        in_row, row_sums = per_row[rows, None], variance.sum(1, keepdims=True, where=counts)
+        return np.asarray(np.where(counts, 1 - 2 / in_row, 1.0) * variance + row_sums / in_row**2)
 
     return kept
 
@@ -139,7 +146,6 @@ class _LineFactor:
 
     @property
     def varies(self) -> bool:
-        """Return whether pixels differ."""
         return bool(np.ptp(self.of_rows) > 0 or np.ptp(self.of_columns) > 0)
 
 
@@ -147,20 +153,12 @@ class _LineFactor:
 class _Squares:
     """Sums of squares of the pixels over the dark series.
 
-    Attributes
-    ----------
-    darks : sequence of Series
-        The series.
-    kept : array (row, column)
-        Share of its variance that each pixel shows.
-    which : array (series,), int
-        Series of equal shot noise are one: its place in the next two.
-    shot_dn2, freedom : array (group,)
-        Variance beside read noise, and degrees of freedom.
+    Each pixel shows the share `kept` (row, column) of its variance. Series of equal shot noise are one group, by its
+    place in `which` (series,), with its variance beside read noise and its degrees of freedom (group,).
     """
 
     darks: Sequence[Series]
-    kept: NDArray[np.floating]
+    kept: Map
     which: NDArray[np.intp]
     shot_dn2: Array
     freedom: Array
@@ -178,13 +176,7 @@ class _Squares:
         return np.asarray(self.at(rows) @ (1 / (read_dn2 + self.shot_dn2)) / self.freedom.sum())
 
 
-def _measure(
-    darks: Sequence[Series],
-    read_dn2: float,
-    shot_dn2: Array,
-    kept: NDArray[np.floating],
-    usable: NDArray[np.bool_],
-) -> PixelReadNoise:
+def _measure(darks: Sequence[Series], read_dn2: float, shot_dn2: Array, kept: Map, usable: Mask) -> PixelReadNoise:
     """Return the posterior if `kept` is the share of its variance that each pixel shows, (row, column)."""
     shot_dn2, which = np.unique(shot_dn2, return_inverse=True)
     freedom = np.bincount(which, [series.frames - 1.0 for series in darks])
@@ -199,16 +191,12 @@ def _measure(
         common = map_of(lambda rows: _scaled(np.sqrt(read_dn2), region.at(rows), shot, read_dn2), kept.shape)
         se_dn = map_of(lambda rows: common[rows] * 0.5 * np.sqrt(limit), kept.shape)
         return PixelReadNoise(common, se_dn, resolved=region.varies)
-    lines = _LineFactor(
-        *line_shifts(map_of(lambda rows: np.log(np.maximum(ratio[rows], 1e-9)), kept.shape), usable), np.exp
-    )
+    log_ratio = map_of(lambda rows: np.log(np.maximum(ratio[rows], 1e-9)), kept.shape)
+    lines = _LineFactor(*_line_shifts(log_ratio, usable), np.exp)
     # A spot of noisier pixels shifts its rows, columns and regions, too; a number for each must explain more than it
     # may by chance (Akaike, IEEE Transactions on Automatic Control 19, 716, 1974).
     even = _LineFactor(np.zeros(kept.shape[0]), np.zeros(kept.shape[1]), np.exp)
-    ways = [(even, 0)]
-    ways += [
-        (grouping, number) for grouping, number in ((region, _MAX_REGIONS), (lines, sum(kept.shape))) if grouping.varies
-    ]
+    ways = [(even, 0), *((way, n) for way, n in ((region, _MAX_REGIONS), (lines, sum(kept.shape))) if way.varies)]
     fits = [_population(squares, ratio, factor, read_dn2, usable) for factor, _ in ways]
     best = int(np.argmax([fit.log_likelihood - number for fit, (_, number) in zip(fits, ways, strict=True)]))
     factor, posterior = ways[best][0], _posterior(fits[best], shot_dn2, freedom)
@@ -231,7 +219,7 @@ def _scaled(read_dn: Array | float, factor: Array, shot_dn2: float, read_dn2: fl
     return np.asarray(np.sqrt(np.maximum(read_dn**2 * factor + shot_dn2 * (factor - 1), 0.01 * read_dn2)))
 
 
-def _region_factors(ratio: NDArray[np.floating], usable: NDArray[np.bool_], precision: float) -> _LineFactor:
+def _region_factors(ratio: Map, usable: Mask, precision: float) -> _LineFactor:
     """Return by which factor the variances of regions differ that are read apart.
 
     Nothing shrinks them. The population would draw the noise of a region towards that of all pixels if a pixel has few
@@ -241,19 +229,11 @@ def _region_factors(ratio: NDArray[np.floating], usable: NDArray[np.bool_], prec
     mean = mean_over(lambda rows: ratio[rows], usable)
     for seam in find_seams(ratio, usable, precision):
         differs[seam.lines] = seam.effect / mean
-    return _LineFactor(differs["rows"], differs["columns"], lambda it: np.maximum(1 + it, 0.05))
+    return _LineFactor(differs["rows"], differs["columns"], lambda effect: np.maximum(1 + effect, 0.05))
 
 
-def line_shifts(values: NDArray[np.floating], usable: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Return by how much whole rows and columns differ from the rest, (row,) and (column,), shrunk by chance.
-
-    Parameters
-    ----------
-    values : array (row, column)
-        A value per pixel with independent errors.
-    usable : array (row, column), bool
-        Pixels that count.
-    """
+def _line_shifts(values: Map, usable: Mask) -> tuple[Array, Array]:
+    """Return by how much whole rows and columns of values with independent errors differ, shrunk by chance."""
     some = thinned(values, usable)
     centre, limit = float(np.median(some)), _CLIP_SIGMA * robust_sigma(some)
     shifts = [np.zeros(size) for size in values.shape]
@@ -282,26 +262,7 @@ def line_shifts(values: NDArray[np.floating], usable: NDArray[np.bool_]) -> tupl
     return shifts[0], shifts[1]
 
 
-def _grid(low: float, high: float, read_dn2: float, degrees: float) -> Array:
-    """Return the grid of ln r (step,): half as wide as chance scatters it, and as far as ratios reach."""
-    blur = np.sqrt(2 / degrees)
-    first, last = np.log(np.clip([low, high], 1e-3, 1e4)) + np.array([-1, 1]) * blur
-    # Where shot noise is most of the noise, read noise may be anything down to nothing.
-    steps = int(np.clip(np.ceil((last - first + 1.0) / max(0.5 * blur, 0.02)), 32, 300))
-    return np.asarray(np.log(read_dn2) + np.linspace(first - 1.0, last, steps))
-
-
-def _log_likelihood(squares: Array, grid: Array, shot_dn2: Array, freedom: Array) -> Array:
-    """Return ln L (pixel, step) up to a constant, from squares (pixel, series)."""
-    variance = np.exp(grid) + shot_dn2[:, None]
-    log = squares @ (-0.5 / variance)
-    log -= 0.5 * freedom @ np.log(variance)
-    return np.asarray(log)
-
-
-def _bins(
-    squares: _Squares, ratio: NDArray[np.floating], factor: _LineFactor, usable: NDArray[np.bool_]
-) -> tuple[Array, Array, float]:
+def _bins(squares: _Squares, ratio: Map, factor: _LineFactor, usable: Mask) -> tuple[Array, Array, float]:
     """Return mean squares (bin, group) and number (bin,) of pixels that tell the population, and the sum of ln factor.
 
     Pixels of one variance tell the same if all frames are alike. If not, each is a bin of its own, and fewer do.
@@ -325,8 +286,7 @@ def _bins(
     return (sums[full] / counts[full])[:, None], counts[full], logs
 
 
-def _every_nth(usable: NDArray[np.bool_], step: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return rows and columns of every `step`-th usable pixel."""
+def _every_nth(usable: Mask, step: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     before = np.concatenate([[0], np.cumsum(usable.sum(1))])
 
     def work(rows: slice) -> NDArray[np.intp]:
@@ -347,19 +307,23 @@ class _Population:
     log_likelihood: float
 
 
-def _population(
-    squares: _Squares, ratio: NDArray[np.floating], factor: _LineFactor, read_dn2: float, usable: NDArray[np.bool_]
-) -> _Population:
-    """Return the population of the squares over `factor`."""
+def _population(squares: _Squares, ratio: Map, factor: _LineFactor, read_dn2: float, usable: Mask) -> _Population:
     degrees = float(squares.freedom.sum())
     some = thinned(ratio, usable, factor.at)
 
     def highest(rows: slice) -> float:
         return float((ratio[rows] / factor.at(rows)).max(where=usable[rows], initial=0.0))
 
-    grid = _grid(float(np.quantile(some, 0.002)), max(over_strips(highest, usable.shape)), read_dn2, degrees)
+    # The grid is half as wide as chance scatters ln r, and reaches as far as ratios do. Where shot noise is most of the
+    # noise, read noise may be anything down to nothing.
+    blur, ends = np.sqrt(2 / degrees), [float(np.quantile(some, 0.002)), max(over_strips(highest, usable.shape))]
+    first, last = np.log(np.clip(ends, 1e-3, 1e4)) + np.array([-1, 1]) * blur
+    steps = int(np.clip(np.ceil((last - first + 1.0) / max(0.5 * blur, 0.02)), 32, 300))
+    grid = np.asarray(np.log(read_dn2) + np.linspace(first - 1.0, last, steps))
     binned, count, log_factors = _bins(squares, ratio, factor, usable)
-    log = _log_likelihood(binned, grid, squares.shot_dn2, squares.freedom)
+    variance = np.exp(grid) + squares.shot_dn2[:, None]
+    log = binned @ (-0.5 / variance)
+    log -= 0.5 * squares.freedom @ np.log(variance)
     peak = log.max(axis=1)
     likelihood = np.exp(log - peak[:, None])
     spread2 = robust_sigma(np.log(np.maximum(some, 1e-9))) ** 2 - 2 / degrees

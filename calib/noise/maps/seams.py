@@ -12,9 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from faintfield.calib.noise.strips import over_strips
-
-type Array = NDArray[np.float64]
+from faintfield.calib.noise.strips import Array, over_strips
 
 # Probability that chance alone makes such a seam, for each of six that are looked for.
 _MAX_CHANCE = 1e-4
@@ -38,7 +36,7 @@ class Seam:
     se : float
         Standard error of the largest difference between regions.
     of_response : bool
-        Whether the response to light has told its size.
+        The response to light has told its size.
     """
 
     lines: str
@@ -74,11 +72,10 @@ def find_seams(values: NDArray[Any], weight: NDArray[Any], precision: float = 1.
     weight : array (row, column)
         Inverse variance of each value over `precision`; 0 for pixels that do not count.
     precision : float
-        What the weights are multiplied by.
+        Factor on the weights.
     """
     profiles = _profiles(values, weight, precision)
-    found = [_find_seam(*profiles[lines], lines) for lines in ("rows", "columns")]
-    return [seam for seam in found if seam]
+    return [seam for lines, profile in profiles.items() if (seam := _find_seam(*profile, lines))]
 
 
 def share_of_seam(
@@ -86,8 +83,8 @@ def share_of_seam(
 ) -> tuple[float, float]:
     """Return how much of the effect of a seam other values (row, column) show, and its standard error."""
     profile, total = _profiles(values, weight, precision)[seam.lines]
-    found, covariance, _ = _fit(np.stack([seam.effect, np.ones(profile.size)], axis=1), profile, total)
-    return float(found[0]), float(np.sqrt(covariance[0, 0]))
+    share, covariance, _ = _fit(np.stack([seam.effect, np.ones(profile.size)], axis=1), profile, total)
+    return float(share[0]), float(np.sqrt(covariance[0, 0]))
 
 
 def _profiles(values: NDArray[Any], weight: NDArray[Any], precision: float) -> dict[str, tuple[Array, Array]]:
@@ -119,12 +116,12 @@ def _find_seam(profile: Array, weight: Array, lines: str) -> Seam | None:
         freedom = count - member.shape[1] - 2
         if freedom < _MIN_FREEDOM:
             continue
-        found, covariance, after = _fit(np.concatenate([member, np.stack([x, x**2], axis=1)], axis=1), profile, weight)
+        level, covariance, after = _fit(np.concatenate([member, np.stack([x, x**2], axis=1)], axis=1), profile, weight)
         excess = max(after / freedom, 1.0)
         fewer = member.shape[1] - 1
         chance = float(stats.f.sf((before - after) / fewer / excess, fewer, freedom))
         if chance < least:
-            level = found[: fewer + 1]
+            level = level[: fewer + 1]
             low, high = int(level.argmin()), int(level.argmax())
             variance = covariance[low, low] + covariance[high, high] - 2 * covariance[low, high]
             effect = level[region] - np.average(level[region], weights=weight)
@@ -136,5 +133,5 @@ def _fit(design: Array, profile: Array, weight: Array) -> tuple[Array, Array, fl
     """Return coefficients, their covariance and the weighted sum of squared residuals."""
     root = np.sqrt(weight)
     covariance = np.linalg.inv((design * weight[:, None]).T @ design)
-    found = covariance @ (design.T @ (weight * profile))
-    return found, covariance, float(np.sum((root * (profile - design @ found)) ** 2))
+    coefficients = covariance @ (design.T @ (weight * profile))
+    return coefficients, covariance, float(np.sum((root * (profile - design @ coefficients)) ** 2))

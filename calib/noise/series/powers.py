@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.calib.noise.compiled import compiled
-from faintfield.calib.noise.room import new_map
+from faintfield.calib.noise.strips import Mask, compiled, map_of
 
 _NONE = np.iinfo(np.int64).min
 
@@ -25,24 +24,15 @@ class Moments:
     shape : tuple of int
         Rows and columns of a frame.
     higher : bool
-        Whether third and fourth powers are summed, too.
+        Sum third and fourth powers, too.
     """
 
     def __init__(self, shape: tuple[int, ...], *, higher: bool) -> None:
         self.mean = np.zeros(shape)
         self.sums = [np.zeros(shape, np.float32) for _ in range(3 if higher else 1)]
 
-    def add(self, frames: int, rows: slice, frame, regular: NDArray[np.bool_], of_rows, of_columns, top: float):
-        """Add some rows of a frame, which is the `frames`-th.
-
-        Parameters
-        ----------
-        frame, regular : array (row, column)
-            Its values, and the pixels that count.
-        of_rows, of_columns : array (row,), array (column,)
-            Sum of which is subtracted.
-        top : float
-            A value.
+    def add(self, frames: int, rows: slice, frame, regular: Mask, of_rows, of_columns, top: float):
+        """Add some rows of the `frames`-th frame (row, column), less the sum of `of_rows` and `of_columns`.
 
         Returns
         -------
@@ -56,13 +46,9 @@ class Moments:
 
     def maps(self) -> list[NDArray[np.float32]]:
         """Return the mean and the sums of second, third and fourth powers; the last two are one zero if not summed."""
-        found: list[NDArray[np.float32]] = []
         moments: list[NDArray[Any]] = [self.mean, *self.sums]
-        for moment in moments:
-            made = new_map(moment.shape)
-            made[...] = moment
-            found.append(made)
-        return found + [np.zeros((1, 1), np.float32) for _ in range(4 - len(found))]
+        maps = [map_of(moment.__getitem__, moment.shape) for moment in moments]
+        return maps + [np.zeros((1, 1), np.float32) for _ in range(4 - len(maps))]
 
 
 @compiled

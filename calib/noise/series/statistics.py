@@ -8,16 +8,16 @@ level and banding would count as pixel noise.
 
 import hashlib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from faintfield.calib.errors import BadFrame, LightLeak
-from faintfield.calib.noise.series.outliers import outlier
 from faintfield.calib.noise.series.powers import Moments, sum_lines
-from faintfield.calib.noise.strips import over_strips, total_of
+from faintfield.calib.noise.strips import Array, Mask, over_strips, total_of
 
 # Robust standard deviations in the first frame of a series beyond which pixels are left out of row and column means:
 # the shot noise of a hot pixel would otherwise spread along its row.
@@ -31,6 +31,9 @@ _CERTAIN_LEAK, _MIN_LEAK = 5.0, 0.25
 
 # A dark has another pattern if its variance exceeds that of its series by these fractions, likewise.
 _CERTAIN_EXCESS, _MIN_EXCESS = 1.0, 0.2
+
+# Probability below which a value is no chance.
+MAX_CHANCE = 1e-7
 
 # Pixels whose values are kept for histograms and for the likelihood of single values.
 SAMPLE_PX = 65_536
@@ -115,23 +118,23 @@ class Series:
     conditions: Conditions
     names: tuple[str, ...]
     digests: tuple[bytes, ...]
-    levels_dn: NDArray[np.float64]
-    row_dn: NDArray[np.float64]
-    column_dn: NDArray[np.float64]
+    levels_dn: Array
+    row_dn: Array
+    column_dn: Array
     row_noise_dn2: float
     column_noise_dn2: float
     pattern_dn: NDArray[np.float32]
     within_dn2: NDArray[np.float32]
     cubes_dn3: NDArray[np.float32]
     fourths_dn4: NDArray[np.float32]
-    suspect: NDArray[np.bool_]
+    suspect: Mask
     sample_dn: NDArray[np.int32]
     floor_dn: int
-    spreads_dn2: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
-    top_dn: float = 0.0
-    at_top: int = 0
-    below_top: int = 0
-    counted: int = 0
+    spreads_dn2: Array
+    top_dn: float
+    at_top: int
+    below_top: int
+    counted: int
 
     @property
     def frames(self) -> int:
@@ -139,11 +142,11 @@ class Series:
         return len(self.names)
 
     @property
-    def mean_dn(self) -> NDArray[np.float64]:
+    def mean_dn(self) -> Array:
         """Mean over the frames (row, column), with level and profiles."""
         return self.mean_of(slice(None))
 
-    def mean_of(self, rows: slice) -> NDArray[np.float64]:
+    def mean_of(self, rows: slice) -> Array:
         """Return some rows of `mean_dn`."""
         mean = self.pattern_dn[rows] + (self.row_dn[rows] + self.levels_dn.mean())[:, None]
         mean += self.column_dn
@@ -184,44 +187,42 @@ class SeriesSums:
             The frame differs in size from earlier ones.
         """
         if not self._frames:
-            self._begin(frame_dn)
+            self._suspect = _suspects(frame_dn)
+            self._regular = ~self._suspect
+            self._suspect_at = np.nonzero(self._suspect)
+            self._row_count, self._column_count = self._regular.sum(1), self._regular.sum(0)
+            self._sampled = sample_index(frame_dn.shape)
+            self._moments = Moments(frame_dn.shape, higher=self.conditions.kind == "dark")
         if frame_dn.shape != self._suspect.shape:
             raise ValueError(f"{name}: {frame_dn.shape} pixels, where the series began with {self._suspect.shape}")
         digest = hashlib.blake2b(np.ascontiguousarray(frame_dn), digest_size=16).digest()
         sample = frame_dn.ravel()[self._sampled].astype(np.int32)
         self._frames.append((name, digest, sample, *self._add_residual(frame_dn)))
 
-    def _begin(self, first_dn: NDArray[Any]) -> None:
-        """Allocate the sums for frames like the first."""
-        self._suspect = _suspects(first_dn)
-        self._regular = ~self._suspect
-        self._suspect_at = np.nonzero(self._suspect)
-        self._row_count, self._column_count = self._regular.sum(1), self._regular.sum(0)
-        self._sampled = sample_index(first_dn.shape)
-        self._moments = Moments(first_dn.shape, higher=self.conditions.kind == "dark")
-
     def _add_residual(self, frame_dn: NDArray[Any]) -> tuple[Any, ...]:
         """Add a frame without its level, row and column means to the sums; return them and the spread of the rest."""
         level, rows, columns, highest = self._means(frame_dn)
         top, frames = max(self._top_dn, min(highest, self.saturation_dn)), len(self._frames) + 1
 
-        def work(strip: slice) -> NDArray[np.float64]:
-            found = self._moments.add(
-                frames, strip, frame_dn[strip], self._regular[strip], level + rows[strip], columns, top
-            )
-            return np.array(found, np.float64)
+        def work(strip: slice) -> Array:
+            regular, of_rows = self._regular[strip], level + rows[strip]
+            return np.array(self._moments.add(frames, strip, frame_dn[strip], regular, of_rows, columns, top), float)
 
         squares, at, below = total_of(work, frame_dn.shape).tolist()
-        self._count_top(top, int(at), int(below))
+        if self.conditions.kind == "flat":
+            if top == self._top_dn:
+                at, below = at + self._at_top, below + self._below_top
+            elif top == self._top_dn + 1:
+                below += self._at_top
+            self._top_dn, self._at_top, self._below_top = top, int(at), int(below)
         return level, rows, columns, squares / self._row_count.sum()
 
-    def _means(self, frame_dn: NDArray[Any]) -> tuple[float, NDArray[np.float64], NDArray[np.float64], float]:
+    def _means(self, frame_dn: NDArray[Any]) -> tuple[float, Array, Array, float]:
         """Return the level of the regular pixels, the means of rows and columns about it, and the highest value."""
         rows = np.zeros(len(frame_dn), np.int64)
 
-        def work(strip: slice) -> tuple[NDArray[np.int64], int, int]:
-            found: tuple[NDArray[np.int64], int, int] = sum_lines(frame_dn[strip], self._regular[strip], rows[strip])
-            return found
+        def work(strip: slice) -> Any:
+            return sum_lines(frame_dn[strip], self._regular[strip], rows[strip])
 
         parts, lows, highs = zip(*over_strips(work, frame_dn.shape), strict=True)
         self._floor_dn = min(self._floor_dn, *lows)
@@ -229,18 +230,8 @@ class SeriesSums:
         level = float(total / self._row_count.sum())
         means = (rows - level * self._row_count) / np.maximum(self._row_count, 1)
         row, column = self._suspect_at
-        taken = (level + means).sum() - np.bincount(column, (level + means)[row], frame_dn.shape[1])
-        return level, means, (columns - taken) / np.maximum(self._column_count, 1), float(max(*highs, min(lows)))
-
-    def _count_top(self, top: float, at: int, below: int) -> None:
-        """Add the numbers of values of a flat at the highest so far, and one below it."""
-        if self.conditions.kind != "flat":
-            return
-        if top == self._top_dn:
-            at, below = at + self._at_top, below + self._below_top
-        elif top == self._top_dn + 1:
-            below += self._at_top
-        self._top_dn, self._at_top, self._below_top = top, at, below
+        shared = (level + means).sum() - np.bincount(column, (level + means)[row], frame_dn.shape[1])
+        return level, means, (columns - shared) / np.maximum(self._column_count, 1), float(max(*highs, min(lows)))
 
     def series(self) -> Series:
         """Return the statistics of the frames so far.
@@ -279,7 +270,7 @@ class SeriesSums:
             below_top=self._below_top,
             counted=frames * int(self._regular.sum()) if self.conditions.kind == "flat" else 0,
         )
-        _check_alike(series, spreads_dn2)
+        _check_alike(series)
         return series
 
 
@@ -293,7 +284,7 @@ def measure_series(
     return sums.series()
 
 
-def any_suspect(series: Sequence[Series]) -> NDArray[np.bool_]:
+def any_suspect(series: Sequence[Series]) -> Mask:
     """Return the pixels (row, column) that are suspect in any series."""
     return np.asarray(np.logical_or.reduce([item.suspect for item in series]))
 
@@ -306,11 +297,10 @@ def sample_index(shape: tuple[int, ...]) -> NDArray[np.int64]:
     return np.sort(np.random.default_rng(1288).choice(pixels, SAMPLE_PX, replace=False))
 
 
-def _suspects(frame_dn: NDArray[Any]) -> NDArray[np.bool_]:
+def _suspects(frame_dn: NDArray[Any]) -> Mask:
     """Return the pixels that differ much from their row and column."""
     # Medians of whole numbers, and of what is left, are multiples of a quarter, which single precision holds
     residual = frame_dn.astype(np.result_type(frame_dn, np.float32))
-
     _subtract_medians(residual)
     residual = np.ascontiguousarray(residual.T)
     _subtract_medians(residual)
@@ -319,7 +309,6 @@ def _suspects(frame_dn: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def _subtract_medians(values: NDArray[Any]) -> None:
-    """Subtract the median of each row, in place."""
 
     def work(rows: slice) -> None:
         values[rows] -= np.median(values[rows], axis=1, keepdims=True)
@@ -333,8 +322,7 @@ def robust_sigma(values: NDArray[Any]) -> float:
     return float(1.4826 * np.median(np.abs(deviations, out=deviations), overwrite_input=True))
 
 
-def _check_alike(series: Series, spreads_dn2: NDArray[np.float64]) -> None:
-    """Check that no dark is brighter, or has another pattern, than the others of its series."""
+def _check_alike(series: Series) -> None:
     if series.conditions.kind != "dark" or series.frames < 2:
         return
     noise_dn = float(np.sqrt(np.median(series.within_dn2) / (series.frames - 1)))
@@ -345,9 +333,26 @@ def _check_alike(series: Series, spreads_dn2: NDArray[np.float64]) -> None:
             f"{series.conditions} (their pixels are {noise_dn:.1f} DN rms noisy): light leaked in; cover the lens and "
             "record it again, or leave it out"
         )
-    odd, excess = outlier(spreads_dn2 / np.median(spreads_dn2), _MIN_EXCESS, _CERTAIN_EXCESS)
+    odd, excess = outlier(series.spreads_dn2 / np.median(series.spreads_dn2), _MIN_EXCESS, _CERTAIN_EXCESS)
     if excess > 0:
         raise BadFrame(
             f"{series.names[odd]}: its pixels spread {np.sqrt(1 + excess):.2f} times as far as in the other "
             f"{series.conditions}: light leaked in or the readout failed; record it again, or leave it out"
         )
+
+
+def outlier(values: Array, min_excess: float, certain_excess: float) -> tuple[int, float]:
+    """Return the index of the largest value, and its excess over the mean of the others; 0 if it can be chance.
+
+    An excess above `certain_excess` always counts. One above `min_excess` counts if its probability, by Student's t
+    from the scatter of the others, is below `MAX_CHANCE`.
+    """
+    largest = int(values.argmax())
+    rest = np.delete(values, largest)
+    excess = float(values[largest] - rest.mean())
+    if excess > certain_excess:
+        return largest, excess
+    if excess < min_excess or rest.size < 2:
+        return largest, 0.0
+    t = excess / max(float(rest.std(ddof=1)) * np.sqrt(1 + 1 / rest.size), 1e-12)
+    return largest, excess if stats.t.sf(t, rest.size - 1) < MAX_CHANCE else 0.0

@@ -15,10 +15,20 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from faintfield.calib.lens import Lens
+from faintfield.pipelines.arguments import ImportOptions
 from faintfield.pipelines.errors import BadValue, MissingFile
-from faintfield.pipelines.formats.exchange.imported_set import PosedImage, PosedModel
-from faintfield.pipelines.formats.files import write_whole
+from faintfield.pipelines.formats.exchange.imported_set import (
+    ExportedSet,
+    ImportedSet,
+    PosedImage,
+    PosedModel,
+    import_posed,
+    lens_of_each_view,
+)
+from faintfield.pipelines.formats.files import write_whole, writing_folder
 from faintfield.pipelines.formats.reading import is_file, read_content
+from faintfield.pipelines.formats.sets.session_set import load_set_or_session
+from faintfield.pipelines.formats.sets.stated import stated_length
 from faintfield.pipelines.formats.toml_files import inside
 
 # Name and number of parameters of a camera model, by COLMAP's number.
@@ -80,6 +90,27 @@ def read_model(folder: Path) -> ColmapModel:
                 f"{', '.join(map(str, model.lenses)) or 'none'}; export the whole model"
             )
     return model
+
+
+def import_model(src: Path, out: Path, options: ImportOptions) -> ImportedSet:
+    """Make an elemental set of a model and its images."""
+    return import_posed(out, read_posed_images(src, options.images or src), options, "import colmap")
+
+
+def export_model(set_path: Path, out: Path, *, binary: bool, overwrite: bool) -> ExportedSet:
+    """Write the lens and poses of a set or session as a model without points."""
+    elemental_set = load_set_or_session(set_path)
+    lenses = lens_of_each_view(elemental_set)
+    cameras = {lens: number for number, lens in enumerate(dict.fromkeys(lenses), start=1)}
+    views = zip(elemental_set.settings.view, lenses, elemental_set.poses_rt_cam_ref, strict=True)
+    model = ColmapModel(
+        {number: lens for lens, number in cameras.items()},
+        [ColmapImage(view.image, cameras[lens], pose) for view, lens, pose in views],
+    )
+    unit = stated_length(elemental_set, "mm")
+    with writing_folder(out, replace_only=MODEL_FILES if overwrite else ()) as folder:
+        write_model(folder, model, binary=binary)
+    return ExportedSet(str(out), len(model.images), unit)
 
 
 def read_posed_images(folder: Path, images: Path) -> PosedModel:

@@ -1,4 +1,4 @@
-"""The descriptor files of EMVA 1288 reference data.
+"""EMVA 1288 reference data: dark and flat images with a descriptor file.
 
 A descriptor is a text file of one-letter lines: `v` release, `n` bits width height, then for each measurement
 `b` exposure-in-ns photons-per-pixel (bright) or `d` exposure-in-ns (dark), followed by one `i` line per image. Paths
@@ -6,17 +6,26 @@ are relative, often with backslashes; decimals may be commas; `#` begins a comme
 """
 
 import math
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PureWindowsPath
 
 import msgspec
+import numpy as np
 
 from faintfield.calib.noise import Conditions
+from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.errors import BadValue, MissingFile
+from faintfield.pipelines.formats.files import sha256, write_json, write_whole, writing_folder
+from faintfield.pipelines.formats.frames import RAW_SUFFIXES, Frame, read_frame
+from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.formats.limits import MAX_EXPOSURE_S
+from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.reading import is_file, read_text
 from faintfield.pipelines.formats.results.noise import NoiseFrame
+from faintfield.pipelines.formats.sets.noise_set import FILE_NAME as NOISE_SET_FILE
+from faintfield.pipelines.formats.sets.noise_set import NoiseSet, group_frames, load_noise_set, write_noise_set
 from faintfield.pipelines.formats.toml_files import inside
 
 DESCRIPTOR = "descriptor.txt"
@@ -27,6 +36,24 @@ _NS_PER_S = 1e9
 _RELEASE = "4.0"
 
 
+class ImportedFrames(msgspec.Struct, frozen=True):
+    """The result of `faintfield import emva1288`."""
+
+    out: str
+    frames: int
+    release: str
+    saturation_dn: float
+
+
+class ExportedData(msgspec.Struct, frozen=True):
+    """The result of `faintfield export emva1288`."""
+
+    out: str
+    frames: int
+    bits: int
+    size_px: tuple[int, int]
+
+
 @dataclass
 class Descriptor:
     """A descriptor file: release of the standard, bits per pixel, and the frames."""
@@ -34,6 +61,54 @@ class Descriptor:
     release: str = ""
     bits: int = 0
     frames: list[NoiseFrame] = field(default_factory=list)
+
+
+def import_data(descriptor: Path, out: Path, *, overwrite: bool = False) -> ImportedFrames:
+    """Make a noise set of the images that a descriptor names."""
+    read = read_descriptor(descriptor)
+    sources = [image_path(descriptor, frame.file) for frame in read.frames]
+    names = [f"frames/{index:05d}_{source.name}" for index, source in enumerate(sources)]
+    frames = [msgspec.structs.replace(frame, file=name) for name, frame in zip(names, read.frames, strict=True)]
+    saturation_dn = float(2**read.bits - 1)
+    replace = NOISE_SET_FILE if overwrite else None
+    with writing_folder(out, replace_if=replace, reads=[descriptor, *sources]) as folder:
+        (folder / "frames").mkdir()
+        for source, name in progress(list(zip(sources, names, strict=True)), "copying frames"):
+            shutil.copyfile(source, folder / name)
+        write_noise_set(folder, NoiseSet(1, frames, saturation_dn))
+        inputs = {frame.file: sha256(source) for frame, source in zip(read.frames, sources, strict=True)}
+        inputs |= {descriptor.name: sha256(descriptor)}
+        write_json(folder / "provenance.json", provenance("import emva1288", {}, inputs))
+    inform(f"{out / NOISE_SET_FILE}: {len(frames)} frames of EMVA 1288 release {read.release or 'unstated'} data")
+    return ImportedFrames(str(out), len(frames), read.release, saturation_dn)
+
+
+def export_data(folder: Path, out: Path, *, overwrite: bool = False) -> ExportedData:
+    """Write the frames of a noise set or a session as images and a descriptor.
+
+    Raises
+    ------
+    MissingFile, BadValue
+        There is no such folder, or a flat states no photons.
+    """
+    if not folder.exists():
+        raise MissingFile(f"{folder}: no such folder; name a noise set or a session")
+    folder, settings = load_noise_set(folder)
+    series = _ordered(folder, settings)
+    first = read_frame(series[0][1][0])
+    bits = _bits(settings, first)
+    sources = [path for _, paths in series for path in paths]
+    replace = DESCRIPTOR if overwrite else None
+    with writing_folder(out, replace_if=replace, reads=[folder, *sources]) as building:
+        (building / "images").mkdir()
+        names = {}
+        for index, source in enumerate(progress(sources, "writing images")):
+            names[source] = _write_image(source, building, index, settings, first)
+        images = [(conditions, [names[path] for path in paths]) for conditions, paths in series]
+        height, width = first.pixels_dn[_region(settings)].shape
+        write_whole(building / DESCRIPTOR, descriptor_text(images, bits, (width, height)))
+    inform(f"{out / DESCRIPTOR}: {len(sources)} images of {bits} bits, {width} x {height} px")
+    return ExportedData(str(out), len(sources), bits, (width, height))
 
 
 def read_descriptor(path: Path) -> Descriptor:
@@ -130,3 +205,43 @@ def descriptor_text(images: Sequence[tuple[Conditions, Sequence[str]]], bits: in
         lines.append(f"d {exposure_ns}" if conditions.kind == "dark" else f"b {exposure_ns} {conditions.photons!r}")
         lines += ["i " + str(PureWindowsPath(name)) for name in names]
     return "\n".join(lines) + "\n"
+
+
+def _ordered(folder: Path, settings: NoiseSet) -> list[tuple[Conditions, list[Path]]]:
+    """Return the series with their frames, flats by their level and then darks, as the standard's data have them."""
+    series = list(group_frames(folder, settings).items())
+    for conditions, paths in series:
+        if conditions.kind == "flat" and not conditions.photons:
+            raise BadValue(
+                f"{paths[0]}: states no photons, which an EMVA 1288 descriptor gives for every bright image; add "
+                "photons to its entry, or leave it out"
+            )
+    return sorted(series, key=lambda item: (item[0].kind != "flat", item[0].level, item[0].exposure_s))
+
+
+def _bits(settings: NoiseSet, first: Frame) -> int:
+    """Return the bits per pixel; the format takes saturation for the last value of these."""
+    end_dn = settings.saturation_dn or first.saturation_dn or float(np.iinfo(first.pixels_dn.dtype).max)
+    bits = int(np.ceil(np.log2(end_dn + 1)))
+    if end_dn != 2**bits - 1:
+        inform(f"saturation at {end_dn:g} DN cannot be stated; readers will take {2**bits - 1} DN, of {bits} bits")
+    return bits
+
+
+def _region(settings: NoiseSet) -> tuple[slice, slice]:
+    """Return the rows and columns in use."""
+    region = settings.region
+    return (slice(*region.rows), slice(*region.columns)) if region else (slice(None), slice(None))
+
+
+def _write_image(source: Path, folder: Path, index: int, settings: NoiseSet, first: Frame) -> str:
+    """Write one image, and return its path within the folder."""
+    height, width = first.pixels_dn.shape[:2]
+    pixels = read_frame(source, (width, height), of="the first frame").pixels_dn
+    as_it_is = settings.region is None and source.suffix.lower() not in RAW_SUFFIXES
+    name = f"images/{index:05d}_{source.stem}{source.suffix if as_it_is else '.tiff'}"
+    if as_it_is:
+        shutil.copyfile(source, folder / name)
+    else:
+        write_frame(folder / name, pixels[_region(settings)])
+    return name

@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.lens import Lens
+from faintfield.pipelines.arguments import ImportOptions
 from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.errors import BadValue, MissingFile, WrongBitDepth, WrongSize
 from faintfield.pipelines.formats.exchange.imported_noise import NoiseOrigin, Pictures, StatedNoise, complete_noise
-from faintfield.pipelines.formats.exchange.tone import Tone, tone_of, without_curve
+from faintfield.pipelines.formats.exchange.tone import Tone, asked_tone, tone_of, without_curve
 from faintfield.pipelines.formats.files import sha256, write_json, writing_folder
 from faintfield.pipelines.formats.frames import RAW_SUFFIXES, Frame, exif_exposure_s, read_frame
 from faintfield.pipelines.formats.image_files import write_frame
@@ -71,20 +72,18 @@ class ImportedSet(msgspec.Struct, frozen=True):
     reference: str
 
 
-def import_posed(
-    out: Path,
-    model: PosedModel,
-    *,
-    mm_per_unit: float | None,
-    reference: str | None,
-    exposure_s: float | None,
-    tone: Tone | None = None,
-    command: str,
-    overwrite: bool,
-) -> ImportedSet:
-    """Make an elemental set of the images of a model, whose poses are in units of `mm_per_unit`, None if not known.
+class ExportedSet(msgspec.Struct, frozen=True):
+    """The result of an export: the file or folder, the number of views, and the unit of lengths, or "relative"."""
 
-    Without it they are relative, to a scale that is not known. Light is in DN, or relative of pictures of 8 bits.
+    out: str
+    views: int
+    unit: str
+
+
+def import_posed(out: Path, model: PosedModel, options: ImportOptions, command: str) -> ImportedSet:
+    """Make an elemental set of the images of a model.
+
+    Without a length of its unit, poses are relative. Light is in DN, or relative of pictures of 8 bits.
 
     Raises
     ------
@@ -93,25 +92,26 @@ def import_posed(
     """
     if not model.images:
         raise BadValue(f"{model.files[-1]}: names no image; export a model of the images")
+    mm_per_unit = options.mm_per_unit
     _check_images(model.images, mm_per_unit or 1.0)
     scale = np.repeat([1.0, mm_per_unit or 1.0], 3)
     images = [
         replace(image, rt_cam_world=image.rt_cam_world * scale, node=node)
         for image, node in zip(model.images, _nodes(model.images), strict=True)
     ]
-    index = _reference(images, reference)
+    index = _reference(images, options.reference)
     write_imported_set(
         out,
         images,
         reference=index,
         noise=StatedNoise(),
-        exposure_s=exposure_s,
-        tone=tone,
+        exposure_s=options.exposure_s,
+        tone=asked_tone(linear=options.linear, srgb=options.srgb),
         command=command,
-        options={"mm_per_unit": mm_per_unit, "reference": reference, "exposure_s": exposure_s},
+        options={name: getattr(options, name) for name in ("mm_per_unit", "reference", "exposure_s")},
         models=model.files,
         units=None if mm_per_unit else Units(depth="relative"),
-        overwrite=overwrite,
+        overwrite=options.overwrite,
     )
     width, height = images[index].lens.size_px
     inform(f"{out}: {len(images)} views of {width} x {height} px")

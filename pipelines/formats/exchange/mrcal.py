@@ -3,6 +3,7 @@
 import ast
 import io
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -12,12 +13,25 @@ from numpy.typing import ArrayLike
 
 from faintfield.calib.lens import Lens
 from faintfield.calib.mrcal_loader import load_mrcal
+from faintfield.pipelines.arguments import ImportOptions
 from faintfield.pipelines.errors import BadValue, MissingFile
-from faintfield.pipelines.formats.exchange.imported_set import PosedImage, PosedModel
+from faintfield.pipelines.formats.exchange.imported_set import (
+    ExportedSet,
+    ImportedSet,
+    PosedImage,
+    PosedModel,
+    import_posed,
+    lens_of_each_view,
+)
+from faintfield.pipelines.formats.files import write_whole, writing_folder
 from faintfield.pipelines.formats.frames import IMAGE_SUFFIXES
 from faintfield.pipelines.formats.reading import is_file, read_content
+from faintfield.pipelines.formats.sets.session_set import load_set_or_session
+from faintfield.pipelines.formats.sets.stated import stated_length
 
 SUFFIX = ".cameramodel"
+
+_MM_PER_M = 1000.0
 
 # mrcal's name of each lens model, and how many distortion coefficients it has.
 _LENS_MODELS = {
@@ -80,6 +94,29 @@ def camera_model_text(lens: Lens, lens_model: str, rt_cam_ref: ArrayLike) -> str
     text = io.StringIO()
     model.write(text)
     return text.getvalue()
+
+
+def import_camera_models(src: Path, out: Path, options: ImportOptions) -> ImportedSet:
+    """Make an elemental set of the models in a folder and their images."""
+    options = replace(options, mm_per_unit=options.mm_per_unit or _MM_PER_M)
+    return import_posed(out, read_camera_models(src, options.images or src), options, "import mrcal")
+
+
+def export_camera_models(set_path: Path, out: Path, *, overwrite: bool) -> ExportedSet:
+    """Write the lens and poses of a set or session, a model for each view."""
+    elemental_set = load_set_or_session(set_path)
+    lenses = lens_of_each_view(elemental_set)
+    models: dict[str, str] = {}
+    for view, lens, pose in zip(elemental_set.settings.view, lenses, elemental_set.poses_rt_cam_ref, strict=True):
+        name = Path(view.image).with_suffix(SUFFIX).name
+        if name in models:
+            raise BadValue(f"{set_path}: {view.image} would become {name} like another view; rename its image")
+        models[name] = camera_model_text(lens, lens_model_of(lens), pose)
+    unit = stated_length(elemental_set, "m")
+    with writing_folder(out, replace_only=[f"*{SUFFIX}"] if overwrite else ()) as folder:
+        for name, text in models.items():
+            write_whole(folder / name, text)
+    return ExportedSet(str(out), len(models), unit)
 
 
 def read_camera_models(folder: Path, images: Path) -> PosedModel:

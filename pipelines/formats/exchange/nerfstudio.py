@@ -13,13 +13,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.lens import Lens
+from faintfield.pipelines.arguments import ImportOptions
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.exchange.camera_to_world import rt_cam_world, turn_and_centre
-from faintfield.pipelines.formats.exchange.imported_set import PosedImage, PosedModel
+from faintfield.pipelines.formats.exchange.imported_set import (
+    ExportedSet,
+    ImportedSet,
+    PosedImage,
+    PosedModel,
+    import_posed,
+    lens_of_each_view,
+)
 from faintfield.pipelines.formats.exchange.picture_folder import picture_named
-from faintfield.pipelines.formats.files import write_json
+from faintfield.pipelines.formats.files import write_json, writing_folder
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.reading import is_file, is_folder, read_json
+from faintfield.pipelines.formats.sets.session_set import load_set_or_session
+from faintfield.pipelines.formats.sets.stated import stated_length
 
 FILE_NAME = "transforms.json"
 
@@ -68,6 +78,21 @@ class _Transforms(_Intrinsics, omit_defaults=True, kw_only=True):
     """The file."""
 
     frames: list[_Frame]
+
+
+def import_transforms(src: Path, out: Path, options: ImportOptions) -> ImportedSet:
+    """Make an elemental set of a `transforms.json` and its images."""
+    return import_posed(out, read_transforms(src, options.images), options, "import nerfstudio")
+
+
+def export_transforms(set_path: Path, out: Path, *, overwrite: bool) -> ExportedSet:
+    """Write the lens and poses of a set or session as a `transforms.json`."""
+    elemental_set = load_set_or_session(set_path)
+    names = [view.image for view in elemental_set.settings.view]
+    unit = stated_length(elemental_set, "mm")
+    with writing_folder(out, replace_only=[FILE_NAME] if overwrite else ()) as folder:
+        write_transforms(folder, names, lens_of_each_view(elemental_set), elemental_set.poses_rt_cam_ref)
+    return ExportedSet(str(out), len(names), unit)
 
 
 def read_transforms(src: Path, images: Path | None = None) -> PosedModel:

@@ -2,6 +2,7 @@
 
 import csv
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +10,16 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from faintfield.calib.lens import Lens
-from faintfield.pipelines.errors import BadValue
+from faintfield.pipelines.arguments import ImportOptions
+from faintfield.pipelines.errors import BadValue, WrongUsage
 from faintfield.pipelines.formats.exchange.camera_to_world import rt_cam_world
-from faintfield.pipelines.formats.exchange.imported_set import PosedImage, PosedModel
+from faintfield.pipelines.formats.exchange.imported_set import (
+    ImportedSet,
+    PosedImage,
+    PosedModel,
+    import_posed,
+    read_picture,
+)
 from faintfield.pipelines.formats.exchange.picture_folder import picture_named
 from faintfield.pipelines.formats.reading import read_text
 
@@ -130,3 +138,39 @@ def _turn(place: str, quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
     if not abs(length - 1) <= _TOLERANCE:
         raise BadValue(f"{place}: qw, qx, qy, qz have the length {length:g}, that of a rotation is 1; correct them")
     return np.asarray(Rotation.from_quat(quaternion).as_matrix())
+
+
+def import_table(
+    src: Path,
+    out: Path,
+    options: ImportOptions,
+    fx_px: float,
+    fy_px: float,
+    centre_px: tuple[float | None, float | None],
+    distortion: tuple[float, ...],
+) -> ImportedSet:
+    """Make an elemental set of a table and its images, with the lens given; by default its centre is the picture's.
+
+    Raises
+    ------
+    WrongUsage
+        The lens cannot be, or the unit of positions is stated twice.
+    """
+    table, folder = PoseTable(src), options.images or src.parent
+    if options.mm_per_unit is not None and table.mm_per_unit is not None:
+        raise WrongUsage(f"{src}: its header states the unit of positions; leave --mm-per-unit out")
+    options = replace(options, mm_per_unit=options.mm_per_unit or table.mm_per_unit)
+    height, width = read_picture(table.first_picture(folder)).pixels_dn.shape[:2]
+    cx_px, cy_px = centre_px
+    try:
+        lens = Lens(
+            (width, height),
+            fx_px,
+            fy_px,
+            (width - 1) / 2 if cx_px is None else cx_px,
+            (height - 1) / 2 if cy_px is None else cy_px,
+            distortion,
+        )
+    except ValueError as failure:
+        raise WrongUsage(f"the lens of the options cannot be: {failure}; correct them") from failure
+    return import_posed(out, table.posed(lens, folder), options, "import poses")

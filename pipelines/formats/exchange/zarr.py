@@ -16,7 +16,8 @@ from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.reading import read_json
 from faintfield.pipelines.formats.results.records import PlaneRecord
 from faintfield.pipelines.formats.results.stacks import Scale, at_depths, planes_in_order, stack_scale
-from faintfield.pipelines.formats.units import StatedUnits, named_by
+from faintfield.pipelines.formats.results.surface import planes_below
+from faintfield.pipelines.formats.units import StatedUnits, named_by, units_of
 
 # Planes are halved until no side is longer, px; viewers load the rest only where they look closer.
 _COARSEST_PX = 512
@@ -58,6 +59,28 @@ class PlaneStack:
         while longest > _COARSEST_PX and min(self.shape[2:]) >> levels:
             levels, longest = levels + 1, longest // 2
         return levels
+
+
+class ZarrExport(msgspec.Struct, frozen=True):
+    """The result of `faintfield export zarr`."""
+
+    out: str
+    shape: tuple[int, int, int, int]
+    levels: int
+    unit: str
+
+
+def export_planes(directory: Path, out: Path, *, overwrite: bool = False) -> ZarrExport:
+    """Write the planes in a folder, which one call and one method made (otherwise BadValue), as OME-Zarr."""
+    require_zarr()
+    results = planes_below(directory)
+    if len(results) > 1:
+        names = ", ".join(map(str, results))
+        raise BadValue(f"{directory}: holds planes of {len(results)} calls or methods; name one folder of {names}")
+    ((folder, result),) = results.items()
+    stack = plane_stack(folder, result.planes, units_of(result))
+    write_zarr(out, stack, directory.resolve().name, overwrite=overwrite)
+    return ZarrExport(str(out), stack.shape, stack.levels, stack.scale.unit or "relative")
 
 
 def plane_stack(folder: Path, records: Sequence[PlaneRecord], units: StatedUnits) -> PlaneStack:

@@ -10,8 +10,7 @@ from typing import Protocol
 from faintfield.rig.errors import StageLost
 from faintfield.rig.simulation.controller.firmware import SimulatedFirmware
 from faintfield.rig.simulation.controller.wire import SimulatedClock, Wire
-from faintfield.rig.stages.drivers import make_stage
-from faintfield.rig.stages.gantry import Gantry
+from faintfield.rig.stages.gantry import Gantry, make_stage
 from faintfield.rig.stages.protocol import Point, StageSettings
 from faintfield.rig.stages.transport import Port, SerialPort, TrafficLog
 
@@ -89,7 +88,6 @@ class DirectLink:
         self._plugged = False
 
     def _require_plug(self) -> None:
-        """Raise `StageLost` as a port does when its cable is unplugged."""
         if not self._plugged:
             raise StageLost("simulated: the connection is lost (unplugged); check cable and power")
 
@@ -154,10 +152,8 @@ class Bench:
     ----------
     firmware : callable
         Makes the controller from a clock and a wire: `SimulatedGrbl` or `SimulatedMarlin`, possibly with options.
-    link : Link, optional
-        The cable; by default a `DirectLink`.
-    resets_on_open : bool
-        Whether opening the port restarts the controller, as it does on most boards.
+    link, resets_on_open : Link, bool
+        The cable, and whether opening the port restarts the controller, as it does on most boards.
 
     Attributes
     ----------
@@ -185,18 +181,10 @@ class Bench:
         if self.resets_on_open:
             self.firmware.restart()
         self.wire.clear()
-        return SteppedPort(port, self)
+        return _SteppedPort(port, self)
 
     def stage(self, settings: StageSettings | None = None, traffic: TrafficLog | None = None) -> Gantry:
-        """Return the driver for this controller, not yet connected.
-
-        Parameters
-        ----------
-        settings : StageSettings, optional
-            Settings of the stage; the default has the firmware's protocol.
-        traffic : TrafficLog, optional
-            Log of every byte sent and received.
-        """
+        """Return the driver for this controller, not yet connected; by default with the firmware's protocol."""
         settings = settings or StageSettings(protocol=self.firmware.protocol, port=self.link.url)
         return make_stage(settings, self.clock, traffic, self.open_port)
 
@@ -221,7 +209,7 @@ class Bench:
         self.wire.clear()
 
 
-class SteppedPort:
+class _SteppedPort:
     """A port on which simulated time passes only while the driver waits for bytes."""
 
     def __init__(self, port: Port, bench: Bench) -> None:
@@ -229,7 +217,6 @@ class SteppedPort:
         self._bench = bench
 
     def write(self, data: bytes) -> None:
-        """Send `data` through the link, and pass what arrives to the controller."""
         self._port.write(data)
         arrived = self._bench.link.receive(len(data))
         self._bench.firmware.receive(self._bench.wire.to_controller(arrived))
@@ -254,5 +241,4 @@ class SteppedPort:
         return received
 
     def close(self) -> None:
-        """Close the port."""
         self._port.close()

@@ -19,7 +19,7 @@ from faintfield.rig.stages.protocol import ProtocolName
 WORD = re.compile(r"([A-Z])(-?\d+(?:\.\d+)?)")
 
 
-def words(text: str) -> dict[str, float]:
+def parse_parameters(text: str) -> dict[str, float]:
     """Return the numbers of a line by letter; the last word of a letter counts."""
     return {letter: float(value) for letter, value in WORD.findall(text)}
 
@@ -29,12 +29,8 @@ class SimulatedFirmware(ABC):
 
     Parameters
     ----------
-    clock : SimulatedClock
-        The simulated time.
-    wire : Wire
-        The serial line to the host.
-    mechanics : Mechanics
-        The motors that it drives.
+    clock, wire, mechanics : SimulatedClock, Wire, Mechanics
+        The simulated time, the serial line to the host, and the motors.
     boot_s : float
         Time from a restart to the first line that it sends.
 
@@ -98,8 +94,6 @@ class SimulatedFirmware(ABC):
         """React to the end of the last motion."""
 
     def _start_homing(self, duration_s: float, finish: Callable[[], None]) -> None:
-        """Call `finish` when homing ends."""
-
         def end() -> None:
             self._homing = None
             finish()
@@ -107,7 +101,6 @@ class SimulatedFirmware(ABC):
         self._homing = self.clock.after(self.homing_slowdown * duration_s, end)
 
     def _cancel_homing(self) -> None:
-        """Interrupt homing."""
         if self._homing is not None:
             self._homing.cancel()
             self._homing = None
@@ -119,13 +112,7 @@ _MAX_WAIT_S = 0.05
 
 @dataclass
 class Server:
-    """A simulated controller and its port.
-
-    Parameters
-    ----------
-    port : str
-        Device that other programs open.
-    """
+    """A simulated controller, and the device `port` that other programs open."""
 
     port: str
     _clock: SimulatedClock
@@ -134,13 +121,7 @@ class Server:
     _far: int
 
     def run(self, speed: float = 1.0) -> None:
-        """Serve until interrupted.
-
-        Parameters
-        ----------
-        speed : float
-            Simulated seconds per real second.
-        """
+        """Serve until interrupted, `speed` simulated seconds per real second."""
         begun_s = time.monotonic()
         while True:
             self.turn(speed * (time.monotonic() - begun_s))
@@ -159,13 +140,7 @@ class Server:
 
 @contextmanager
 def serving(firmware: Callable[[SimulatedClock, Wire], SimulatedFirmware]) -> Iterator[Server]:
-    """Open a pseudo-terminal with a simulated controller behind it, and close it at the end.
-
-    Parameters
-    ----------
-    firmware : callable
-        Makes the controller from a clock and a wire.
-    """
+    """Open a pseudo-terminal with the controller behind it that `firmware` makes, and close it at the end."""
     clock = SimulatedClock()
     wire = Wire(clock)
     far, near = os.openpty()

@@ -6,34 +6,50 @@ before GRBL has asked for it; a failed homing still answers `ok`; and only some 
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from operator import sub
+from typing import ClassVar
 
-from faintfield.rig.simulation.controller.firmware import words
+from faintfield.rig.simulation.controller.firmware import SimulatedFirmware, parse_parameters
 from faintfield.rig.simulation.controller.grbl_settings import StoredSettings, jog_error
-from faintfield.rig.simulation.controller.grbl_states import GrblStates
 from faintfield.rig.simulation.controller.kinematics import Axis, Mechanics, Vector
 from faintfield.rig.simulation.controller.wire import SimulatedClock, Wire
 
 # Sizes of GRBL's line (bytes), receive buffer (bytes) and planner (motions).
 _LINE_BYTES, _BUFFER_BYTES, _PLANNER_BLOCKS = 80, 128, 15
 
+# The work offset is in every 30th report while moving, and in every 10th at rest.
+_OFFSET_EVERY_BUSY, _OFFSET_EVERY_IDLE = 30, 10
 
-class SimulatedGrbl(GrblStates):
+_ALARM_DELAY_S = 0.05  # from a critical alarm until a reset is accepted
+
+_RESUMED_MM_PER_MIN = 6000.0  # rate of motion that was held and goes on
+
+
+class SimulatedGrbl(SimulatedFirmware):
     """Firmware, settings and mechanics of a GRBL stage.
 
     Parameters
     ----------
-    clock : SimulatedClock
-        The simulated time.
-    wire : Wire
-        The serial line to the host.
+    clock, wire : SimulatedClock, Wire
+        The simulated time, and the serial line to the host.
     settings : dict
         Values that differ from the defaults, by `$` number; settings survive restarts.
-    boot_s : float
-        Time from a restart to the banner.
-    play_mm : float
-        Play in both drives.
+    boot_s, play_mm : float
+        Time from a restart to the banner, and play in both drives.
+
+    Attributes
+    ----------
+    door_is_open : bool
+        Whether the safety door stays open; `open_door` alone is a door that is closed again at once.
     """
+
+    door_is_open = False
+
+    protocol = "grbl"
+    _line_end = b"\r\n"
+    _critical_alarms: ClassVar[tuple[int, ...]] = (1, 2)
+    _settings_type: ClassVar[type[StoredSettings]] = StoredSettings
 
     def __init__(
         self,
@@ -44,18 +60,153 @@ class SimulatedGrbl(GrblStates):
         boot_s: float = 1.0,
         play_mm: float = 0.0,
     ) -> None:
-        stored = self._stored(settings or {})
-        x, y = (Axis(-length - 5.0, 2.0, -0.5 * length, play_mm) for length in stored.travel_mm())
-        mechanics = Mechanics(clock, (x, y), 1.0 / stored.number(100), (0.0, 0.0), switch_at_high_end=True)
-        super().__init__(clock, wire, mechanics, boot_s, stored)
+        self.settings = self._settings_type(settings or {})
+        self._realtime: dict[int, Callable[[], None]] = {
+            ord("?"): self._report,
+            ord("!"): self._hold,
+            ord("~"): self._resume,
+            0x18: self._reset,
+            0x84: self.open_door,
+            0x85: self._cancel_jog,
+        }
+        x, y = (Axis(-length - 5.0, 2.0, -0.5 * length, play_mm) for length in self.settings.travel_mm())
+        mechanics = Mechanics(clock, (x, y), 1.0 / self.settings.number(100), (0.0, 0.0), switch_at_high_end=True)
+        mechanics.on_switch = self._switch_hit
+        super().__init__(clock, wire, mechanics, boot_s)
 
-    @staticmethod
-    def _stored(changes: dict[int, str]) -> StoredSettings:
-        """Return the settings in the controller's memory."""
-        return StoredSettings(changes)
+    def _reset_state(self) -> None:
+        self.work_offset, self._reports_to_offset = (0.0, 0.0, 0.0), 0
+        self.state, self.critical, self._accepts_reset = "Boot", False, True
+        self._held: list[Vector] = []
+
+    def receive(self, data: bytes) -> None:
+        """Take bytes from the host; real-time characters act at once, even inside a line."""
+        for byte in data:
+            if self.state == "Boot":
+                return
+            if act := self._realtime.get(byte):
+                act()
+            elif not self._deaf():
+                self._take(byte)
+        self._run_lines()
+
+    def _deaf(self) -> bool:
+        """Return whether GRBL hears nothing but a reset."""
+        return self.critical
+
+    def alarm(self, code: int) -> None:
+        """Stop with an alarm."""
+        homing = self.state == "Home"
+        if self.mechanics.moving or homing:
+            self.mechanics.stop_dead()
+            self._cancel_homing()
+        self.state = "Alarm"
+        self._waiting.clear()
+        self.say(f"ALARM:{code}")
+        if code in self._critical_alarms:
+            self.critical, self._accepts_reset = True, False
+            self.clock.after(_ALARM_DELAY_S, self._ask_for_reset)
+        elif homing:
+            self.say("ok")  # the answer to the homing command, sent although it failed
+            self._greet()
+
+    def _booted(self) -> None:
+        self.state = "Alarm" if self.settings.number(22) else "Idle"
+        self._greet()
+
+    def _greet(self) -> None:
+        self.say("Grbl 1.1h ['$' for help]")
+        if self.state == "Alarm":
+            self.say("[MSG:'$H'|'$X' to unlock]")
+
+    def _ask_for_reset(self) -> None:
+        self.say("[MSG:Reset to continue]")
+        self._accepts_reset = True
+
+    def _reset(self) -> None:
+        if not self._accepts_reset:
+            return
+        self._held.clear()
+        self._line.clear()
+        self._waiting.clear()
+        if self.state == "Home":
+            self.alarm(6)
+            return
+        in_motion = self.mechanics.moving
+        if in_motion:
+            self.mechanics.stop_dead()
+            self.say("ALARM:3")
+        self.critical = False
+        self.state = "Alarm" if in_motion or self.state in ("Alarm", "Sleep") else "Idle"
+        self._greet()
+        if self.door_is_open:
+            self.open_door()
+
+    def _hold(self) -> None:
+        if self.state == "Jog":
+            self._cancel_jog()
+        elif self.state == "Run":
+            self.pause()
+
+    def _cancel_jog(self) -> None:
+        if self.state == "Jog":
+            self.mechanics.brake()
+
+    def open_door(self) -> None:
+        """Open the safety door, which cancels a jog and holds other motion."""
+        jogging = self.state == "Jog"
+        self.state = "Door:2" if self.mechanics.moving else "Door:1"
+        ahead = self.mechanics.brake()
+        self._held = [] if jogging else ahead or self._held
+
+    def pause(self) -> None:
+        """Press the feed-hold button of the machine, which holds a jog as well."""
+        self.state = "Hold:1" if self.mechanics.moving else "Hold:0"
+        self._held = self.mechanics.brake() or self._held
+
+    def _motion_ended(self) -> None:
+        self.state = {"Hold:1": "Hold:0", "Door:2": "Door:1"}.get(self.state, self.state)
+        if self.state in ("Jog", "Run"):
+            self.state = "Idle"
+        self._run_lines()
+
+    def _switch_hit(self) -> None:
+        if self.settings.number(21):
+            self.alarm(1)
+
+    def _report(self) -> None:
+        if self._deaf() or self.state == "Home":
+            return
+        tell_offset = self._reports_to_offset == 0
+        if tell_offset:
+            busy = self.state in ("Jog", "Run")
+            self._reports_to_offset = _OFFSET_EVERY_BUSY if busy else _OFFSET_EVERY_IDLE
+        self._reports_to_offset -= 1
+        here = (*self.mechanics.commanded_mm(), 0.0)
+        is_machine = int(self.settings.number(10)) & 1 == 1
+        values = here if is_machine else tuple(map(sub, here, self.work_offset))
+        fields = [self._reported_state(), f"{'MPos' if is_machine else 'WPos'}:{_vector(values)}", "FS:0,0"]
+        if pins := self._pins():
+            fields.append(f"Pn:{pins}")
+        if tell_offset:
+            fields.append(f"WCO:{_vector(self.work_offset)}")
+        self.say(f"<{'|'.join(fields)}>")
+
+    def _reported_state(self) -> str:
+        return self.state
+
+    def _pins(self) -> str:
+        return "".join(axis for axis, closed in zip("XY", self.mechanics.switches(), strict=True) if closed)
+
+    def _resume(self) -> None:
+        if self.state not in ("Hold:0", "Door:0"):
+            return
+        self.state = "Idle"
+        held, self._held = self._held, []
+        for target in held:
+            self._queue(target, _RESUMED_MM_PER_MIN, "Run")
 
     def _take(self, byte: int) -> None:
-        """Take one ordinary byte; bytes beyond the receive buffer are lost."""
         if byte in b"\r\n":
             self._waiting.append(self._line.decode("ascii", errors="replace"))
             self._line.clear()
@@ -63,7 +214,6 @@ class SimulatedGrbl(GrblStates):
             self._line.append(byte)
 
     def _run_lines(self) -> None:
-        """Run waiting lines while the planner has room."""
         while self._waiting and not self._deaf() and self._homing is None:
             if self.mechanics.queued() > _PLANNER_BLOCKS:
                 return
@@ -84,7 +234,6 @@ class SimulatedGrbl(GrblStates):
         return self._gcode(line)
 
     def _system(self, line: str) -> int | None:
-        """Run a `$` command."""
         if line == "$X":
             if self.state == "Alarm":
                 self.say("[MSG:Caution: Unlocked]")
@@ -92,10 +241,10 @@ class SimulatedGrbl(GrblStates):
             return 0
         if self.state not in ("Idle", "Alarm"):
             return 8
-        if found := re.fullmatch(r"\$H([XY]?)", line):
-            if found[1] and not self.settings.homes_singly():
+        if match := re.fullmatch(r"\$H([XY]?)", line):
+            if match[1] and not self.settings.homes_singly():
                 return 3
-            return self._home(["XY".index(found[1])] if found[1] else [0, 1])
+            return self._home(["XY".index(match[1])] if match[1] else [0, 1])
         answer = self.settings.answer(line)
         if answer is None:
             return 3
@@ -103,12 +252,11 @@ class SimulatedGrbl(GrblStates):
         return 0
 
     def _jog(self, text: str) -> int:
-        """Run a jog."""
         if self.state not in ("Idle", "Jog"):
             return 9
         if error := jog_error(text):
             return error
-        parsed = words(text)
+        parsed = parse_parameters(text)
         target = self._target(parsed, relative="G91" in text, machine="G53" in text)
         if not self.settings.allows(target):
             return 15
@@ -116,8 +264,7 @@ class SimulatedGrbl(GrblStates):
         return 0
 
     def _gcode(self, line: str) -> int:
-        """Run G0, G1 or G92, the only G-code that a stage may receive."""
-        parsed = words(line)
+        parsed = parse_parameters(line)
         if re.search(r"G92(?!\d)", line):
             here = self.mechanics.planned_mm()
             self.work_offset = (here[0] - parsed.get("X", 0.0), here[1] - parsed.get("Y", 0.0), 0.0)
@@ -135,7 +282,6 @@ class SimulatedGrbl(GrblStates):
         return 0
 
     def _target(self, axis_words: dict[str, float], *, relative: bool, machine: bool) -> tuple[float, float]:
-        """Return the machine position of axis words; an axis without a word stays."""
         values = []
         for axis, here, offset in zip("XY", self.mechanics.planned_mm(), self.work_offset, strict=False):
             base = here if relative else 0.0 if machine else offset
@@ -143,7 +289,6 @@ class SimulatedGrbl(GrblStates):
         return values[0], values[1]
 
     def _queue(self, target: Vector, feed_mm_per_min: float, state: str) -> None:
-        """Plan a straight motion, which puts GRBL into `state`."""
         start = self.mechanics.planned_mm()
         self.mechanics.queue(target, *self.settings.speed_and_acceleration(start, target, feed_mm_per_min))
         self.state = state if self.mechanics.moving else "Idle"
@@ -162,9 +307,12 @@ class SimulatedGrbl(GrblStates):
         return None
 
     def _homed(self, axes: Sequence[int]) -> None:
-        """End homing: the axes stand pulled off their switches, which are zero."""
         for axis in axes:
             self.mechanics.set_homed(axis, -self.settings.number(27), -self.settings.number(27))
         self.state = "Idle"
         self.say("ok")
         self._run_lines()
+
+
+def _vector(values: Sequence[float]) -> str:
+    return ",".join(f"{value:.3f}" for value in values)

@@ -1,9 +1,9 @@
-"""The `$` settings of the simulated GRBL, what they mean for its motions, its jogs and its reports."""
+"""The `$` settings of the simulated GRBL, and what they mean for its motions and its jogs."""
 
 import re
 from collections.abc import Sequence
 
-from faintfield.rig.simulation.controller.firmware import WORD, words
+from faintfield.rig.simulation.controller.firmware import WORD, parse_parameters
 from faintfield.rig.simulation.controller.kinematics import along
 
 _DEFAULTS = {
@@ -15,13 +15,7 @@ _DEFAULTS = {
 
 
 class StoredSettings(dict[int, str]):
-    """Values by `$` number, as text; they survive restarts.
-
-    Parameters
-    ----------
-    changes : dict
-        Values that differ from the defaults.
-    """
+    """Values by `$` number, as text, which survive restarts: the defaults, except for `changes`."""
 
     def __init__(self, changes: dict[int, str]) -> None:
         super().__init__({**_DEFAULTS, **changes})
@@ -66,40 +60,17 @@ class StoredSettings(dict[int, str]):
             return ["[VER:1.1h.20190830:]", "[OPT:V,15,128]"]
         if command == "$$":
             return [f"${number}={value}" for number, value in self.items()]
-        if found := re.fullmatch(r"\$(\d+)=(\d+(?:\.\d+)?)", command):
-            self[int(found[1])] = found[2]
+        if match := re.fullmatch(r"\$(\d+)=(\d+(?:\.\d+)?)", command):
+            self[int(match[1])] = match[2]
             return []
         return None
 
 
 def jog_error(text: str) -> int:
     """Return the number of GRBL's error for what follows `$J=`, 0 if it is a jog."""
-    parsed, modes = words(text), set(re.findall(r"G\d+", text))
+    parsed, modes = parse_parameters(text), set(re.findall(r"G\d+", text))
     if not parsed.keys() <= set("GXYZF") or not modes <= {"G20", "G21", "G90", "G91", "G53"} or WORD.sub("", text):
         return 16
     if "F" not in parsed:
         return 22
     return 0 if parsed.keys() & {"X", "Y"} else 16
-
-
-def status_report(
-    state: str,
-    machine_mm: Sequence[float],
-    offset_mm: Sequence[float],
-    pins: str,
-    is_machine: bool,
-    with_offset: bool,
-) -> str:
-    """Return a status report with machine or work position, and the work offset if asked for."""
-    values = machine_mm if is_machine else [m - o for m, o in zip(machine_mm, offset_mm, strict=True)]
-    fields = [state, f"{'MPos' if is_machine else 'WPos'}:{_vector(values)}", "FS:0,0"]
-    if pins:
-        fields.append(f"Pn:{pins}")
-    if with_offset:
-        fields.append(f"WCO:{_vector(offset_mm)}")
-    return f"<{'|'.join(fields)}>"
-
-
-def _vector(values: Sequence[float]) -> str:
-    """Return numbers as GRBL prints them."""
-    return ",".join(f"{value:.3f}" for value in values)

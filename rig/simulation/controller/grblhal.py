@@ -17,22 +17,19 @@ _HOMING_REQUIRED = 11
 _HARMLESS = ("", "$I", "$$")
 
 
-class HalSettings(StoredSettings):
+class _HalSettings(StoredSettings):
     """The `$` settings of grblHAL."""
 
     def __init__(self, changes: dict[int, str]) -> None:
         super().__init__({22: "7", 40: "0", **changes})
 
     def margin_mm(self) -> float:
-        """Return how far from the ends of the travel the soft limits lie."""
         return self.number(27) if int(self.number(21)) & 1 else 0.0
 
     def homes_singly(self) -> bool:
-        """Return whether an axis can be homed by itself."""
         return bool(int(self.number(22)) & 2)
 
     def answer(self, command: str) -> list[str] | None:
-        """Return the lines that answer `$I`, `$$` or `$N=value`, which is stored; None for other commands."""
         if command != "$I":
             return super().answer(command)
         single = "H" if self.homes_singly() else ""
@@ -43,14 +40,9 @@ class SimulatedGrblHal(SimulatedGrbl):
     """Firmware, settings and mechanics of a grblHAL stage; the parameters are those of `SimulatedGrbl`."""
 
     _critical_alarms: ClassVar[tuple[int, ...]] = (1, 2, 10, 17)
-
-    @staticmethod
-    def _stored(changes: dict[int, str]) -> StoredSettings:
-        """Return the settings in the controller's memory."""
-        return HalSettings(changes)
+    _settings_type = _HalSettings
 
     def _reset_state(self) -> None:
-        """Forget alarms, too; the emergency stop stays as it is."""
         super()._reset_state()
         self._alarm, self._frozen = 0, False
 
@@ -80,7 +72,6 @@ class SimulatedGrblHal(SimulatedGrbl):
             super().open_door()
 
     def _booted(self) -> None:
-        """Finish the restart, locked if homing is required."""
         self.state = "Idle"
         self._greet()
         if int(self.settings.number(22)) & 4:
@@ -89,23 +80,18 @@ class SimulatedGrblHal(SimulatedGrbl):
             self.alarm(10)
 
     def _greet(self) -> None:
-        """Send the banner."""
         self.say("GrblHAL 1.1f ['$' or '$HELP' for help]")
 
     def _deaf(self) -> bool:
-        """Return whether nothing but a reset is heard."""
         return False
 
-    def _told_state(self) -> str:
-        """Return the state with the number of the alarm."""
+    def _reported_state(self) -> str:
         return f"Alarm:{self._alarm}" if self.state == "Alarm" and self._alarm else self.state
 
     def _pins(self) -> str:
-        """Return the letters of the active inputs, with E for the emergency stop."""
         return super()._pins() + ("E" if self.emergency_stop else "")
 
     def _reset(self) -> None:
-        """Handle the reset character: ignored under the emergency stop, an abort in a frozen jog."""
         if self.emergency_stop or not self._accepts_reset:
             return
         if self._frozen and not self.mechanics.moving:
@@ -114,28 +100,23 @@ class SimulatedGrblHal(SimulatedGrbl):
         super()._reset()
 
     def _cancel_jog(self) -> None:
-        """Handle the jog-cancel character, which a frozen jog ignores."""
         if not self._frozen:
             super()._cancel_jog()
 
     def _motion_ended(self) -> None:
-        """Update the state at the end of the last motion; a frozen jog stays."""
         if not self._frozen:
             super()._motion_ended()
 
     def _resume(self) -> None:
-        """Handle the resume character: a frozen jog runs on."""
         if self._frozen:
             self._frozen, self.state = False, "Hold:0"
         super()._resume()
 
     def _run_lines(self) -> None:
-        """Run waiting lines, but none while a jog is frozen."""
         if not self._frozen:
             super()._run_lines()
 
     def _run(self, line: str) -> int | None:
-        """Run one line; during a critical alarm nearly all are refused."""
         if self.critical and line not in _HARMLESS:
             return 79 if line.startswith("$") else 9
         return super()._run(line)

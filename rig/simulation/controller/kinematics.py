@@ -17,10 +17,7 @@ type Vector = tuple[float, ...]
 class Profile:
     """Speed along a straight line over time, in pieces of constant acceleration.
 
-    Parameters
-    ----------
-    pieces : tuple of (float, float, float)
-        Duration (s), initial speed (mm/s) and acceleration (mm/s²) of each piece, in order.
+    Each piece has a duration (s), an initial speed (mm/s) and an acceleration (mm/s²).
     """
 
     pieces: tuple[tuple[float, float, float], ...]
@@ -75,10 +72,8 @@ class Axis:
 
     Parameters
     ----------
-    low_mm, high_mm : float
-        Ends of the mechanical travel.
-    carriage_mm : float
-        Position of the carriage.
+    low_mm, high_mm, carriage_mm : float
+        Ends of the mechanical travel, and position of the carriage.
     play_mm : float
         Distance that the motor turns after a reversal before the carriage follows.
 
@@ -120,16 +115,12 @@ class Mechanics:
 
     Parameters
     ----------
-    clock : SimulatedClock
-        The simulated time.
-    axes : (Axis, Axis)
-        x and y.
+    clock, axes : SimulatedClock, (Axis, Axis)
+        The simulated time; x and y.
     step_mm : float
         Distance of one motor step.
-    switch_mm : (float, float)
-        Positions at which the homing switches close.
-    switch_at_high_end : bool
-        Whether the switches are at the upper ends of the travel.
+    switch_mm, switch_at_high_end : (float, float), bool
+        Positions at which the homing switches close, and whether these are the upper ends of the travel.
     on_idle, on_switch : callable
         Called when the last motion ends, and when a motion closes a switch.
     endless : bool
@@ -232,14 +223,12 @@ class Mechanics:
         self._commanded = tuple(values)
 
     def _start_next(self) -> None:
-        """Start the next motion of the queue."""
         target, speed, acceleration = self._queue.pop(0)
         length = math.dist(self._commanded, target)
         profile = Profile.rest_to_rest(length, speed, acceleration) if length else Profile(())
         self._begin(Motion(self._commanded, target, profile, acceleration, self.clock.now_s()))
 
     def _begin(self, motion: Motion) -> None:
-        """Start `motion`, and schedule its end and its first contact with a switch."""
         self._end_motion()
         self._motion = motion
         self._events = [] if self.endless else [self.clock.after(motion.profile.duration_s, self._finish)]
@@ -258,7 +247,6 @@ class Mechanics:
         return high
 
     def _contact_at(self, commanded: Vector) -> bool:
-        """Return whether a switch would be closed at a commanded position."""
         sign = 1.0 if self.switch_at_high_end else -1.0
         return any(
             not axis.stuck and sign * (value + axis.slip_mm - switch) >= -1e-9
@@ -266,7 +254,6 @@ class Mechanics:
         )
 
     def _finish(self) -> None:
-        """End the motion, and start the next or become idle."""
         assert self._motion is not None
         self._commanded = self._motion.end
         self._motion, self._events = None, []
@@ -278,7 +265,6 @@ class Mechanics:
             self.on_idle()
 
     def _end_motion(self) -> None:
-        """End the motion at its present position."""
         self._commanded = self.commanded_mm()
         self._motion = None
         for event in self._events:

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from functools import reduce
 from operator import xor
 
-from faintfield.rig.simulation.controller.firmware import SimulatedFirmware, words
+from faintfield.rig.simulation.controller.firmware import SimulatedFirmware, parse_parameters
 from faintfield.rig.simulation.controller.kinematics import Axis, Mechanics, along
 from faintfield.rig.simulation.controller.wire import ScheduledEvent, SimulatedClock, Wire
 
@@ -33,16 +33,12 @@ class SimulatedMarlin(SimulatedFirmware):
 
     Parameters
     ----------
-    clock : SimulatedClock
-        The simulated time.
-    wire : Wire
-        The serial line to the host.
+    clock, wire : SimulatedClock, Wire
+        The simulated time, and the serial line to the host.
     travel_mm : (float, float)
         Lengths of the axes; coordinates run upwards from zero, where the switches are.
-    boot_s : float
-        Time from a restart to the first line.
-    play_mm : float
-        Play in both drives.
+    boot_s, play_mm : float
+        Time from a restart to the first line, and play in both drives.
     realtime_position : bool
         Whether M114 R reports the real position.
     """
@@ -69,7 +65,6 @@ class SimulatedMarlin(SimulatedFirmware):
         super().__init__(clock, wire, mechanics, boot_s)
 
     def _reset_state(self) -> None:
-        """Forget homing, modes and line numbers, and ignore the host until the greeting."""
         if self._motors_off is not None:
             self._motors_off.cancel()
         self.alive, self.homed, self._idle_limit_s = False, [False, False], _RELEASE_AFTER_S
@@ -109,13 +104,11 @@ class SimulatedMarlin(SimulatedFirmware):
         self.alive = False
 
     def _booted(self) -> None:
-        """Send the greeting."""
         self.alive = True
         self.say("start", "echo:Marlin 2.1.2.4", "echo: Last Updated: 2024-06-01", "echo:EEPROM OK")
         self._watch_idle()
 
     def _run_lines(self) -> None:
-        """Run waiting lines until one has to wait for a motion or the planner is full."""
         while self._waiting and self.alive and self._awaited is None:
             if self.mechanics.queued() >= _PLANNER_BLOCKS:
                 return
@@ -126,18 +119,18 @@ class SimulatedMarlin(SimulatedFirmware):
 
     def _checked(self, line: str) -> str | None:
         """Return the command in a line, or None after asking for the line again."""
-        found = re.fullmatch(r"N(\d+) (.*)\*(\d+)", line)
-        if not found:
+        match = re.fullmatch(r"N(\d+) (.*)\*(\d+)", line)
+        if not match:
             if not line.startswith("N"):
                 return line
             self._ask_again("No Checksum with line number")
             return None
-        if reduce(xor, line.rpartition("*")[0].encode("ascii", errors="replace")) != int(found[3]):
+        if reduce(xor, line.rpartition("*")[0].encode("ascii", errors="replace")) != int(match[3]):
             self._ask_again("checksum mismatch")
             return None
-        number, command = int(found[1]), found[2]
+        number, command = int(match[1]), match[2]
         if command.startswith("M110"):
-            self._last_line = int(words(command).get("N", number))
+            self._last_line = int(parse_parameters(command).get("N", number))
             return command
         if number != self._last_line + 1:
             self._ask_again("Line Number is not Last Line Number+1")
@@ -146,14 +139,12 @@ class SimulatedMarlin(SimulatedFirmware):
         return command
 
     def _ask_again(self, why: str) -> None:
-        """Report a damaged line and ask for the next number."""
         self._waiting.clear()
         self.say(f"Error:{why}, Last Line: {self._last_line}", f"Resend: {self._last_line + 1}", "ok")
 
     def _run(self, command: str) -> None:
-        """Run one command and answer it; homing and waiting answer when they have ended."""
         name = command.split(" ", 1)[0]
-        parameters = words(command[len(name) :])
+        parameters = parse_parameters(command[len(name) :])
         actions: dict[str, Callable[[], None]] = {
             "G28": lambda: self._home([i for i in (0, 1) if "XY"[i] in command[3:]] or [0, 1]),
             "M400": lambda: self._await(lambda: not self.mechanics.moving and not self._waits_for_button),
@@ -177,7 +168,6 @@ class SimulatedMarlin(SimulatedFirmware):
             self.say("ok")
 
     def _move(self, parameters: dict[str, float]) -> None:
-        """Plan a straight motion, clipped to the travel of homed axes."""
         start = self.mechanics.planned_mm()
         target = []
         for i, axis in enumerate("XY"):
@@ -189,7 +179,6 @@ class SimulatedMarlin(SimulatedFirmware):
         self._watch_idle()
 
     def _home(self, axes: list[int]) -> None:
-        """Start homing, one axis after the other: seek, back off, seek slowly."""
         seconds = 0.0
         distances = self.mechanics.homing_distances_mm()
         lost = False
@@ -204,7 +193,6 @@ class SimulatedMarlin(SimulatedFirmware):
         self._say_busy()
 
     def _homed(self, axes: list[int]) -> None:
-        """End homing: the axes stand at their switches, which are zero."""
         for axis in axes:
             self.mechanics.set_homed(axis, 0.0, 0.0)
             self.homed[axis] = True
@@ -214,7 +202,6 @@ class SimulatedMarlin(SimulatedFirmware):
         self._run_lines()
 
     def _await(self, done: Callable[[], bool]) -> None:
-        """Answer when `done`, and report busy until then."""
         if done():
             self.say("ok")
             return
@@ -222,8 +209,6 @@ class SimulatedMarlin(SimulatedFirmware):
         self._say_busy()
 
     def _say_busy(self) -> None:
-        """Report at intervals that a command is still being executed."""
-
         def again() -> None:
             if self._awaited is not None and self.alive:
                 self.say(f"echo:busy: {'paused for user' if self._waits_for_button else 'processing'}")
@@ -232,7 +217,6 @@ class SimulatedMarlin(SimulatedFirmware):
         self.clock.after(_BUSY_EVERY_S, again)
 
     def _motion_ended(self) -> None:
-        """Answer the command that waits for the end of the last motion."""
         self._watch_idle()
         if self._awaited is not None and self._awaited():
             self._awaited = None
@@ -248,7 +232,6 @@ class SimulatedMarlin(SimulatedFirmware):
         self._watch_idle()
 
     def _watch_idle(self) -> None:
-        """Release the motors when nothing has moved for the idle limit."""
         if self._motors_off is not None:
             self._motors_off.cancel()
             self._motors_off = None
@@ -262,13 +245,11 @@ class SimulatedMarlin(SimulatedFirmware):
             axis.slip_mm += 1.0
 
     def _tell_position(self, *, real: bool) -> None:
-        """Answer M114."""
         x, y = self.mechanics.commanded_mm() if real and self._realtime_position else self.mechanics.planned_mm()
         counts = [round(value * self.settings["M92"]) for value in self.mechanics.commanded_mm()]
         self.say(f"X:{x:.2f} Y:{y:.2f} Z:0.00 E:0.00 Count X:{counts[0]} Y:{counts[1]} Z:0")
 
     def _tell_capabilities(self) -> None:
-        """Answer M115."""
         x, y = self.travel_mm
         bounds = f"{{min:{{x:0,y:0,z:0}},max:{{x:{x:g},y:{y:g},z:100}}}}"
         self.say(
@@ -279,18 +260,15 @@ class SimulatedMarlin(SimulatedFirmware):
         )
 
     def _tell_switches(self) -> None:
-        """Answer M119."""
         self.say("Reporting endstop status")
         for axis, closed in zip("xy", self.mechanics.switches(), strict=True):
             self.say(f"{axis}_min: {'TRIGGERED' if closed else 'open'}")
 
     def _tell_limits(self) -> None:
-        """Answer M211."""
         x, y = self.travel_mm
         self.say(f"echo:Soft endstops: On  Min:  X0.00 Y0.00 Z0.00   Max:  X{x:.2f} Y{y:.2f} Z100.00")
 
     def _tell_settings(self) -> None:
-        """Answer M503."""
         s = self.settings
         self.say("echo:; Steps per unit:")
         self.say(f"echo: M92 X{s['M92']:.2f} Y{s['M92']:.2f} Z400.00")

@@ -79,11 +79,6 @@ type ByteFilter = Callable[[bytes], bytes]
 class Wire:
     """Carries bytes in both directions at 115200 baud, through filters.
 
-    Parameters
-    ----------
-    clock : SimulatedClock
-        The simulated time.
-
     Attributes
     ----------
     filters_to_controller, filters_to_host : list
@@ -103,7 +98,7 @@ class Wire:
 
     def to_controller(self, data: bytes) -> bytes:
         """Return the bytes that arrive at the controller when the host sends `data`."""
-        return _filtered(data, self.filters_to_controller)
+        return _apply_filters(data, self.filters_to_controller)
 
     def to_host(self, data: bytes) -> None:
         """Send `data` to the host, after what is already on the wire."""
@@ -134,14 +129,12 @@ class Wire:
         self._free_at_s = 0.0
 
     def _arrive(self, data: bytes) -> None:
-        """Deliver `data` to the host, if the cable is plugged in."""
         del self._under_way[0]
         if self.connected:
-            self._arrived += _filtered(data, self.filters_to_host)
+            self._arrived += _apply_filters(data, self.filters_to_host)
 
 
-def _filtered(data: bytes, filters: list[ByteFilter]) -> bytes:
-    """Return `data` after all filters."""
+def _apply_filters(data: bytes, filters: list[ByteFilter]) -> bytes:
     for apply in tuple(filters):
         data = apply(data)
     return data

@@ -7,12 +7,12 @@ coordinates, whatever work offset is stored in the controller.
 
 from collections.abc import Sequence
 from contextlib import suppress
+from operator import truediv
 
 from faintfield.rig.errors import StageError, StageLost, StageTimeout, WrongFirmware
 from faintfield.rig.stages.grbl.connection import CANCEL_JOG, RESET, GrblConnection
 from faintfield.rig.stages.grbl.failures import SOFT_LIMIT_ALARM, state_failure
 from faintfield.rig.stages.grbl.messages import Feedback, GrblSetting, Report
-from faintfield.rig.stages.grbl.recovery import bring_to_rest
 from faintfield.rig.stages.grbl.settings import GrblSettings
 from faintfield.rig.stages.motion import timeout_s
 from faintfield.rig.stages.protocol import AnswerTime, AxisIndex, Identity, Point
@@ -26,15 +26,7 @@ _MAX_REPORTS_TO_OFFSET = 40
 
 
 class GrblController:
-    """A `Controller` that speaks GRBL 1.1.
-
-    Parameters
-    ----------
-    line : LineTransport
-        The connection.
-    axes : (str, str)
-        The controller's letters for the two axes.
-    """
+    """A `Controller` that speaks GRBL 1.1 over `line`; `axes` are its letters for the two axes."""
 
     def __init__(self, line: LineTransport, axes: tuple[str, str]) -> None:
         self._grbl = GrblConnection(line)
@@ -57,15 +49,16 @@ class GrblController:
             raise StageLost(f"{differing} read differently twice in a row: the line is disturbed; try a shorter cable")
         identity = GrblSettings(first, build).identity(self._index)
         motion = identity.motion
-        ratios = zip(motion.rate_mm_per_s, motion.acceleration_mm_per_s2, strict=True)
-        self._braking_s = max(rate / acceleration for rate, acceleration in ratios)
-        self._await_offset()
-        return identity
+        self._braking_s = max(map(truediv, motion.rate_mm_per_s, motion.acceleration_mm_per_s2))
+        for _ in range(_MAX_REPORTS_TO_OFFSET):
+            if self._grbl.poll().is_machine or self._grbl.offset is not None:
+                return identity
+        raise WrongFirmware("work positions are reported without their offset; set $10=1 for machine positions")
 
     def home(self, axis: AxisIndex | None, bound_s: float) -> AnswerTime:
         """Home within `bound_s`: GRBL answers nothing until the switches are found."""
         self._grbl.command("$H" if axis is None else f"$H{self._axes[axis]}", bound_s)
-        time = self._grbl.answer_time
+        time = self._grbl.line.answer_time
         self._wait_until_still(0.0)
         self._grbl.alarm, self._grbl.count_lost = None, False
         return time
@@ -97,45 +90,41 @@ class GrblController:
 
     def stop(self) -> bool:
         """Cancel the jog: GRBL slows down within its acceleration and keeps its count."""
-        self._grbl.send(CANCEL_JOG)
+        self._grbl.line.send(CANCEL_JOG)
         self._wait_until_still(self._braking_s)
         return True
 
     def abort(self) -> bool:
         """Cancel the jog, or reset while homing, which nothing else interrupts; reset what does not end."""
         with suppress(StageError):  # a stage that cannot be reached cannot be stopped
-            self._grbl.send(RESET if self._grbl.homing else CANCEL_JOG)
+            self._grbl.line.send(RESET if self._grbl.homing else CANCEL_JOG)
             if not self._grbl.homing:
-                bring_to_rest(self._grbl, self._clock, _RECOVERY_S + self._braking_s)
+                self._grbl.bring_to_rest(_RECOVERY_S + self._braking_s)
                 return not self._grbl.count_lost
         return False
 
     def recover(self, wait_s: float) -> bool:
         """Bring GRBL to a state that accepts commands; a lock is cleared only if the position was kept."""
-        if not self._grbl.is_open:
+        if not self._grbl.line.is_open:
             self.connect(wait_s)
             return False
-        self._grbl.send(b"\n")  # ends a damaged line, which would otherwise be joined to the next
-        report = bring_to_rest(self._grbl, self._clock, _RECOVERY_S + self._braking_s)
+        self._grbl.line.send(b"\n")  # ends a damaged line, which would otherwise be joined to the next
+        report = self._grbl.bring_to_rest(_RECOVERY_S + self._braking_s)
         if report.state == "Alarm":
-            return self._unlock_if_kept(self._machine_point(report))
+            # A controller that has restarted unseen reports zero.
+            restarted = self._machine_point(report) == (0.0, 0.0)
+            if self._grbl.alarm != SOFT_LIMIT_ALARM or self._grbl.count_lost or restarted:
+                return False
+            self._grbl.alarm = None
+            self._grbl.command("$X")
+            return True
         return not self._grbl.count_lost
 
     def close(self) -> None:
         """Close the connection."""
-        self._grbl.close()
-
-    def _unlock_if_kept(self, point: Point) -> bool:
-        """Clear the lock if the alarm kept the position; return whether it did."""
-        # A controller that has restarted unseen reports zero.
-        if self._grbl.alarm != SOFT_LIMIT_ALARM or self._grbl.count_lost or point == (0.0, 0.0):
-            return False
-        self._grbl.alarm = None
-        self._grbl.command("$X")
-        return True
+        self._grbl.line.close()
 
     def _jog_command(self, modes: str, point: Point, feed_mm_per_s: float) -> str:
-        """Return the jog command to `point`."""
         x, y = self._axes
         return f"$J={modes} {x}{point.x_mm:.3f} {y}{point.y_mm:.3f} F{60.0 * feed_mm_per_s:.1f}"
 
@@ -146,14 +135,14 @@ class GrblController:
         """
         started_s = self._clock.now_s()
         self._grbl.read_until(started_s + predicted_s)
-        last: Report | None = None
+        last: Point | None = None
         while self._clock.now_s() < started_s + timeout_s(predicted_s):
             report = self._grbl.poll()
             if report.state == "Idle":
                 point = self._machine_point(report)
-                if last is not None and self._machine_point(last) == point:
+                if point == last:
                     return point
-                last = report
+                last = point
             elif report.state in ("Jog", "Run"):
                 last = None
             else:
@@ -164,27 +153,16 @@ class GrblController:
         )
 
     def _machine_point(self, report: Report) -> Point:
-        """Return the machine position of `report`, adding the offset to a work position."""
         values = report.position
         if not report.is_machine:
             offset = self._grbl.offset
             if offset is None:
-                raise StageTimeout(
-                    "work position without its offset; set $10=1, so that machine positions are reported"
-                )
+                raise StageTimeout("a work position without its offset; set $10=1 for machine positions")
             values = tuple(work + shift for work, shift in zip(values, offset, strict=False))
         if max(self._index) >= len(values):
             raise WrongFirmware(f"the controller reports {len(values)} axes, not {self._axes}; set stage.axes")
         return Point(*(values[index] for index in self._index))
 
-    def _await_offset(self) -> None:
-        """Poll until a work offset is reported, if positions are work positions."""
-        for _ in range(_MAX_REPORTS_TO_OFFSET):
-            if self._grbl.poll().is_machine or self._grbl.offset is not None:
-                return
-        raise WrongFirmware("work positions are reported without their offset; set $10=1 for machine positions")
-
     def _read_settings(self) -> dict[int, str]:
-        """Return the `$` settings by number."""
         messages = self._grbl.command("$$")
         return {message.number: message.value for message in messages if isinstance(message, GrblSetting)}

@@ -102,12 +102,7 @@ def error_failure(command: str, code: int) -> StageRejected:
 def state_failure(report: Report, alarm: int | None) -> StageAlarm:
     """Return the exception for a state in which the stage cannot be used.
 
-    Parameters
-    ----------
-    report : Report
-        The report with that state.
-    alarm : int or None
-        Code of the last alarm, for controllers that do not report it with their state.
+    `alarm` is the code of the last alarm, for controllers that do not report it with their state.
     """
     if report.state != "Alarm":
         meaning, remedy, kept = _STATES[report.state]

@@ -81,6 +81,12 @@ class Report(Struct, frozen=True):
         """Return whether the emergency stop is pressed, which grblHAL reports among the inputs."""
         return "E" in self.pins
 
+    @property
+    def is_moving(self) -> bool:
+        """Return whether the stage moves or slows down."""
+        slowing = (self.state, self.substate) in (("Hold", 1), ("Door", 2), ("Door", 3))
+        return self.state in ("Jog", "Run") or slowing
+
 
 type Message = Ok | ErrorCode | Alarm | Banner | GrblSetting | Feedback | Report | Unknown
 
@@ -91,22 +97,16 @@ def parse(line: str) -> Message:
 
 
 def _report(match: re.Match[str]) -> Report:
-    """Return the status report of a match."""
     state, substate, frame, position, fields = match.groups()
     offset, pins = _OFFSET.search(fields), _PINS.search(fields)
     return Report(
         state=state,
         substate=None if substate is None else int(substate),
-        position=_vector(position),
+        position=tuple(map(float, position.split(","))),
         is_machine=frame == "M",
-        offset=None if offset is None else _vector(offset[1]),
+        offset=None if offset is None else tuple(map(float, offset[1].split(","))),
         pins="" if pins is None else pins[1],
     )
-
-
-def _vector(text: str) -> tuple[float, ...]:
-    """Return the numbers of a comma-separated list."""
-    return tuple(float(number) for number in text.split(","))
 
 
 # The forms of lines, each with the function that makes its message of a match.

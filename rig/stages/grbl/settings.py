@@ -22,26 +22,13 @@ _KEEP_MOTORS_ON = 255
 
 
 class GrblSettings(Struct, frozen=True):
-    """The `$$` settings and the `$I` build information of one controller.
-
-    Parameters
-    ----------
-    values : dict
-        Setting number to value, as reported.
-    build : dict
-        Kind (`VER`, `OPT`) to text of the build information.
-    """
+    """The `$$` settings of one controller by number, and its `$I` build information by kind, as reported."""
 
     values: dict[int, str]
     build: dict[str, str]
 
     def identity(self, axes: tuple[int, ...]) -> Identity:
-        """Return firmware, travel, rates and tolerances of the controller.
-
-        Parameters
-        ----------
-        axes : tuple of int
-            The controller's numbers for the two axes.
+        """Return firmware, travel, rates and tolerances of the controller, for the two axes of these numbers.
 
         Raises
         ------
@@ -50,10 +37,16 @@ class GrblSettings(Struct, frozen=True):
         """
         version = self.build.get("VER", "")
         if not re.match(r"v?1\.1", version):
-            raise WrongFirmware(
-                f"the controller is GRBL {version or 'of no version'!r}; 1.1 or grblHAL is needed; flash it"
-            )
-        self._refuse_unsafe()
+            raise WrongFirmware(f"the controller is GRBL {version or 'of no version'!r}; flash 1.1 or grblHAL")
+        if not int(self._number(22)) & 1:
+            raise WrongFirmware("$22=0: the controller has no homing, so its position cannot be known; set $22=1")
+        if self._number(13) != 0:
+            raise WrongFirmware("$13=1: positions are reported in inches; set $13=0")
+        warnings = []
+        if self._number(20) == 0:
+            warnings.append("$20=0: the controller itself does not keep to its travel; set $20=1")
+        if self._number(1) != _KEEP_MOTORS_ON:
+            warnings.append(f"$1={self.values[1]}: the motors let go between motions; set $1={_KEEP_MOTORS_ON}")
         x, y = axes
         return Identity(
             firmware=f"{'grblHAL' if self._is_hal() else 'Grbl'} {version.rstrip(':')}",
@@ -67,24 +60,8 @@ class GrblSettings(Struct, frozen=True):
             homes_together="H" not in self._options(),
             pull_off_mm=self._number(27),
             settings={f"${number}": value for number, value in sorted(self.values.items())},
-            warnings=tuple(self._warnings()),
+            warnings=tuple(warnings),
         )
-
-    def _refuse_unsafe(self) -> None:
-        """Raise for settings under which positions cannot be known."""
-        if not int(self._number(22)) & 1:
-            raise WrongFirmware("$22=0: the controller has no homing, so its position cannot be known; set $22=1")
-        if self._number(13) != 0:
-            raise WrongFirmware("$13=1: positions are reported in inches; set $13=0")
-
-    def _warnings(self) -> list[str]:
-        """Return settings that should be changed, each with its remedy."""
-        warnings = []
-        if self._number(20) == 0:
-            warnings.append("$20=0: the controller itself does not keep to its travel; set $20=1")
-        if self._number(1) != _KEEP_MOTORS_ON:
-            warnings.append(f"$1={self.values[1]}: the motors let go between motions; set $1={_KEEP_MOTORS_ON}")
-        return warnings
 
     def _travel(self, axis: int) -> tuple[float, float]:
         """Return the machine coordinates of the ends of `axis`.
@@ -116,7 +93,6 @@ class GrblSettings(Struct, frozen=True):
         return self.build.get("FIRMWARE") == "grblHAL" or _HAL_SETTING in self.values
 
     def _options(self) -> str:
-        """Return the letters of the compile-time options."""
         return self.build.get("OPT", "").partition(",")[0]
 
     def _number(self, setting: int) -> float:
@@ -124,7 +100,6 @@ class GrblSettings(Struct, frozen=True):
         value = float(self.values.get(setting, "nan"))
         if not (value > 0.0 or (value == 0.0 and setting < 100 and setting not in (24, 25))):
             raise WrongFirmware(
-                f"${setting}={self.values.get(setting, 'not reported')}: the stage cannot be driven with it; "
-                "set it in the controller"
+                f"${setting}={self.values.get(setting, 'not reported')}: the stage cannot be driven; set it"
             )
         return value

@@ -9,7 +9,7 @@ from contextlib import suppress
 
 from faintfield.rig.errors import StageAlarm, StageLost, StageRejected, StageTimeout, WrongFirmware
 from faintfield.rig.stages.marlin import messages as marlin
-from faintfield.rig.stages.marlin.settings import MarlinSettings
+from faintfield.rig.stages.marlin.settings import marlin_identity
 from faintfield.rig.stages.motion import timeout_s
 from faintfield.rig.stages.protocol import AnswerTime, AxisIndex, Box, Identity, Point
 from faintfield.rig.stages.transport import LineTransport, Ok, restart_failure
@@ -37,16 +37,9 @@ _MAX_STARTS = 3
 
 
 class MarlinController:
-    """A `Controller` that speaks Marlin.
+    """A `Controller` that speaks Marlin over `line`; `axes` are its letters for the two axes.
 
-    Parameters
-    ----------
-    line : LineTransport
-        The connection.
-    axes : (str, str)
-        The controller's letters for the two axes.
-    travel_mm : Box, optional
-        The travel, for firmware that does not report it.
+    `travel_mm` is the travel, for firmware that does not report it.
     """
 
     def __init__(self, line: LineTransport, axes: tuple[str, str], travel_mm: Box | None) -> None:
@@ -69,7 +62,7 @@ class MarlinController:
         first, second = self._read_settings(), self._read_settings()
         if first != second:
             raise StageLost("the settings read differently twice in a row: the line is disturbed; try a shorter cable")
-        return MarlinSettings((*about, *first)).identity(self._axes, self._travel_mm)
+        return marlin_identity((*about, *first), self._axes, self._travel_mm)
 
     def home(self, axis: AxisIndex | None, bound_s: float) -> AnswerTime:
         """Home the named axis or both, and no others, such as a focus drive."""
@@ -140,7 +133,6 @@ class MarlinController:
         self._line.close()
 
     def _discard_input(self) -> None:
-        """Ignore all lines for a moment."""
         for _ in self._line.lines_until(self._clock.now_s() + _DISCARD_S):
             pass
 
@@ -161,9 +153,7 @@ class MarlinController:
                         self._command(command)
                     return
                 echoed = echoed or marker in text
-        raise StageTimeout(
-            f"no answer as from Marlin to {_MAX_STARTS} attempts; check power, baud rate and protocol of the controller"
-        )
+        raise StageTimeout(f"no answer as from Marlin to {_MAX_STARTS} attempts; check power, baud rate and protocol")
 
     def _keeps_count(self) -> bool | None:
         """Return whether the controller accepts the next line number, as none does after a restart; None if mute."""
@@ -178,7 +168,6 @@ class MarlinController:
         return answered
 
     def _new_marker(self) -> str:
-        """Return a word that was not used before, for the controller to echo."""
         self._markers += 1
         return f"faintfield-{self._markers}."
 
@@ -195,12 +184,10 @@ class MarlinController:
                 deadline_s = min(self._clock.now_s() + _QUIET_S, last_s)
 
     def _read_settings(self) -> list[marlin.Message]:
-        """Return the messages about settings and limits."""
         messages = [*self._command("M503"), *self._command("M211")]
         return [message for message in messages if isinstance(message, marlin.MarlinSetting | marlin.Limits)]
 
     def _command(self, command: str, bound_s: float = _ANSWER_S) -> list[marlin.Message]:
-        """Send one command, again if it arrives damaged, and return the messages before its `ok`."""
         for text in self._line.lines_until(self._clock.now_s()):
             self._check(marlin.parse(text), command)
         self._line_number += 1
@@ -209,9 +196,7 @@ class MarlinController:
             messages = self._await_ok(command, bound_s)
             if messages is not None:
                 return messages
-        raise StageLost(
-            f"line {self._line_number} arrived damaged {_MAX_SENDINGS} times in a row; use a shorter or shielded cable"
-        )
+        raise StageLost(f"line {self._line_number} arrived damaged {_MAX_SENDINGS} times in a row; use a shorter cable")
 
     def _await_ok(self, command: str, bound_s: float) -> list[marlin.Message] | None:
         """Return the messages up to the `ok`, or None if the controller asks for the line again."""
@@ -240,7 +225,6 @@ class MarlinController:
         )
 
     def _check(self, message: marlin.Message, command: str) -> None:
-        """Raise for a message that the controller has restarted or stopped."""
         if isinstance(message, marlin.Start):
             raise restart_failure()
         if isinstance(message, marlin.Resend) and message.number != self._line_number:
@@ -250,5 +234,5 @@ class MarlinController:
             )
         if isinstance(message, marlin.ErrorText) and not message.in_transmission:
             raise StageAlarm(
-                f"the controller says {message.text!r} to {command!r}; look for the cause, then recover and home it"
+                f"the controller says {message.text!r} to {command!r}; find the cause, recover and home it"
             )

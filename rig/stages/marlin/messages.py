@@ -107,19 +107,16 @@ def numbered(number: int, command: str) -> bytes:
 
 
 def _position(match: re.Match[str]) -> PositionReport:
-    """Return the positions of a match, by axis."""
     axes = re.findall(rf"([XYZ]):\s?({_NUMBER})", match[2])
     return PositionReport({axis: float(value) for axis, value in axes}, is_ok=match[1] is not None)
 
 
 def _limits(match: re.Match[str]) -> Limits:
-    """Return the reachable positions of a match."""
     x_min, y_min, x_max, y_max = map(float, match.groups())
     return Limits((x_min, x_max), (y_min, y_max))
 
 
 def _setting(match: re.Match[str]) -> MarlinSetting:
-    """Return the command and the parameters of a match."""
     return MarlinSetting(match[1], {word[0]: float(word[1:]) for word in match[2].split()})
 
 

@@ -14,99 +14,66 @@ _ROUNDING_MM = 0.0055
 _HOMING_BOUND_S = 240.0
 
 
-class MarlinSettings:
-    """Settings that one controller has reported.
+def marlin_identity(messages: Iterable[Message], axes: tuple[str, str], travel_mm: Box | None) -> Identity:
+    """Return firmware, travel, rates and tolerances of a controller.
 
     Parameters
     ----------
     messages : iterable of Message
         Answers about its capabilities (M115), settings (M503) and limits (M211).
+    axes : (str, str)
+        The controller's letters for the two axes.
+    travel_mm : Box, optional
+        The travel, for firmware that does not report it.
+
+    Raises
+    ------
+    WrongFirmware
+        The firmware is not Marlin, or does not report a setting that is needed.
     """
+    received = tuple(messages)
+    firmware = next((message.name for message in received if isinstance(message, Firmware)), "")
+    if "marlin" not in firmware.lower():
+        raise WrongFirmware(f"the controller is {firmware or 'nameless'!r}, not Marlin; flash it or set stage.protocol")
+    parameters = {message.command: message.parameters for message in received if isinstance(message, MarlinSetting)}
 
-    def __init__(self, messages: Iterable[Message]) -> None:
-        received = tuple(messages)
-        self._firmware = next((m.name for m in received if isinstance(m, Firmware)), "")
-        self._capabilities = {m.name: m.present for m in received if isinstance(m, Capability)}
-        self._parameters = {m.command: m.parameters for m in received if isinstance(m, MarlinSetting)}
-        self._limits = [m for m in received if isinstance(m, Limits)]
-
-    def identity(self, axes: tuple[str, str], travel_mm: Box | None) -> Identity:
-        """Return firmware, travel, rates and tolerances of the controller.
-
-        Parameters
-        ----------
-        axes : (str, str)
-            The controller's letters for the two axes.
-        travel_mm : Box, optional
-            The travel, for firmware that does not report it.
-
-        Raises
-        ------
-        WrongFirmware
-            The firmware is not Marlin, or does not report a setting that is needed.
-        """
-        if "marlin" not in self._firmware.lower():
-            raise WrongFirmware(
-                f"the controller is {self._firmware or 'of no stated name'!r}; Marlin is needed; "
-                "flash it, or set stage.protocol"
-            )
-        x, y = axes
-        travel_acceleration = self._number("M204", "T")
-        return Identity(
-            firmware=self._firmware,
-            travel_mm=self._travel(axes, travel_mm),
-            motion=MotionLimits(
-                rate_mm_per_s=(self._number("M203", x), self._number("M203", y)),
-                acceleration_mm_per_s2=(
-                    min(travel_acceleration, self._number("M201", x)),
-                    min(travel_acceleration, self._number("M201", y)),
-                ),
-            ),
-            tolerance_mm=(self._tolerance(x), self._tolerance(y)),
-            homing_bound_s=_HOMING_BOUND_S,
-            homes_together=False,
-            pull_off_mm=0.0,
-            settings=self._as_text(),
-            warnings=tuple(self._warnings()),
-        )
-
-    def _travel(self, axes: tuple[str, str], configured: Box | None) -> Box:
-        """Return the positions that all reported limits allow."""
-        boxes = [Box(limits.x_mm, limits.y_mm) for limits in self._limits] if axes == ("X", "Y") else []
-        if boxes:
-            return reduce(Box.intersection, boxes)
-        if configured is None:
-            raise WrongFirmware("the controller does not report its travel (M115, M211); set stage.travel_mm")
-        return configured
-
-    def _warnings(self) -> list[str]:
-        """Return settings that should be changed, each with its remedy."""
-        warnings = []
-        if not self._limits:
-            warnings.append(
-                "the controller reports no limits: only stage.travel_mm keeps the stage inside its travel; check it"
-            )
-        if not self._capabilities.get("EMERGENCY_PARSER", False):
-            warnings.append("no emergency parser: a motion cannot be stopped half way; enable EMERGENCY_PARSER")
-        return warnings
-
-    def _tolerance(self, axis: str) -> float:
-        """Return half a motor step plus the rounding of reports, in mm."""
-        return 0.5 / self._number("M92", axis) + _ROUNDING_MM
-
-    def _as_text(self) -> dict[str, str]:
-        """Return the parameters as text, by command."""
-        return {
-            command: " ".join(f"{letter}{value:g}" for letter, value in parameters.items())
-            for command, parameters in sorted(self._parameters.items())
-        }
-
-    def _number(self, command: str, letter: str) -> float:
-        """Return one parameter; raises `WrongFirmware` if it was not reported or has an impossible value."""
-        value = self._parameters.get(command, {}).get(letter)
+    def number(command: str, letter: str) -> float:
+        value = parameters.get(command, {}).get(letter)
         if value is None or value <= 0.0:
-            raise WrongFirmware(
-                f"{command} {letter}={'not reported' if value is None else f'{value:g}'}: "
-                "the stage cannot be driven with it; set it in the controller"
-            )
+            state = "not reported" if value is None else f"{value:g}"
+            raise WrongFirmware(f"{command} {letter}={state}: the stage cannot be driven with it; set it")
         return value
+
+    boxes = [Box(message.x_mm, message.y_mm) for message in received if isinstance(message, Limits)]
+    warnings = []
+    if not boxes:
+        warnings.append("no limits are reported: only stage.travel_mm keeps the stage inside its travel; check it")
+    if Capability("EMERGENCY_PARSER", present=True) not in received:
+        warnings.append("no emergency parser: a motion cannot be stopped half way; enable EMERGENCY_PARSER")
+    if boxes and axes == ("X", "Y"):
+        travel_mm = reduce(Box.intersection, boxes)
+    if travel_mm is None:
+        raise WrongFirmware("the controller does not report its travel (M115, M211); set stage.travel_mm")
+    x, y = axes
+    travel_acceleration = number("M204", "T")
+    return Identity(
+        firmware=firmware,
+        travel_mm=travel_mm,
+        motion=MotionLimits(
+            rate_mm_per_s=(number("M203", x), number("M203", y)),
+            acceleration_mm_per_s2=(
+                min(travel_acceleration, number("M201", x)),
+                min(travel_acceleration, number("M201", y)),
+            ),
+        ),
+        # Half a motor step, and the rounding of reports
+        tolerance_mm=(0.5 / number("M92", x) + _ROUNDING_MM, 0.5 / number("M92", y) + _ROUNDING_MM),
+        homing_bound_s=_HOMING_BOUND_S,
+        homes_together=False,
+        pull_off_mm=0.0,
+        settings={
+            command: " ".join(f"{letter}{value:g}" for letter, value in letters.items())
+            for command, letters in sorted(parameters.items())
+        },
+        warnings=tuple(warnings),
+    )

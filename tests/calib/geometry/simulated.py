@@ -4,14 +4,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from faintfield.calib.board import Board
-from faintfield.calib.geometry import BoardObservation, Target
+from faintfield.calib.geometry import BoardObservation, GeometrySettings, RigGeometry, Target, calibrate_geometry
 from faintfield.rig.plan import centre_node, grid_nodes, nominal_poses_rt_cam_ref
 from faintfield.rig.simulation.boards import SimulatedBoard, six_boards
 from faintfield.rig.simulation.experiment import paper_experiment
 
 NOISE_PX = 0.2
+LENIENT = GeometrySettings(max_transfer_sigma_px=20.0, max_holdout_ratio=10.0)
 OPTICS = paper_experiment(1600, 1200).optics
 BOARD_NAMES = [f"board-{index}" for index in range(6)]
 BOARDS = {name: Board(name, 9, 7, 40.0, 30.0, "DICT_5X5_1000", 31 * k) for k, name in enumerate(BOARD_NAMES)}
@@ -47,16 +49,30 @@ def simulated(
     for index, board in enumerate(standing or six_boards(6, 8, 40.0)):
         for node, pose in zip(grid_nodes(side, side), poses, strict=True):
             there = pose + np.append(np.zeros(3), generator.normal(size=3) * miss_mm)
-            pixels = board.seen(OPTICS, there)
-            ids = np.flatnonzero(np.isfinite(pixels[:, 0]))
-            noisy = pixels[ids] + generator.normal(size=(len(ids), 2)) * noise_px
             target = Target(BOARD_NAMES[index], index if miss_mm else 0)
-            observations.append(BoardObservation(node, target, ids, noisy, np.full(len(ids), NOISE_PX)))
+            observations.append(observe(board, there, node, target, generator, noise_px))
     return Simulated(observations, poses, side)
+
+
+def observe(
+    board: SimulatedBoard,
+    pose: NDArray[np.float64],
+    node: tuple[int, int],
+    target: Target,
+    generator: np.random.Generator,
+    noise_px: float,
+) -> BoardObservation:
+    """Return the corners that a camera sees, with noise."""
+    pixels = board.seen(OPTICS, pose)
+    ids = np.flatnonzero(np.isfinite(pixels[:, 0]))
+    noisy = pixels[ids] + generator.normal(size=(len(ids), 2)) * noise_px
+    return BoardObservation(node, target, ids, noisy, np.full(len(ids), NOISE_PX))
+
+
+def calibrated(truth: Simulated, settings: GeometrySettings | None = None) -> RigGeometry:
+    return calibrate_geometry(BOARDS, truth.observations, OPTICS.size_px, truth.reference, settings)
 
 
 def centres_mm(rt_cam_ref: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return camera centres (node, 3), by scipy's rotations."""
-    from scipy.spatial.transform import Rotation
-
     return -Rotation.from_rotvec(rt_cam_ref[:, :3]).inv().apply(rt_cam_ref[:, 3:])

@@ -21,16 +21,20 @@ from faintfield.calib.geometry.bundle import _c_library_silenced
 from faintfield.calib.homography import fronto_parallel_rt_ref_plane, image_lattice, transfer
 from faintfield.calib.lens import Lens
 from faintfield.rig.simulation.boards import SimulatedBoard, six_boards
-from tests.calib.geometry.simulated import BOARDS, NOISE_PX, OPTICS, Simulated, centres_mm, simulated
+from tests.calib.geometry.simulated import (
+    BOARDS,
+    LENIENT,
+    NOISE_PX,
+    OPTICS,
+    Simulated,
+    calibrated,
+    centres_mm,
+    simulated,
+)
 
-LENIENT = GeometrySettings(max_transfer_sigma_px=20.0, max_holdout_ratio=10.0)
 TRUE_LENS = Lens(OPTICS.size_px, OPTICS.fx_px, OPTICS.fy_px, OPTICS.cx_px, OPTICS.cy_px, OPTICS.distortion)
 
 type Calibrated = tuple[Simulated, RigGeometry]
-
-
-def calibrated(truth: Simulated, settings: GeometrySettings | None = None) -> RigGeometry:
-    return calibrate_geometry(BOARDS, truth.observations, OPTICS.size_px, truth.reference, settings)
 
 
 def normalized_error(truth: Simulated, geometry: RigGeometry) -> float:

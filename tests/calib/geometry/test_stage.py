@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from faintfield.calib.geometry import RigGeometry, calibrate_geometry
+from faintfield.calib.geometry import RigGeometry
 from faintfield.calib.geometry.stage import approach_directions, stage_report
 from faintfield.rig.plan import grid_nodes
-from tests.calib.geometry.simulated import BOARDS, OPTICS, simulated
+from tests.calib.geometry.simulated import calibrated, simulated
 
 SIDE = 5
 NODES = grid_nodes(SIDE, SIDE)
@@ -21,8 +21,7 @@ TILT = Rotation.from_rotvec([0.01, -0.02, 0.3])
 @pytest.fixture(scope="module")
 def measured() -> RigGeometry:
     """Lens and covariance of a 3 x 3 calibration, repeated for as many nodes as the stages have."""
-    truth = simulated(1)
-    geometry = calibrate_geometry(BOARDS, truth.observations, OPTICS.size_px, (1, 1))
+    geometry = calibrated(simulated(1))
     lens = geometry.covariance.shape[0] - 6 * len(geometry.nodes)
     covariance = np.zeros((lens + 6 * len(NODES),) * 2)
     covariance[:lens, :lens] = geometry.covariance[:lens, :lens]

@@ -91,11 +91,14 @@ def _expected_moments(
     return Moments(
         pixels=float(pixels),
         freedom=float(pixels),
-        darks=DarkMoments(exposures_s, n, line, (n - 1) * pixels * noise_dn2, (n - 1) * level_dn2, pixels * scatter),
+        darks=DarkMoments(
+            exposures_s, n, line, (n - 1) * pixels * noise_dn2, (n - 1) * level_dn2, pixels * scatter, np.zeros_like(n)
+        ),
         flats=FlatMoments(
             flat_n,
             sensor.offset_dn + signals,
             (flat_n - 1) * pixels * (read_dn2 + gain * signals),
             np.ones_like(signals),
+            np.zeros_like(signals),
         ),
     )

@@ -10,6 +10,9 @@ from faintfield.calib.noise import Conditions, Series, measure_series
 
 Frames = list[tuple[str, NDArray[np.uint16]]]
 
+EXPOSURES_S = (0.1, 1.0, 10.0, 60.0)
+TRUTH = {"gain_dn_per_e": 2.0, "read_noise_e": 12.0**0.5, "dark_current_e_per_s": 0.2}
+
 
 @dataclass(frozen=True)
 class Sensor:
@@ -17,8 +20,8 @@ class Sensor:
 
     shape: tuple[int, int] = (64, 64)
     offset_dn: float = 100.0
-    gain_dn_per_e: float = 2.0
-    read_noise_e: float = 12.0**0.5
+    gain_dn_per_e: float | NDArray[np.float64] = 2.0
+    read_noise_e: float | NDArray[np.float64] = 12.0**0.5
     dark_current_e_per_s: float = 0.2
     dsnu_e: float = 1.5
     dcnu: float = 0.0
@@ -28,6 +31,9 @@ class Sensor:
     prnu: float = 0.0
     bend_per_dn: float = 0.0
     quantum_efficiency: float = 0.5
+    well_e: float = np.inf  # mean over the pixels, which differ by 3 %
+    ceiling_dn: float = 65535.0
+    jump_e: float | NDArray[np.float64] = 0.0  # of pixels that are up in half of the frames
 
 
 @dataclass(frozen=True)
@@ -39,6 +45,7 @@ class Chip:
     dark_current_e_per_s: NDArray[np.float64]
     response: NDArray[np.float64]
     hot: NDArray[np.bool_]
+    well_e: NDArray[np.float64] | float
 
 
 def make_chip(sensor: Sensor, rng: np.random.Generator) -> Chip:
@@ -51,6 +58,7 @@ def make_chip(sensor: Sensor, rng: np.random.Generator) -> Chip:
         np.where(hot, dark + rng.uniform(1.0, 30.0, shape), dark),
         1 + sensor.prnu * rng.standard_normal(shape),
         hot,
+        sensor.well_e if np.isinf(sensor.well_e) else sensor.well_e * (1 + 0.03 * rng.standard_normal(shape)),
     )
 
 
@@ -58,14 +66,16 @@ def expose(chip: Chip, exposure_s: float, rng: np.random.Generator, photons: flo
     """Take one frame (row, column), in DN."""
     sensor = chip.sensor
     mean_e = chip.dark_current_e_per_s * exposure_s + sensor.quantum_efficiency * photons * chip.response
-    signal_e = rng.poisson(mean_e) + rng.normal(0, sensor.read_noise_e, sensor.shape)
+    signal_e = np.minimum(rng.poisson(mean_e), chip.well_e) + rng.normal(0, sensor.read_noise_e, sensor.shape)
+    if np.any(sensor.jump_e):
+        signal_e += sensor.jump_e * (rng.random(sensor.shape) < 0.5)
     signal_dn = sensor.gain_dn_per_e * signal_e
     if sensor.bend_per_dn:
         # The charge e makes the signal s with e·g = s (1 + κ s).
         signal_dn = (np.sqrt(1 + 4 * sensor.bend_per_dn * signal_dn) - 1) / (2 * sensor.bend_per_dn)
     dn = chip.offset_dn + signal_dn + sensor.jitter_dn * rng.standard_normal()
     dn += sensor.banding_dn * rng.standard_normal((sensor.shape[0], 1))
-    return np.clip(np.rint(dn), 0, 65535).astype(np.uint16)
+    return np.clip(np.rint(dn), 0, sensor.ceiling_dn).astype(np.uint16)
 
 
 def darks(chip: Chip, exposures_s: Sequence[float], frames: int, rng: np.random.Generator) -> dict[float, Frames]:
@@ -93,7 +103,20 @@ def flat_series(
     return measure_series(named, Conditions("flat", exposure_s, level, photons if stated else None))
 
 
-def specimen(seed: int, **changes: object) -> tuple[Chip, np.random.Generator]:
+def with_flats(
+    chip: Chip,
+    rng: np.random.Generator,
+    photons: Sequence[float] = (8000.0,),
+    exposures_s: Sequence[float] = EXPOSURES_S,
+    frames: int = 10,
+    dark_frames: int = 10,
+) -> list[Series]:
+    """Measure darks of each exposure, and flats of each light level."""
+    series = dark_series(chip, exposures_s, dark_frames, rng)
+    return [*series, *(flat_series(chip, light, frames, rng, level=level) for level, light in enumerate(photons))]
+
+
+def specimen(seed: int | np.random.Generator, **changes: object) -> tuple[Chip, np.random.Generator]:
     """Make a chip of the paper's camera with some fields changed, and the generator to expose it with."""
     rng = np.random.default_rng(seed)
     return make_chip(replace(Sensor(), **changes), rng), rng  # type: ignore[arg-type] # fields are named by the test

@@ -24,7 +24,7 @@ from faintfield.calib.noise.emva.quantities import (
     snr,
     threshold_e,
 )
-from faintfield.calib.noise.emva.warmth import dark_current_doubling
+from faintfield.calib.noise.fit.temperature import dark_current_doubling
 
 GAIN, READ_E, CURRENT, EFFICIENCY, FULL_E = 0.5, 8.0, 0.2, 0.6, 10_000.0
 
@@ -135,7 +135,7 @@ def test_missing_input_is_the_reason() -> None:
 
 SHAPE = (80, 100)
 EVERY = np.ones(SHAPE, bool)
-NONE = TemporalNoise(0.0, 0.0, 0.0)
+NONE = TemporalNoise(np.zeros(3), np.zeros(3))
 
 
 def patterned(rng: np.random.Generator, pixel: float, row: float, column: float) -> NDArray[np.float64]:
@@ -172,8 +172,8 @@ def test_temporal_noise_is_subtracted() -> None:
     fixed = patterned(rng, 2.0, 1.5, 0.0)
     series = darks_of([fixed + patterned(rng, 6.0, 2.0, 1.0) for _ in range(8)])
     noise = temporal_noise(series, EVERY)
-    assert noise.pixel == pytest.approx((36 + 1 / 12) / 8, rel=0.03)
-    assert noise.row == pytest.approx((4 + 36 / 100) / 8, rel=0.2)
+    assert noise.variances[0] == pytest.approx((36 + 1 / 12) / 8, rel=0.03)
+    assert noise.variances[1] == pytest.approx((4 + 36 / 100) / 8, rel=0.2)
     parts = nonuniformity(series.mean_dn, EVERY, noise)
     assert parts.pixel.value == pytest.approx(2.0, rel=0.04)
     assert parts.row.value == pytest.approx(1.5, rel=0.3)

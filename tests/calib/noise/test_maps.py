@@ -1,41 +1,39 @@
 """Maps of sensors whose every pixel is known: read noise, gain, response, offsets and defects."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from faintfield.calib.noise import Conditions, NoiseCalibration, Series, calibrate, measure_series
+from faintfield.calib.noise.emva.light_estimates import quantum_efficiency
+from faintfield.calib.noise.maps.defects import outlying_pixels
+from faintfield.calib.noise.maps.levels import LinePattern, line_pattern, pixel_levels
 from faintfield.calib.noise.maps.photo_response import Response, _kept_share, _running_mean, measure_response
-from faintfield.calib.noise.maps.pixels import (
-    LinePattern,
-    line_pattern,
-    outlying_pixels,
-    pixel_levels,
-    quantum_efficiency,
-)
-from faintfield.calib.noise.maps.read_noise import PixelReadNoise, kept_variance, measure_read_noise
+from faintfield.calib.noise.maps.read_noise import PixelReadNoise, kept_of, measure_read_noise
 from faintfield.calib.noise.maps.seams import find_seams, share_of_seam
-from tests.calib.noise.darkroom import darks, specimen
+from tests.calib.noise import darkroom
+from tests.calib.noise.darkroom import darks, specimen, with_flats
 
 type Array = NDArray[np.float64]
 
 SHAPE = (64, 72)
 LEFT = np.arange(SHAPE[1]) < SHAPE[1] // 2
 EVERY = np.ones(SHAPE, bool)
+NO_CURRENT = {"dark_current_e_per_s": 0.0}
 
 
-def frames_of(frames: list[Array], conditions: Conditions) -> Series:
-    named = [(f"{conditions.level} {k}", np.rint(frame).astype(np.uint16)) for k, frame in enumerate(frames)]
-    return measure_series(named, conditions)
+def measured(stack: list[Array], conditions: Conditions) -> Series:
+    return measure_series([(str(k), np.rint(frame)) for k, frame in enumerate(stack)], conditions)
 
 
 def dark_series(sigma_dn: Array, frames: int, rng: np.random.Generator, shot_dn2: float = 0.0) -> Series:
     """Return the statistics of darks with this noise of each pixel and offsets that differ by 3 DN."""
-    offset, noise = 200 + 3 * rng.standard_normal(sigma_dn.shape), np.sqrt(sigma_dn**2 + shot_dn2)
-    stack = [offset + noise * rng.standard_normal(sigma_dn.shape) for _ in range(frames)]
-    return frames_of(stack, Conditions("dark", 0.1))
+    noise_dn = np.sqrt(sigma_dn**2 + shot_dn2)
+    chip, _ = specimen(rng, shape=sigma_dn.shape, gain_dn_per_e=1.0, read_noise_e=noise_dn, dsnu_e=3.0, **NO_CURRENT)
+    return darkroom.dark_series(chip, (0.1,), frames, rng)[0]
 
 
 def read_noise(sigma_dn: Array, frames: int, seed: int) -> PixelReadNoise:
@@ -98,7 +96,8 @@ def test_subtracted_means_mix_variances_as_matrices() -> None:
     variance = np.random.default_rng(10).uniform(1, 9, (5, 7))
     whole = np.kron(np.eye(5) - 1 / 5, np.eye(7) - 1 / 7)
     expected = np.diag(whole @ np.diag(variance.ravel()) @ whole.T).reshape(5, 7)
-    np.testing.assert_allclose(kept_variance(variance, np.ones((5, 7), bool)), expected, rtol=1e-12)
+    kept = kept_of(lambda rows: variance[rows], np.ones((5, 7), bool))
+    np.testing.assert_allclose(kept(slice(None), variance), expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize(("lines", "regions"), [("columns", "halves"), ("columns", "alternate"), ("rows", "quarters")])
@@ -119,19 +118,13 @@ def test_seam_is_measured_beside_a_gradient(lines: str, regions: str) -> None:
 def calibrated(
     seed: int, *, gain: Array | float = 2.0, response: Array | float = 1.0, jump_e: Array | float = 0.0
 ) -> NoiseCalibration:
-    """Calibrate a sensor from 40 darks and 40 flats each of three levels; pixels that jump are up half of the time."""
-    rng = np.random.default_rng(seed)
-    read_e = 1.5 * np.exp(0.15 * rng.standard_normal(SHAPE))
-
-    def frame(light_e: float) -> Array:
-        electrons = rng.poisson(light_e * response * np.ones(SHAPE)) + read_e * rng.standard_normal(SHAPE)
-        return np.asarray(100 + gain * (electrons + jump_e * (rng.random(SHAPE) < 0.5)))
-
-    series = []
-    for level, light_e in enumerate((0.0, 1000.0, 4000.0, 12000.0)):
-        conditions = Conditions("flat", 0.1, level, light_e) if light_e else Conditions("dark", 0.1)
-        series.append(frames_of([frame(light_e) for _ in range(40)], conditions))
-    return calibrate(series, 65535)
+    """Calibrate a sensor from 40 darks and 40 flats each of three levels."""
+    read_e = 1.5 * np.exp(0.15 * np.random.default_rng([seed, 1]).standard_normal(SHAPE))
+    chip, rng = specimen(
+        seed, shape=SHAPE, gain_dn_per_e=gain, read_noise_e=read_e, dsnu_e=0.0, jump_e=jump_e, **NO_CURRENT
+    )
+    chip = replace(chip, response=response * np.ones(SHAPE))
+    return calibrate(with_flats(chip, rng, (2000.0, 8000.0, 24000.0), (0.1,), 40, 40), 65535)
 
 
 def test_gains_of_pixels_and_taps_are_measured() -> None:
@@ -158,7 +151,7 @@ def test_step_of_gain_is_none_of_the_response() -> None:
     for level, light in enumerate((0.0, 90.0, 180.0, 300.0)):
         conditions = Conditions("flat", 0.1, level, light) if light else Conditions("dark", 0.1)
         stack = [100 + gain * (rng.poisson(light * response) + 15.0 * rng.standard_normal(shape)) for _ in range(4)]
-        series.append(frames_of(stack, conditions))
+        series.append(measured(stack, conditions))
     result = calibrate(series, 65535)
     assert result.maps.gain_dn_per_e is not None
     assert result.maps.read_noise_e is not None
@@ -227,7 +220,9 @@ def test_pixel_levels_are_posterior_means() -> None:
     hot[3, 4] = True
     levels = pixel_levels(series, values, noise_dn2, pattern, hot)
     design = np.stack([np.ones(3), t], axis=1)
-    means = np.array([dark.mean_dn - dark.mean_dn.mean(where=~hot) for dark in series]) - pattern.of(slice(None))
+    means = np.array([dark.mean_dn - dark.mean_dn.mean(where=~hot) for dark in series]) - np.add.outer(
+        pattern.row_dn, pattern.column_dn
+    )
     for place, prior in (((5, 6), np.diag([1 / 10.5, 1 / 0.002])), ((3, 4), np.diag([1 / 10.5, 1e-12]))):
         weights = np.diag(counts / [48.0 + 20 * place[0] + place[1], 56.0, 96.0])
         covariance = np.linalg.inv(design.T @ weights @ design + prior)
@@ -245,7 +240,7 @@ def test_pattern_of_columns_is_shrunk() -> None:
     rng = np.random.default_rng(12)
     own, offsets = 2.0 * rng.standard_normal((1, 90)), 4.0 * rng.standard_normal((64, 90))
     stack = [500 + own + offsets + 3.0 * rng.standard_normal((64, 90)) for _ in range(8)]
-    pattern = line_pattern([frames_of(stack, Conditions("dark", 0.1))], 16.0)
+    pattern = line_pattern([measured(stack, Conditions("dark", 0.1))], 16.0)
     chance = 16 / 64 + 9 / 64 / 8
     kept, profile = 4 / (4 + chance), own + offsets.mean(axis=0)
     np.testing.assert_allclose(pattern.column_dn, (kept * (profile - profile.mean()))[0], atol=0.4)
@@ -255,14 +250,11 @@ def test_pattern_of_columns_is_shrunk() -> None:
 
 def test_quantum_efficiency_is_a_line_through_zero() -> None:
     photons, charges = np.array([100.0, 200.0, 400.0]), np.array([52.0, 98.0, 203.0])
-    blank = [("one", np.zeros((16, 16), int))]
-    flats = [measure_series(blank, Conditions("flat", 1.0, photons=light)) for light in (*photons.tolist(), None)]
-    slope, se = quantum_efficiency(flats, [*charges, 77.0], 0.01) or (0.0, 0.0)
+    slope, se = quantum_efficiency(photons, charges, 0.01)
     (expected,), (squares,), *_ = np.linalg.lstsq(photons[:, None], charges)
     assert slope == pytest.approx(expected)
     assert se == pytest.approx(np.hypot(0.01 * slope, np.sqrt(squares / 2 / np.sum(photons**2))))
-    assert quantum_efficiency(flats[:1], [52.0], 0.01) == pytest.approx((0.52, 0.0052))
-    assert quantum_efficiency(flats[3:], [77.0], 0.01) is None
+    assert quantum_efficiency(photons[:1], charges[:1], 0.01) == pytest.approx((0.52, 0.0052))
 
 
 def responding(response: Array, noise_dn2: float = 1.0, seed: int = 1) -> Response:

@@ -8,27 +8,25 @@ import pytest
 from numpy.typing import NDArray
 
 from faintfield.calib.noise import Conditions, Series, calibrate, measure_series
+from faintfield.calib.noise.estimate import Estimate
+from faintfield.calib.noise.fit.scatter import trend_dn2, without_odd
+from faintfield.calib.noise.fit.temperature import Warmth, settle_temperature, with_doubling_error
 from faintfield.calib.noise.likelihood.maximum import NoiseFit
 from faintfield.calib.noise.likelihood.moments import gather_moments
 from faintfield.calib.noise.likelihood.response import Light
-from faintfield.calib.noise.misfit.odd_light import without_odd
-from faintfield.calib.noise.misfit.scatter import trend_dn2
-from faintfield.calib.noise.misfit.temperature import Warmth, settle_temperature, with_doubling_error
-from faintfield.calib.noise.result import Estimate
-from tests.calib.noise.darkroom import Chip, dark_series, expose, flat_series, specimen
+from tests.calib.noise.darkroom import Chip, dark_series, expose, flat_series, specimen, with_flats
 
 CHIP = {"gain_dn_per_e": 0.5, "read_noise_e": 8.0, "dsnu_e": 3.0, "shape": (40, 40)}
 PHOTONS = tuple(np.linspace(600.0, 12000.0, 9))
 
 
-def take(chip: Chip, rng: np.random.Generator) -> list[Series]:
-    series = dark_series(chip, (0.1, 5.0, 10.0, 20.0), 6, rng)
-    return [*series, *(flat_series(chip, light, 4, rng, level=level) for level, light in enumerate(PHOTONS))]
+def measured(chip: Chip, rng: np.random.Generator) -> list[Series]:
+    return with_flats(chip, rng, PHOTONS, (0.1, 5.0, 10.0, 20.0), frames=4, dark_frames=6)
 
 
 @cache
 def plain() -> tuple[Series, ...]:
-    return tuple(take(*specimen(3, **CHIP)))
+    return tuple(measured(*specimen(3, **CHIP)))
 
 
 def noisier(series: Series, factor: float) -> Series:
@@ -76,7 +74,7 @@ def test_unknown_light_leaves_room_for_a_bend() -> None:
 
 def test_flickering_lamp_leaves_the_noise_alone() -> None:
     chip, rng = specimen(5, **CHIP)
-    series = take(chip, rng)
+    series = measured(chip, rng)
     for j, light in enumerate(PHOTONS):
         frames = [(f"f{j}_{k}", expose(chip, 0.1, rng, light * (1 + 0.02 * rng.standard_normal()))) for k in range(4)]
         series[4 + j] = measure_series(frames, series[4 + j].conditions)

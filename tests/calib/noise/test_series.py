@@ -10,10 +10,9 @@ from scipy import stats
 
 from faintfield.calib.errors import BadFrame, LightLeak, SaturatedFlat
 from faintfield.calib.noise import Conditions, Series, calibrate, measure_series
-from faintfield.calib.noise.series.flat_levels import check_flat_levels
-from faintfield.calib.noise.series.outliers import MAX_CHANCE, outlier
-from faintfield.calib.noise.series.saturation import find_saturation
-from tests.calib.noise.darkroom import darks, expose, specimen
+from faintfield.calib.noise.series.flats import check_flat_levels, find_saturation
+from faintfield.calib.noise.series.statistics import MAX_CHANCE, outlier
+from tests.calib.noise.darkroom import Chip, dark_series, darks, expose, flat_series, specimen
 
 DARK, FLAT = Conditions("dark", 1.0), Conditions("flat", 1.0)
 
@@ -110,35 +109,38 @@ def test_outliers_are_no_chance_by_students_t() -> None:
 OFFSET_DN, GAIN, READ_E = 50.0, 0.5, 6.0
 
 
-def take(
-    charges_e: list[float], frames: int = 2, ceiling_dn: float = 4095.0, well_e: float = np.inf, seed: int = 1
-) -> list[Series]:
-    """Take flats of these mean charges; wells differ by 3 % between pixels."""
-    rng = np.random.default_rng(seed)
-    well = well_e * (1 + 0.03 * rng.standard_normal((48, 48)))
-    series = []
-    for level, charge in enumerate(charges_e):
-        kind = Conditions("flat" if charge else "dark", 0.1 * (1 + level) if not charge else 0.1, level, 2 * charge)
-        named = []
-        for k in range(frames):
-            electrons = np.minimum(rng.poisson(charge, well.shape), well) + rng.normal(0, READ_E, well.shape)
-            dn = np.clip(np.rint(OFFSET_DN + GAIN * electrons), 0, ceiling_dn)
-            named.append((f"{charge:g} {k}", dn.astype(np.uint16)))
-        series.append(measure_series(named, kind))
-    return series
+def camera(seed: int, well_e: float = np.inf) -> tuple[Chip, np.random.Generator]:
+    """Make a sensor of 12 bits without dark current."""
+    converter = {"offset_dn": OFFSET_DN, "gain_dn_per_e": GAIN, "ceiling_dn": 4095.0}
+    charge = {"read_noise_e": READ_E, "dark_current_e_per_s": 0.0, "dsnu_e": 0.0, "well_e": well_e}
+    return specimen(seed, shape=(48, 48), **converter, **charge)
+
+
+def flats_of(charges_e: list[float], well_e: float = np.inf) -> list[Series]:
+    """Measure flats of these mean charges."""
+    chip, rng = camera(1, well_e)
+    return [flat_series(chip, 2 * charge_e, 2, rng, level=level) for level, charge_e in enumerate(charges_e)]
+
+
+def flat_of(charges_e: list[float], exposure_s: float, seed: int) -> Series:
+    """Measure one series whose frames have these mean charges."""
+    chip, rng = camera(seed)
+    named = [(f"{exposure_s:g} s {k}", expose(chip, exposure_s, rng, 2 * e)) for k, e in enumerate(charges_e)]
+    return measure_series(named, Conditions("flat", exposure_s))
 
 
 def levels(series: Iterable[Series]) -> list[int]:
     return [entry.conditions.level for entry in series]
 
 
-DARKS = take([0.0, 0.0], 4, seed=2)
+CHIP, RNG = camera(2)
+DARKS = dark_series(CHIP, (0.1, 0.2), 4, RNG)
 WELL_E = [500.0, 1000.0, 2000.0, 3000.0, 4000.0, 4500.0, 5000.0, 5500.0, 6000.0]
 
 
 def test_levels_at_the_converters_end_are_dropped() -> None:
     """A charge of 7600 e lies 5 standard deviations below the end, which nobody states, and 8020 e one."""
-    saturation = find_saturation(DARKS, take([1000.0, 4000.0, 7600.0, 8020.0, 8300.0, 9000.0]), np.inf)
+    saturation = find_saturation(DARKS, flats_of([1000.0, 4000.0, 7600.0, 8020.0, 8300.0, 9000.0]), np.inf)
     assert (saturation.limit, saturation.level_dn) == ("ADC", 4095.0)
     assert levels(saturation.kept) == [0, 1, 2]
     assert levels(series for series, _ in saturation.left_out) == [3, 4, 5]
@@ -146,7 +148,7 @@ def test_levels_at_the_converters_end_are_dropped() -> None:
 
 
 def test_full_well_shows_in_falling_noise() -> None:
-    saturation = find_saturation(DARKS, take(WELL_E, well_e=5000.0), 4095.0)
+    saturation = find_saturation(DARKS, flats_of(WELL_E, well_e=5000.0), 4095.0)
     assert saturation.limit == "full well"
     assert saturation.level_dn == pytest.approx(OFFSET_DN + GAIN * 4500, rel=0.02)
     assert saturation.interval_dn is not None
@@ -155,7 +157,7 @@ def test_full_well_shows_in_falling_noise() -> None:
 
 
 def test_unsaturated_flats_are_all_kept() -> None:
-    flats = take([500.0, 2000.0, 5000.0])
+    flats = flats_of([500.0, 2000.0, 5000.0])
     saturation = find_saturation(DARKS, flats, 4095.0)
     assert (saturation.limit, saturation.level_dn, saturation.interval_dn) == ("not reached", None, None)
     assert list(saturation.kept) == flats
@@ -163,8 +165,8 @@ def test_unsaturated_flats_are_all_kept() -> None:
 
 
 def test_only_saturated_flats_are_refused() -> None:
-    with pytest.raises(SaturatedFlat, match=r"^8300 0: .* of the flat's pixels stand at 4095 DN"):
-        find_saturation(DARKS, take([8300.0, 9000.0]), np.inf)
+    with pytest.raises(SaturatedFlat, match=r"^flat_0_0: .* of the flat's pixels stand at 4095 DN"):
+        find_saturation(DARKS, flats_of([8300.0, 9000.0]), np.inf)
 
 
 @pytest.mark.parametrize(
@@ -178,7 +180,7 @@ def test_only_saturated_flats_are_refused() -> None:
 def test_capacity_is_the_charge_at_the_end(
     charges_e: list[float], well_e: float, end_e: float, error: float, dropped: int
 ) -> None:
-    result = calibrate([*DARKS, *take(charges_e, well_e=well_e)], 4095.0)
+    result = calibrate([*DARKS, *flats_of(charges_e, well_e=well_e)], 4095.0)
     capacity = result.estimates["saturation_e"]
     assert capacity.ci95 is not None
     assert capacity.ci95[0] < end_e < capacity.ci95[1]
@@ -194,20 +196,12 @@ def test_capacity_is_the_charge_at_the_end(
     ids=["too much noise", "too little noise"],
 )
 def test_single_odd_series_is_no_full_well(level: int, factor: float, kept: list[int], words: str) -> None:
-    flats = take([1000.0, 2000.0, 3000.0, 4000.0, 5000.0, 6000.0])
+    flats = flats_of([1000.0, 2000.0, 3000.0, 4000.0, 5000.0, 6000.0])
     flats[level] = replace(flats[level], within_dn2=np.float32(factor) * flats[level].within_dn2)
     saturation = find_saturation(DARKS, flats, 4095.0)
     assert (saturation.limit, saturation.level_dn) == ("not reached", None)
     assert levels(saturation.kept) == kept
     assert words in saturation.left_out[0][1]
-
-
-def flat_of(charges_e: list[float], exposure_s: float, seed: int) -> Series:
-    rng, named = np.random.default_rng(seed), []
-    for k, charge in enumerate(charges_e):
-        dn = np.rint(OFFSET_DN + GAIN * (rng.poisson(charge, (48, 48)) + rng.normal(0, READ_E, (48, 48))))
-        named.append((f"{exposure_s:g} s {k}", dn.astype(np.uint16)))
-    return measure_series(named, Conditions("flat", exposure_s))
 
 
 def test_frames_of_two_lights_are_named() -> None:

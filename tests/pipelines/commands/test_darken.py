@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.formats.sets.elemental_set import load_set
-from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
-from faintfield.recon.likelihood.images import ElementalImages
-from tests.pipelines.conftest import Command, Edit, SetMaker
-from tests.pipelines.noise_sets import deviation_of_snr
-from tests.pipelines.refusals import assert_refused
+from tests.pipelines.by_hand import channels_of
+from tests.pipelines.conftest import Command, Edit, SetMaker, assert_refused
+from tests.pipelines.noise_sets import check_noise_of_eq_6, deviation_of_snr
 
 READ_VARIANCE_E2 = 12 + 1 / 48
 DARK_E = 0.02
@@ -30,14 +28,9 @@ def _scene_light(shape: tuple[int, int], generator: np.random.Generator) -> NDAr
     return np.asarray(np.where(disc, 0.6 + 1.5 * (detail - 0.5), 0.1))
 
 
-def _channels(folder: Path) -> dict[str, ElementalImages]:
-    elemental_set = load_set(folder)
-    return {layout.name: load_channel(elemental_set, layout) for layout in channel_layouts(elemental_set)}
-
-
 def _light(folder: Path) -> NDArray[np.float64]:
     """Return the light of a set's reference view, in electrons of the bright camera: (colour, row, column)."""
-    return np.array([np.maximum(images.electrons[0].astype(float), 0) for images in _channels(folder).values()])
+    return np.array([np.maximum(images.electrons[0].astype(float), 0) for images in channels_of(folder).values()])
 
 
 def _darken(done: Command, bright: Path, out: Path, *options: object) -> dict[str, float]:
@@ -82,16 +75,11 @@ def test_views_are_bright_ones_scaled_with_noise(
     ended = faintfield("darken", bright, tmp_path / "none", "--read-noise-e", 0, "--dark-current-e-per-s", 0)
     assert_refused(ended, "BadValue", "must both be positive")
     assert not (tmp_path / "none").exists()
-    bright_views, dark_views = (_channels(folder)["grey"].electrons for folder in (bright, tmp_path / "dark"))
+    bright_views, dark_views = (channels_of(folder)["grey"].electrons for folder in (bright, tmp_path / "dark"))
     expected = scale_e * np.maximum(bright_views.astype(float), 0) + DARK_E
-    variance = expected + READ_VARIANCE_E2
-    normalised = (dark_views - expected) / np.sqrt(variance)
-    for view in normalised:
-        assert abs(view.mean()) < 4 / np.sqrt(view.size)
-        deviation = np.sqrt(np.mean(2 + expected / variance**2) / view.size)
-        assert np.mean(view**2) == pytest.approx(1, abs=4 * deviation)
+    residuals = [check_noise_of_eq_6(*view, READ_VARIANCE_E2) for view in zip(dark_views, expected, strict=True)]
     # Noise is drawn anew for each view
-    first, second = (view.ravel() for view in normalised[:2])
+    first, second = (view.ravel() for view in residuals[:2])
     assert abs(np.corrcoef(first, second)[0, 1]) < 4 / np.sqrt(first.size)
 
 
@@ -128,7 +116,7 @@ def test_colour_stays_colour(make_set: SetMaker, tmp_path: Path, done: Command) 
     folder = make_set(views, name="bright")
     scale_e = _darken(done, folder, tmp_path / "dark", "--snr", 2)["scale_e"]
     assert read_frame(load_set(tmp_path / "dark").image_paths[0]).pixels_dn.shape == (150, 200, 3)
-    for index, images in enumerate(_channels(tmp_path / "dark").values()):
+    for index, images in enumerate(channels_of(tmp_path / "dark").values()):
         electrons = images.electrons
         expected = scale_e * _light(folder)[index].mean() + DARK_E
         deviation = np.sqrt((expected + READ_VARIANCE_E2) / electrons.size)
@@ -142,7 +130,7 @@ def test_mosaic_and_dark_pixels_stay(make_set: SetMaker, tmp_path: Path, done: C
     frame[1::2, 1::2] = 90  # no blue at all
     done("darken", make_set([frame], camera={"mosaic": ["RG", "GB"]}), tmp_path / "dark", "--snr", 5)
     assert load_set(tmp_path / "dark").settings.camera.mosaic == ("RG", "GB")
-    means = {name: images.electrons.mean() for name, images in _channels(tmp_path / "dark").items()}
+    means = {name: images.electrons.mean() for name, images in channels_of(tmp_path / "dark").items()}
     assert means["blue"] == pytest.approx(DARK_E, abs=4 * np.sqrt(READ_VARIANCE_E2 / (75 * 100)))
     assert min(means["red"], means["green"]) > 1.0
 
@@ -157,15 +145,8 @@ def test_views_with_colliding_names_stay_apart(
         write_frame(bright / name, np.full((150, 200), level, np.uint16))
     edit(bright, lambda settings: [settings["view"][i].update(image=name) for i, name in enumerate(names)])
     scale_e = _darken(done, bright, tmp_path / "dark")["scale_e"]
-    electrons = _channels(tmp_path / "dark")["grey"].electrons
+    electrons = channels_of(tmp_path / "dark")["grey"].electrons
     for view, level in enumerate(level_dn):
         expected = scale_e * (level - 100) / 2 + DARK_E
         deviation = np.sqrt((expected + READ_VARIANCE_E2) / electrons[view].size)
         assert electrons[view].mean(dtype=float) == pytest.approx(expected, abs=4 * deviation)
-
-
-@pytest.mark.parametrize("source", [".", "noise_free"])
-def test_set_is_never_replaced_by_its_derivative(source: str, scene: Path, faintfield: Command) -> None:
-    before = {path: path.read_bytes() for path in scene.rglob("*") if path.is_file()}
-    assert_refused(faintfield("darken", scene / source, scene, "--overwrite"), "OutputExists")
-    assert {path: path.read_bytes() for path in scene.rglob("*") if path.is_file()} == before

@@ -13,8 +13,8 @@ import pytest
 from faintfield.calib.board import Board
 from faintfield.calib.geometry import BoardObservation, GeometrySettings, Node, Target, calibrate_geometry
 from faintfield.pipelines.commands.board import board
-from faintfield.pipelines.commands.geometry import GeometrySummary, geometry
-from faintfield.pipelines.commands.imports.mrcal import import_mrcal
+from faintfield.pipelines.commands.geometry import geometry
+from faintfield.pipelines.commands.imports import import_mrcal
 from faintfield.pipelines.commands.simulate import simulate
 from faintfield.pipelines.errors import BadValue, InputError, MissingFile
 from faintfield.pipelines.formats.exchange.colmap import read_model
@@ -28,10 +28,10 @@ from faintfield.pipelines.formats.results.geometry import (
 from faintfield.pipelines.formats.sets.board_set import load_board_set
 from faintfield.pipelines.formats.sets.elemental_set import load_set, with_measured_geometry
 from faintfield.pipelines.formats.sets.ground_truth import read_truth
+from faintfield.pipelines.workflows.geometry import GeometrySummary
 from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
-from tests.pipelines.conftest import Command
+from tests.pipelines.conftest import Command, assert_refused, drawing_nothing
 from tests.pipelines.forms import check_layout
-from tests.pipelines.refusals import assert_refused
 from tests.simulated_boards import simulate_board_set
 
 BOARDS = [Board(f"b{index}", 9, 7, 40.0, 29.0, "DICT_4X4_250", 31 * index) for index in range(4)]
@@ -52,7 +52,8 @@ def measured(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pat
     truth = read_truth(scene)
     assert truth is not None
     simulate_board_set(folder, experiment, np.array(truth.true_rt_cam_ref), BOARDS, np.random.default_rng(1))
-    return folder, geometry(folder)
+    with drawing_nothing():
+        return folder, geometry(folder)
 
 
 def test_files_hold_true_poses(measured: tuple[Path, GeometrySummary], scene: Path) -> None:

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
-from tests.pipelines.conftest import Command
-from tests.pipelines.refusals import assert_refused
+from tests.pipelines.conftest import Command, assert_refused
 
 
 def _picture(value: int = 0, shape: tuple[int, ...] = (6, 8)) -> NDArray[np.uint16]:
@@ -88,20 +87,6 @@ def test_stated_turn_moves_pictures(tmp_path: Path, done: Command) -> None:
     assert [int(read_frame(path).pixels_dn[0, 0]) for path in elemental_set.image_paths] == [3, 0, 4, 1, 5, 2]
 
 
-@pytest.mark.parametrize(("suffix", "shape"), [("jpg", (24, 32)), ("tif", (24, 32, 3)), ("bmp", (24, 32, 3))])
-def test_8_bit_values_are_kept_in_16_bits(shape: tuple[int, ...], suffix: str, tmp_path: Path, done: Command) -> None:
-    (tmp_path / "src").mkdir()
-    source = tmp_path / "src" / f"view_r0_c0.{suffix}"
-    assert cv2.imwrite(str(source), np.random.default_rng(1).integers(0, 256, shape).astype(np.uint8))
-    done("import", "grid", tmp_path / "src", tmp_path / "out", "--linear")
-    elemental_set = load_set(tmp_path / "out")
-    assert elemental_set.settings.view[0].image == "view_r0_c0.tiff"
-    pixels = read_frame(elemental_set.image_paths[0]).pixels_dn
-    assert pixels.dtype == np.uint16
-    np.testing.assert_array_equal(pixels, read_frame(source).pixels_dn)
-    assert elemental_set.noise.saturation_dn == 255.0
-
-
 def test_noise_and_exposure_are_those_of_options(tmp_path: Path, done: Command) -> None:
     values = (0.25, 64.0, 3.0, 4.0, 0.5, 0.6)
     names = ("exposure-s", "offset-dn", "gain-dn-per-e", "read-noise-e", "dark-current-e-per-s", "quantum-efficiency")
@@ -116,25 +101,6 @@ def test_noise_and_exposure_are_those_of_options(tmp_path: Path, done: Command) 
     assert "estimated" not in (tmp_path / "out" / "elemental.toml").read_text()
     assert "assumed" not in ended.stderr
     assert json.loads((tmp_path / "out" / "provenance.json").read_text())["noise"] == {"how": "stated"}
-
-
-@pytest.mark.parametrize(
-    ("pitch", "unit", "depth_mm"), [(("--pitch-mm", 50), "mm", 2000.0), ((), "disparity_px", 1000.0)]
-)
-def test_aligned_pictures_see_plane_where_they_agree(
-    pitch: tuple[object, ...], unit: str, depth_mm: float, tmp_path: Path, done: Command
-) -> None:
-    """The depth of the plane is focal length times pitch over disparity."""
-    src = _pictures(tmp_path / "src", _grid_names(range(3), range(3)))
-    done("import", "grid", src, tmp_path / "out", "--disparity-px", 2.5, "--fx-px", 100, *pitch)
-    elemental_set = load_set(tmp_path / "out")
-    assert elemental_set.settings.units.depth == unit
-    assert elemental_set.depth_of_disparity(0.0) == pytest.approx(depth_mm, rel=1e-12)
-    # Where each view images a point of that plane: always at the same pixel
-    x_mm, y_mm = 30.0, -20.0
-    moved = elemental_set.poses_rt_cam_ref[:, 3:5] + [x_mm, y_mm]
-    pixels = 100.0 * moved / depth_mm + elemental_set.principal_points_px()
-    np.testing.assert_allclose(pixels, pixels[[4] * 9], atol=1e-9)
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -157,16 +123,6 @@ def test_point_is_sharp_at_its_disparity(tmp_path: Path, done: Command) -> None:
     assert np.argwhere(sharp == sharp.max()).tolist() == [[15, 20]]
     assert sharp.max() == pytest.approx(9000.0, rel=1e-3)
     assert blurred.max() < 0.2 * 9000
-
-
-def test_only_earlier_sets_are_replaced(tmp_path: Path, faintfield: Command) -> None:
-    src = _pictures(tmp_path / "src", ["view_r0_c0.png", "view_r0_c1.png"])
-    assert faintfield("import", "grid", src, tmp_path / "out").returncode == 0
-    assert faintfield("import", "grid", src, tmp_path / "out").returncode == 1
-    assert faintfield("import", "grid", src, tmp_path / "out", "--overwrite").returncode == 0
-    (src / "elemental.toml").touch()
-    assert_refused(faintfield("import", "grid", src, src, "--overwrite"), "OutputExists")
-    assert sorted(path.name for path in src.iterdir()) == ["elemental.toml", "view_r0_c0.png", "view_r0_c1.png"]
 
 
 def test_raw_file_is_kept_with_its_black_level(real_data: Path, tmp_path: Path, done: Command) -> None:

@@ -1,6 +1,5 @@
 """Light of imported pictures: tone curves undone, units, and gain and noise that nobody stated."""
 
-import json
 import re
 import struct
 import zlib
@@ -18,6 +17,7 @@ from faintfield.pipelines.formats.sets.elemental_file import Noise
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
 from tests.pipelines.conftest import Command
+from tests.pipelines.forms import read_record
 
 EVERY_VALUE = np.arange(256, dtype=np.uint8).reshape(16, 16)
 
@@ -141,10 +141,6 @@ def noisy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def origin(folder: Path) -> Any:
-    return json.loads((folder / "provenance.json").read_text())["noise"]
-
-
 def test_unstated_gain_and_noise_are_estimated(noisy: Path, tmp_path: Path, done: Command) -> None:
     words = done("import", "grid", noisy, tmp_path / "out", "--offset-dn", BLACK_DN).stderr
     noise = stated_noise(tmp_path / "out")
@@ -154,7 +150,7 @@ def test_unstated_gain_and_noise_are_estimated(noisy: Path, tmp_path: Path, done
     assert imported_light(tmp_path / "out")[0] == "dn"
     assert "estimated from the differences of neighbouring views" in words
     assert re.search(r"the variance of a pixel is \S+ · light \+ \S+², in DN$", words, re.MULTILINE)
-    record = origin(tmp_path / "out")
+    record = read_record(tmp_path / "out", "provenance.json")["noise"]
     assert record["how"] == "estimated"
     assert record["gain_dn"]["value"] == noise.gain_dn_per_e
     low, high = record["gain_dn"]["ci95"]
@@ -179,7 +175,7 @@ def test_noise_without_evidence_is_assumed_and_announced(tmp_path: Path, done: C
     assert "assumed that the variance of a pixel is 1 · light + 0², in DN; correct [noise] in elemental.toml" in words
     noise = stated_noise(tmp_path / "out")
     assert (noise.gain_dn_per_e, noise.read_noise_e, noise.estimated) == (1.0, 0.0, True)
-    assert origin(tmp_path / "out")["how"] == "assumed"
+    assert read_record(tmp_path / "out", "provenance.json")["noise"]["how"] == "assumed"
 
 
 def test_images_of_colmap_lose_their_curve_alike(tmp_path: Path, done: Command) -> None:

@@ -18,24 +18,17 @@ from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.frames import Frame
 from faintfield.pipelines.formats.results.noise import read_fitted_noise
 from tests.calib.noise.darkroom import specimen
-from tests.pipelines.forms import check_layout
+from tests.pipelines.forms import check_layout, read_record
 from tests.pipelines.noise_sets import measure_sensor, take_set, write_frames
 
 
-def json_result(folder: Path) -> dict[str, Any]:
-    result: dict[str, Any] = json.loads((folder / "noise.json").read_text())
-    return result
-
-
-def test_numbers_maps_and_page_are_written(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("faintfield.pipelines.pages.emva_page.emva_page", lambda *_, **__: "page")
+@pytest.mark.usefixtures("undrawn")
+def test_numbers_maps_and_page_are_written(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     chip, rng = specimen(1, hot_fraction=0.005, prnu=0.01)
     folder = write_frames(tmp_path / "set", take_set(chip, rng, photons=(4000.0, 20000.0)), saturation_dn=65535.0)
     assert run(["noise", str(folder), "--json"]) == 0
     out, err = capfd.readouterr()
-    result = json_result(folder)
+    result = read_record(folder, "noise.json")
     assert json.loads(out) | {"record_sha256": result["record_sha256"]} == result
     assert "K, system gain" in err
     assert result["gain_dn_per_e"]["value"] == pytest.approx(2, rel=0.03)
@@ -65,7 +58,7 @@ def test_unknown_numbers_are_null_with_reason(tmp_path: Path) -> None:
         del keys["temperature_c"]
     folder = write_frames(tmp_path, frames, region={"rows": [0, 64], "columns": [10, 64]})
     assert any("dark_00.tiff: no temperature" in warning for warning in measure_sensor(folder).warnings)
-    result = json_result(folder)
+    result = read_record(folder, "noise.json")
     assert result["temperature_c"] is None
     for name in ("gain_dn_per_e", "read_noise_e", "dark_current_e_per_s", "quantum_efficiency", "prnu"):
         assert result[name]["value"] is None
@@ -158,20 +151,6 @@ def test_real_ccd_is_as_published(real_data: Path, tmp_path: Path) -> None:
     assert result.read_noise_dn.value == pytest.approx(4.03, rel=0.005)
     assert result.dark_current_e_per_s.why is not None
     assert "black level drifted" in result.dark_current_e_per_s.why
-
-
-def test_raw_file_brings_mosaic_without_exposure(
-    real_data: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    """The EXIF of this file states no exposure; the decoder would make it 1 s."""
-    raw = real_data / "raw" / "colorchart.dng"
-    (tmp_path / "one.dng").write_bytes(raw.read_bytes())
-    entry = 'format = 1\n[[frame]]\nfile = "one.dng"\nkind = "dark"\n'
-    (tmp_path / "noise.toml").write_text(entry)
-    assert "one.dng: its exposure is neither stated nor in its EXIF" in failure_of(tmp_path, capfd)
-    (tmp_path / "noise.toml").write_text(entry + "exposure_s = 0.5\n")
-    assert "TooFewFrames: plane R_r0c0" in (line := failure_of(tmp_path, capfd))
-    assert "one.dng: the only one of the darks of 0.5 s" in line
 
 
 def test_masked_pixels_unlike_darks_raise_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

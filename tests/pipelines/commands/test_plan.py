@@ -11,9 +11,8 @@ import pytest
 import tifffile
 
 from faintfield.rig.simulation.sensor import SimulatedSensor
-from tests.pipelines.conftest import Command
-from tests.pipelines.formats.sets.test_noise_set import FITTED
-from tests.pipelines.refusals import assert_refused
+from tests.pipelines.by_hand import FITTED, write_fitted_noise
+from tests.pipelines.conftest import Command, assert_refused
 
 type Predict = Callable[..., dict[str, Any]]
 
@@ -174,7 +173,7 @@ def test_numbers_of_data_sheet_are_used(real: Path, predict: Predict) -> None:
 
 
 def test_calibration_gives_numbers_or_reasons(real: Path, tmp_path: Path, predict: Predict) -> None:
-    (tmp_path / "noise.json").write_text(json.dumps(FITTED | {"size_px": [400, 300], "quantum_efficiency": 0.5}))
+    write_fitted_noise(tmp_path, size_px=[400, 300], quantum_efficiency=0.5)
     prediction = predict(real, "--light-e", 1, "--fx-px", 500, "--depth-mm", 500)
     assert prediction["noise_from"] == str(tmp_path / "noise.json")
     assert prediction["photons"]["value"] == 2
@@ -207,7 +206,7 @@ def test_light_of_test_frame_has_interval(rig: Path, tmp_path: Path, predict: Pr
 
 
 def test_interval_includes_error_of_calibration(real: Path, tmp_path: Path, predict: Predict) -> None:
-    (tmp_path / "noise.json").write_text(json.dumps(FITTED))
+    write_fitted_noise(tmp_path)
     frame = write_frame(tmp_path / "test.tiff", 30.0, 2.0)
     words = (real, "--test-frame", frame, "--frame-exposure-ms", 2000)
     alone = predict(*words)["light_e"]
@@ -218,8 +217,7 @@ def test_interval_includes_error_of_calibration(real: Path, tmp_path: Path, pred
     names = ["offset_dn", "gain_dn_per_e", "read_noise_e", "dark_current_e_per_s"]
     matrix = np.diag([0.1**2, 0.01**2, 0.0, 0.01**2])
     matrix[0, 1] = matrix[1, 0] = 0.9 * 0.1 * 0.01
-    known = FITTED | {"covariance": {"names": names, "matrix": matrix.tolist()}}
-    (tmp_path / "noise.json").write_text(json.dumps(known))
+    write_fitted_noise(tmp_path, covariance={"names": names, "matrix": matrix.tolist()})
     together = predict(*words)["light_e"]["ci95"]
     calibrated += 2 * 0.9 * (0.1 / 2) * (30.4 * 0.01 / 2)
     assert (together[1] - together[0]) * 10 == pytest.approx(1.96 * math.sqrt(counted + calibrated), rel=0.02)

@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 import tifffile
 
-from faintfield.pipelines.cli import run
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import grey_levels, white_level
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
 from faintfield.recon.solver.penalties import total_variation
-from tests.pipelines.conftest import Command, Edit, drawing_nothing
+from tests.pipelines.conftest import Command, Edit, run_undrawn
 from tests.pipelines.forms import read_record
 
 pytestmark = pytest.mark.usefixtures("undrawn")
@@ -26,29 +25,16 @@ ONE_STEP_LATE = ("--method", "pmlem-osl", "--penalty-weight")
 METHODS = ("backprojection", "mlem", "pmlem-osl", "pmlem")
 
 
-def _run(*words: object) -> None:
-    with drawing_nothing():
-        assert run([str(word) for word in words]) == 0
-
-
 @pytest.fixture(scope="module")
-def larger_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """5 x 5 dark views of 96 x 72 px, to be read only."""
-    folder = tmp_path_factory.mktemp("larger") / "scene"
-    _run("simulate", folder, "--size-px", 96, 72, "--rows", 5, "--columns", 5)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def results(larger_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def results(dark_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Both planes of the larger scene by every method, to be read only."""
     out = tmp_path_factory.mktemp("results") / "planes"
     methods = (word for name in METHODS for word in ("--method", name))
-    _run("reconstruct", larger_scene, "--out", out, *DEPTHS, "--prior", "tv", *methods)
+    run_undrawn("reconstruct", dark_scene, "--out", out, *DEPTHS, "--prior", "tv", *methods)
     return out
 
 
-def test_results_and_inputs_of_methods_are_recorded(results: Path, larger_scene: Path) -> None:
+def test_results_and_inputs_of_methods_are_recorded(results: Path, dark_scene: Path) -> None:
     planes = {f"plane_{depth}.{suffix}" for depth in ("00500.0", "00700.0") for suffix in ("tiff", "png", "json")}
     own = {f"{method}/{name}" for method in METHODS for name in (*planes, "reconstruction.json")}
     overview = {"overview.json", "integral_image.png", "reference_view.png", "noise_reference.png"}
@@ -62,14 +48,14 @@ def test_results_and_inputs_of_methods_are_recorded(results: Path, larger_scene:
         assert (record["options"]["method"], record["options"]["depth_mm"]) == (method, [500.0, 700.0])
         assert set(record["inputs"]) == views | {"elemental.toml", "flat.tiff"}
         for name, digest in record["inputs"].items():
-            assert digest == hashlib.sha256((larger_scene / name).read_bytes()).hexdigest()
+            assert digest == hashlib.sha256((dark_scene / name).read_bytes()).hexdigest()
         assert set(record["versions"]) >= {"python", "faintfield", "numpy", "scipy", "numba"}
         assert record["wall_time_s"] > 0
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_record_of_plane_agrees_with_its_file(method: str, results: Path, larger_scene: Path) -> None:
-    elemental_set = load_set(larger_scene)
+def test_record_of_plane_agrees_with_its_file(method: str, results: Path, dark_scene: Path) -> None:
+    elemental_set = load_set(dark_scene)
     camera, (layout,) = elemental_set.settings.camera, channel_layouts(elemental_set)
     images = load_channel(elemental_set, layout)
     for plane in read_record(results / method)["planes"]:
@@ -159,18 +145,18 @@ def test_penalised_planes_have_a_third_of_the_error(results: Path) -> None:
 
 
 def test_errors_refer_to_noise_free_plane_and_texture(
-    results: Path, larger_scene: Path, tmp_path: Path, done: Command
+    results: Path, dark_scene: Path, tmp_path: Path, done: Command
 ) -> None:
-    noise_free = larger_scene / "noise_free"
+    noise_free = dark_scene / "noise_free"
     done("reconstruct", noise_free, "--out", tmp_path / "bright", *DEPTHS, "--method", "backprojection")
     metrics = json.loads((results / "metrics.json").read_text())
     for row in metrics["planes"]:
         name = f"{row['depth_mm']:07.1f}"
         plane = tifffile.imread(results / row["method"] / f"plane_{name}.tiff")
-        visible = read_frame(larger_scene / "truth" / f"visible_{name}.png").pixels_dn > 127
+        visible = read_frame(dark_scene / "truth" / f"visible_{name}.png").pixels_dn > 127
         against = {
             "mse_bright": tifffile.imread(tmp_path / "bright" / f"plane_{name}.tiff"),
-            "mse_texture": tifffile.imread(larger_scene / "truth" / f"plane_{name}.tiff"),
+            "mse_texture": tifffile.imread(dark_scene / "truth" / f"plane_{name}.tiff"),
         }
         for key, truth in against.items():
             error = np.mean(((plane - truth)[visible] / truth[visible].max()) ** 2, dtype=float)
@@ -192,17 +178,16 @@ def test_errors_of_earlier_planes_do_not_stay(scene: Path, tmp_path: Path, done:
     assert "Errors against the truth" not in (out / "report.html").read_text()
 
 
-def test_colour_set_gives_colour_planes(tmp_path: Path, done: Command, small_options: tuple[object, ...]) -> None:
-    done("simulate", tmp_path / "set", *small_options, "--colour", "bayer", "--snr", 20)
-    done("reconstruct", tmp_path / "set", "--out", tmp_path / "out", "--depth-mm", 500, "--method", "backprojection")
+def test_colour_set_gives_colour_planes(colour_set: Path, tmp_path: Path, done: Command) -> None:
+    done("reconstruct", colour_set, "--out", tmp_path / "out", "--depth-mm", 500, "--method", "backprojection")
     plane = tifffile.imread(tmp_path / "out" / "plane_00500.0.tiff")
-    assert plane.shape == (72, 96, 3)
+    assert plane.shape == (48, 64, 3)
     records = read_record(tmp_path / "out")["planes"]
     assert [record["channel"] for record in records] == ["red", "green", "blue"]
     for index, record in enumerate(records):
         assert record["mean_e"] == pytest.approx(plane[:, :, index].mean(dtype=float), rel=1e-5)
-    texture = tifffile.imread(tmp_path / "set" / "truth" / "plane_00500.0.tiff")
-    visible = read_frame(tmp_path / "set" / "truth" / "visible_00500.0.png").pixels_dn > 127
+    texture = tifffile.imread(colour_set / "truth" / "plane_00500.0.tiff")
+    visible = read_frame(colour_set / "truth" / "visible_00500.0.png").pixels_dn > 127
     for index in range(3):
         # Its own colour is nearer than those of the others, whose light it does not see
         nearest = [np.corrcoef(plane[visible][:, index], texture[visible][:, other])[0, 1] for other in range(3)]

@@ -1,33 +1,31 @@
 """`faintfield run` takes the options of `reconstruct`, and does again only what they change."""
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from unittest import mock
 
 import pytest
 
-from faintfield.pipelines.commands.run import run
 from faintfield.pipelines.launcher import app
 from faintfield.pipelines.reconstruction.options import Options
 from faintfield.pipelines.reconstruction.request import select_planes
-from faintfield.pipelines.reconstruction.surface_request import select_surface
+from faintfield.pipelines.reconstruction.surface.request import select_surface
 from faintfield.recon.errors import NothingInFocus
 from tests.pipelines.conftest import Command
 from tests.pipelines.forms import read_record
+from tests.pipelines.sessions import steps_run
 from tests.pipelines.surfaces import Searches
 
 pytestmark = pytest.mark.usefixtures("undrawn")
 
 _SEARCHED_MM = (400.0, 900.0)
-_QUICK: dict[str, Any] = {"prior": "tv", "penalty_weight": 0.1, "passes": 3}
-
-
-def _ran(session: Path, **options: Any) -> list[str]:
-    return [step.step for step in run(session, options=Options(**options)).steps if step.ran]
+_FAIL = mock.Mock(side_effect=NothingInFocus("begun"))
+_FAST = Options(method=["backprojection"], pitch_mm=16.0)
 
 
 def test_only_options_of_sets_are_missing_from_run() -> None:
     options = {
-        command: {name for one in app[command].assemble_argument_collection() for name in one.names}
+        command: {name for argument in app[command].assemble_argument_collection() for name in argument.names}
         for command in ("run", "reconstruct")
     }
     assert options["reconstruct"] - options["run"] == {"SESSION|SET", "--out", "--geometry", "--scene"}
@@ -56,64 +54,61 @@ def test_options_that_exclude_each_other_are_refused(recorded_session: Path, fai
         assert len(ended.stderr.splitlines()) == 1
 
 
-def _fail(*_: object) -> None:
-    raise NothingInFocus("begun")
-
-
 def test_planes_solved_together_are_made_once(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: dict[str, Any] = {"depth_mm": [500.0, 700.0], "joint": True, "uncertainty": True, "pitch_mm": 16.0, **_QUICK}
-    assert _ran(session, **asked) == ["reconstruct"]
+    quick = Options(depth_mm=[500.0, 700.0], pitch_mm=16.0, prior="tv", penalty_weight=0.1, passes=3)
+    asked = replace(quick, joint=True, uncertainty=True)
+    assert steps_run(session, asked) == ["reconstruct"]
     record = read_record(session / "reconstructions")
     assert {plane["method"] for plane in record["planes"]} == {"joint"}
     assert all((session / "reconstructions" / plane["sigma_file"]).is_file() for plane in record["planes"])
-    assert _ran(session, **asked) == []
-    monkeypatch.setattr("faintfield.pipelines.reconstruction.tasks.solve_together", _fail)
+    assert steps_run(session, asked) == []
+    monkeypatch.setattr("faintfield.pipelines.reconstruction.planes.tasks.solve_together", _FAIL)
     with pytest.raises(NothingInFocus, match="begun"):
-        _ran(session, **{**asked, "uncertainty": False}, likelihood="poisson")
+        steps_run(session, replace(asked, uncertainty=False, likelihood="poisson"))
 
 
 def test_depths_are_searched_only_once(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in ("autofocus", "request"):
+    for module in ("depth.autofocus", "request"):
         monkeypatch.setattr(f"faintfield.pipelines.reconstruction.{module}.searched_range_mm", lambda _: _SEARCHED_MM)
-    asked: dict[str, Any] = {"method": ["backprojection"], "pitch_mm": 16.0}
-    assert _ran(session, depth_mm=["auto"], **asked) == ["reconstruct"]
+    asked = replace(_FAST, depth_mm=["auto"])
+    assert steps_run(session, asked) == ["reconstruct"]
     record = read_record(session / "reconstructions")
     depth_mm = record["best_focus"]["depth_mm"]
     assert record["options"]["depth_mm"] == depth_mm
     assert depth_mm == pytest.approx([500.0, 700.0], rel=0.01)
     assert record["best_focus"]["searched_mm"] == [[*_SEARCHED_MM]]
-    monkeypatch.setattr("faintfield.pipelines.reconstruction.request.best_focus", _fail)
-    assert _ran(session, depth_mm=["auto"], **asked) == []
-    assert _ran(session, depth=["auto"], **asked) == []
-    for other in ({"sweep_mm": "450:900:3"}, {"passes": 7}):
+    monkeypatch.setattr("faintfield.pipelines.reconstruction.request.best_focus", _FAIL)
+    assert steps_run(session, asked) == []
+    assert steps_run(session, replace(_FAST, depth=["auto"])) == []
+    for other in (replace(asked, sweep_mm="450:900:3"), replace(asked, passes=7)):
         with pytest.raises(NothingInFocus, match="begun"):
-            _ran(session, depth_mm=["auto"], **asked, **other)
+            steps_run(session, other)
 
 
 @pytest.mark.deep
 def test_range_of_sweep_is_searched_only_once(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     range_found = "faintfield.pipelines.reconstruction.request.found_range_mm"
     monkeypatch.setattr(range_found, lambda *_: (497.0, 503.0))
-    asked: dict[str, Any] = {"sweep": "auto", "method": ["backprojection"], "pitch_mm": 16.0}
-    assert _ran(session, **asked) == ["reconstruct"]
+    asked = replace(_FAST, sweep="auto")
+    assert steps_run(session, asked) == ["reconstruct"]
     options = read_record(session / "reconstructions")["options"]
     depths = options["depth_mm"]
     assert options["auto_sweep"] == len(depths)
     assert (depths[0], depths[-1]) == (497.0, 503.0)
-    monkeypatch.setattr(range_found, _fail)
-    assert _ran(session, **asked) == []
-    assert _ran(session, **{**asked, "sweep": None, "depth_mm": depths}) == ["reconstruct"]
+    monkeypatch.setattr(range_found, _FAIL)
+    assert steps_run(session, asked) == []
+    assert steps_run(session, replace(_FAST, depth_mm=depths)) == ["reconstruct"]
     assert "auto_sweep" not in read_record(session / "reconstructions")["options"]
 
 
 @pytest.mark.deep
 def test_depth_map_of_disparities_is_made_once(seen: Searches, session: Path) -> None:
-    asked: dict[str, Any] = {"sweep_px": "-60:-50:5", "depth_map": True, "method": ["backprojection"], "pitch_mm": 16.0}
-    assert _ran(session, **asked) == ["reconstruct"]
+    asked = replace(_FAST, sweep_px="-60:-50:5", depth_map=True)
+    assert steps_run(session, asked) == ["reconstruct"]
     assert len(read_record(session / "reconstructions")["planes"]) == 5
-    assert _ran(session, **asked) == []
+    assert steps_run(session, asked) == []
     (session / "reconstructions" / "disparity_px.tiff").unlink()
-    assert _ran(session, **asked) == ["reconstruct"]
+    assert steps_run(session, asked) == ["reconstruct"]
 
 
 def test_prior_applies_to_planes_and_surface() -> None:

@@ -2,13 +2,14 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
 
-from faintfield.pipelines.commands.exports.colmap import export_colmap
-from faintfield.pipelines.commands.exports.mrcal import export_mrcal
+from faintfield.pipelines.commands.exports import export_colmap, export_mrcal
 from faintfield.pipelines.commands.reconstruct import reconstruct
 from faintfield.pipelines.commands.run import run
 from faintfield.pipelines.commands.verify import verify as verify_all
@@ -22,26 +23,14 @@ from faintfield.pipelines.reconstruction.options import Options
 from faintfield.rig.errors import SessionCorrupt
 from faintfield.rig.session.session import taken_frames
 from faintfield.rig.session.verify import verify
-from tests.pipelines.sessions import SWEEPS, captured, rig_toml
+from tests.pipelines.forms import flip_last_bit
+from tests.pipelines.sessions import SWEEPS, captured, rig_toml, steps_run
 
 pytestmark = pytest.mark.usefixtures("undrawn")
 
-
-def _options(depth_mm: float = 700.0) -> Options:
-    return Options(depth_mm=[depth_mm], method=["backprojection"])
-
-
-def _ran(session: Path, depth_mm: float = 700.0) -> list[str]:
-    return [step.step for step in run(session, options=_options(depth_mm)).steps if step.ran]
-
-
-def _flip_last_bit(path: Path) -> None:
-    content = path.read_bytes()
-    path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
-
-
-def _refuse(*_: object, **__: object) -> None:
-    raise BadValue("begun; wait")
+PLANE = Options(depth_mm=[700.0], method=["backprojection"])
+OTHER_PLANE = replace(PLANE, depth_mm=[500.0])
+REFUSE = mock.Mock(side_effect=BadValue("begun; wait"))
 
 
 def test_geometry_of_session_is_where_its_camera_was(calibrated_session: Path) -> None:
@@ -79,7 +68,7 @@ def test_missing_frames_and_results_are_named(session: Path, tmp_path: Path) -> 
     for name in ("noise", "geometry"):  # the geometry is missed first
         (session / f"{name}.json").unlink()
         with pytest.raises(MissingFile, match=rf"{name}.json: no such file; run `faintfield {name}"):
-            reconstruct(session, options=_options())
+            reconstruct(session, options=PLANE)
     with pytest.raises(BadValue, match=r"no bright frame of the centre node \[1, 1\]"):
         load_session(session, "bright")
     load: Callable[[Path], object]
@@ -93,14 +82,14 @@ class TestRun:
     """`faintfield run`: only what is out of date, by hash."""
 
     def test_exactly_dependent_steps_run_again(self, session: Path) -> None:
-        assert _ran(session) == []
+        assert steps_run(session, PLANE) == []
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("faintfield.pipelines.pages.report.write_report", _refuse)
+            patch.setattr("faintfield.pipelines.workflows.reconstruct.write_report", REFUSE)
             with pytest.raises(BadValue, match="begun"):
-                _ran(session, 500.0)
-        assert _ran(session, 500.0) == ["report"], "that of the earlier planes is outdated"
+                steps_run(session, OTHER_PLANE)
+        assert steps_run(session, OTHER_PLANE) == ["report"], "that of the earlier planes is outdated"
         next((session / "frames").glob("*_dark_scene_0_r0_c0_*")).touch()
-        assert _ran(session, 500.0) == []
+        assert steps_run(session, OTHER_PLANE) == []
 
     def test_altered_frame_is_named_and_begins_its_step(
         self, session: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -111,20 +100,20 @@ class TestRun:
             pixels[10, 20] += 7
             write_frame(frame, pixels)
             if kind == "dark_scene":
-                assert _ran(session) == ["reconstruct"]
+                assert steps_run(session, PLANE) == ["reconstruct"]
                 assert f"warning: frames/{frame.name} and 0 other frames are not what was" in capsys.readouterr().err
-        monkeypatch.setattr("faintfield.pipelines.commands.run.noise", _refuse)
+        monkeypatch.setattr("faintfield.pipelines.workflows.session.measure_sensor", REFUSE)
         with pytest.raises(BadValue, match="still to be done: noise, reconstruct, report"):
-            _ran(session)
+            steps_run(session, PLANE)
 
     def test_missing_and_unreadable_results_are_made_again(self, session: Path) -> None:
         (session / "reconstructions" / "report.html").unlink()
-        assert _ran(session) == ["report"]
+        assert steps_run(session, PLANE) == ["report"]
         for damaged in ('{"format": 1,', '{"inputs": 3}'):
             (session / "reconstructions" / "reconstruction.json").write_text(damaged)
-            assert _ran(session) == ["reconstruct"]
-        _flip_last_bit(session / "reconstructions" / "plane_00700.0.tiff")
-        assert _ran(session) == ["reconstruct"]
+            assert steps_run(session, PLANE) == ["reconstruct"]
+        flip_last_bit(session / "reconstructions" / "plane_00700.0.tiff")
+        assert steps_run(session, PLANE) == ["reconstruct"]
         assert verify(session).problems == ()
 
     @pytest.mark.deep
@@ -140,8 +129,8 @@ class TestRun:
         (session / "cameras" / "node_r0_c1.cameramodel").unlink()
         beside = ("noise_maps.npz", "reconstructions/plane_00700.0.tiff")
         for name in beside:
-            _flip_last_bit(session / name)
-        assert _ran(session) == ["noise", "geometry", "reconstruct"]
+            flip_last_bit(session / name)
+        assert steps_run(session, PLANE) == ["noise", "geometry", "reconstruct"]
         assert "noise: noise.json: was altered after it was written" in capsys.readouterr().err
         assert verify_all(session).results is not None
         for name in (*results[:3], *beside, "cameras/node_r0_c1.cameramodel"):
@@ -149,26 +138,26 @@ class TestRun:
 
     def test_other_lens_or_maps_begin_their_step(self, session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         with monkeypatch.context() as patch:
-            patch.setattr("faintfield.pipelines.commands.run.geometry", _refuse)
+            patch.setattr("faintfield.pipelines.workflows.session.measure_stage", REFUSE)
             with pytest.raises(BadValue, match="begun"):
-                run(session, options=_options(), lens="opencv4")
-        _flip_last_bit(session / "noise_maps.npz")
-        monkeypatch.setattr("faintfield.pipelines.commands.run.noise", _refuse)
+                run(session, options=PLANE, lens="opencv4")
+        flip_last_bit(session / "noise_maps.npz")
+        monkeypatch.setattr("faintfield.pipelines.workflows.session.measure_sensor", REFUSE)
         with pytest.raises(BadValue, match="begun"):
-            _ran(session)
+            steps_run(session, PLANE)
 
     def test_failed_step_skips_only_its_dependents(self, session: Path, capsys: pytest.CaptureFixture[str]) -> None:
         for path in (session / "geometry.json", *(session / "frames").glob("*_charuco_*")):
             path.unlink()
         with pytest.raises(MissingFile, match=r"run `faintfield run .*still to be done: geometry, reconstruct, report"):
-            _ran(session, 500.0)
+            steps_run(session, OTHER_PLANE)
         assert "reconstruct: skipped, because it needs geometry" in capsys.readouterr().err
 
     def test_call_without_depths_or_session_is_refused(self, recorded_session: Path, tmp_path: Path) -> None:
         with pytest.raises(WrongUsage, match=r"give --depth-mm or --sweep-mm"):
             run(recorded_session)
         with pytest.raises(MissingFile, match="holds no session"):
-            run(tmp_path, options=_options())
+            run(tmp_path, options=PLANE)
 
 
 def test_session_is_verified_with_its_results(recorded_session: Path, session: Path) -> None:
@@ -180,10 +169,10 @@ def test_session_is_verified_with_its_results(recorded_session: Path, session: P
     assert (found.results.problems, found.results.unchecked) == ((), ())
     assert found.results.inputs > found.session.planned
     for name in ("noise_maps.npz", "reconstructions/plane_00700.0.tiff"):
-        _flip_last_bit(session / name)
+        flip_last_bit(session / name)
         with pytest.raises(ResultDamaged, match=f"{name}: was altered"):
             verify_all(session)
-        _flip_last_bit(session / name)
+        flip_last_bit(session / name)
     next((session / "frames").glob("*_flat_0_*")).write_bytes(b"another")
     with pytest.raises(ResultDamaged, match=r"_flat_0_.* was altered since it was made from it"):
         verify_all(session / "noise.json")

@@ -2,8 +2,8 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -11,27 +11,23 @@ import pytest
 import tifffile
 
 from faintfield.pipelines.commands.reconstruct import reconstruct
-from faintfield.pipelines.commands.run import run
 from faintfield.pipelines.commands.verify import verify
 from faintfield.pipelines.reconstruction.options import Options
 from faintfield.recon.errors import NothingInFocus
+from tests.pipelines.sessions import steps_run
 from tests.pipelines.surfaces import FOUND_MM, Searches
 
-RANGE = "400:900"
-
+ASKED = Options(surface=True, depth_range_mm="400:900", penalty_weight=0.5, passes=2)
+WITH_PLANE = replace(ASKED, depth_mm=[700.0], method=["backprojection"], pitch_mm=16.0)
+OTHER_PLANE = replace(WITH_PLANE, depth_mm=[500.0])
+OTHER_RANGE = replace(ASKED, depth_range_mm="400:1000")
 
 pytestmark = pytest.mark.usefixtures("undrawn")
 
 
-def _ran(session: Path, *, depth_mm: list[float] | None = None, depth_range_mm: str = RANGE) -> list[str]:
-    planes: dict[str, Any] = {"depth_mm": depth_mm, "method": ["backprojection"], "pitch_mm": 16.0} if depth_mm else {}
-    asked = Options(surface=True, depth_range_mm=depth_range_mm, penalty_weight=0.5, passes=2, **planes)
-    return [step.step for step in run(session, options=asked).steps if step.ran]
-
-
 def test_only_outdated_surface_is_made_again(seen: Searches, session: Path) -> None:
     out = session / "reconstructions"
-    assert _ran(session, depth_mm=[700.0]) == ["reconstruct", "surface"]
+    assert steps_run(session, WITH_PLANE) == ["reconstruct", "surface"]
     page = (out / "report.html").read_text()
     assert 'id="surface"' in page
     assert "700 mm" in page
@@ -39,44 +35,45 @@ def test_only_outdated_surface_is_made_again(seen: Searches, session: Path) -> N
     record = json.loads((out / "surface" / "surface.json").read_bytes())
     assert (record["command"], record["options"]["poses"]) == ("reconstruct", "measured")
     assert verify(session).results is not None
-    assert _ran(session, depth_mm=[700.0]) == []
-    assert _ran(session, depth_mm=[700.0], depth_range_mm="900:400") == []
-    assert _ran(session, depth_mm=[500.0]) == ["reconstruct"]
+    assert steps_run(session, WITH_PLANE) == []
+    assert steps_run(session, replace(WITH_PLANE, depth_range_mm="900:400")) == []
+    assert steps_run(session, OTHER_PLANE) == ["reconstruct"]
     assert len(seen) == 1
     (out / "surface" / "visibility.tiff").unlink()
-    assert _ran(session, depth_mm=[500.0]) == ["surface"]
+    assert steps_run(session, OTHER_PLANE) == ["surface"]
 
 
 def test_run_keeps_surface_of_reconstruct(seen: Searches, session: Path) -> None:
     shutil.rmtree(session / "reconstructions")
-    reconstruct(session, options=Options(surface=True, depth_range_mm=RANGE, penalty_weight=0.5, passes=2))
-    assert _ran(session) == []
+    reconstruct(session, options=ASKED)
+    assert steps_run(session, ASKED) == []
     assert {path.name for path in (session / "reconstructions").iterdir()} == {"surface", "report.html"}
     assert not (session / "reconstructions" / "surface" / "report.html").exists()
     (session / "reconstructions" / "report.html").unlink()
-    assert _ran(session) == ["report"]
+    assert steps_run(session, ASKED) == ["report"]
 
 
 @pytest.mark.deep
 def test_interrupt_leaves_no_page_of_earlier_surface(
     seen: Searches, session: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    _ran(session)
+    steps_run(session, ASKED)
 
     with monkeypatch.context() as patch:
-        patch.setattr("faintfield.pipelines.pages.report.write_report", mock.Mock(side_effect=KeyboardInterrupt))
+        interrupt = mock.Mock(side_effect=KeyboardInterrupt)
+        patch.setattr("faintfield.pipelines.workflows.reconstruct.write_report", interrupt)
         with pytest.raises(KeyboardInterrupt):
-            _ran(session, depth_range_mm="400:1000")
+            steps_run(session, OTHER_RANGE)
     assert not (session / "reconstructions" / "report.html").exists()
     (session / "reconstructions" / "surface" / ".picture.tiff.0123abcd.unfinished").touch()
-    assert _ran(session, depth_range_mm="400:1000") == ["report"]
+    assert steps_run(session, OTHER_RANGE) == ["report"]
     assert not list((session / "reconstructions" / "surface").glob(".*"))
 
 
 def test_failed_surface_leaves_planes(seen: Searches, session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     nothing = mock.Mock(side_effect=NothingInFocus("nothing there; use more light"))
-    monkeypatch.setattr("faintfield.pipelines.reconstruction.surface_depths.estimate_surface", nothing)
+    monkeypatch.setattr("faintfield.pipelines.reconstruction.depth.search.estimate_surface", nothing)
     with pytest.raises(NothingInFocus, match=r"more light; mend that .* still to be done: surface, report"):
-        _ran(session, depth_mm=[500.0])
+        steps_run(session, OTHER_PLANE)
     assert "500 mm" in (session / "reconstructions" / "report.html").read_text()
     assert not (session / "reconstructions" / "surface").exists()

@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,13 +10,14 @@ from numpy.typing import NDArray
 from faintfield.pipelines.errors import InputError
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.sets.elemental_set import load_set
-from faintfield.pipelines.formats.sets.ground_truth import read_truth
+from faintfield.pipelines.formats.sets.ground_truth import Truth, read_truth
 from faintfield.pipelines.reconstruction.overview import brightness
 from faintfield.recon.metrics import photons_from_linear_snr, photons_from_moments
 from faintfield.rig.simulation.experiment import paper_experiment
 from faintfield.rig.simulation.scene import render
-from tests.pipelines.conftest import Command
-from tests.pipelines.noise_sets import deviation_of_snr
+from tests.pipelines.conftest import SMALL, Command
+from tests.pipelines.forms import files_in, read_record
+from tests.pipelines.noise_sets import check_noise_of_eq_6, deviation_of_snr
 
 # The paper's camera
 READ_NOISE_E, ETA, DARK_E, GAIN, OFFSET_DN = 12**0.5, 0.5, 0.2 * 0.1, 2.0, 100.0
@@ -25,18 +25,15 @@ READ_NOISE_E, ETA, DARK_E, GAIN, OFFSET_DN = 12**0.5, 0.5, 0.2 * 0.1, 2.0, 100.0
 READ_VARIANCE_E2 = 12 + 1 / 12 / GAIN**2
 
 
-def _truth(folder: Path) -> dict[str, Any]:
-    truth: dict[str, Any] = json.loads((folder / "truth.json").read_text())
+def _truth(folder: Path) -> Truth:
+    truth = read_truth(folder)
+    assert truth is not None
     return truth
 
 
 def _electrons(folder: Path) -> NDArray[np.float32]:
     elemental_set = load_set(folder)
     return np.stack([elemental_set.noise.electrons(read_frame(path).pixels_dn) for path in elemental_set.image_paths])
-
-
-def _all_files(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 VIEWS = {f"view_r{row}_c{column}.tiff" for row in range(3) for column in range(3)}
@@ -49,18 +46,16 @@ FILES = {
 
 def test_set_holds_views_noise_reference_and_truth(simulated_scene: Path) -> None:
     truth = {f"truth/{name}" for z in ("00500.0", "00700.0") for name in (f"plane_{z}.tiff", f"visible_{z}.png")}
-    assert set(_all_files(simulated_scene)) == FILES | truth
+    assert set(files_in(simulated_scene)) == FILES | truth
     for name in (*VIEWS, "noise_reference.tiff"):
         frame = read_frame(simulated_scene / name).pixels_dn
         assert frame.shape == (72, 96)
         assert frame.dtype == np.uint16
 
 
-def test_other_seed_gives_other_noise(
-    simulated_scene: Path, tmp_path: Path, done: Command, small_options: tuple[object, ...]
-) -> None:
-    done("simulate", tmp_path / "other", *small_options, "--seed", 2)
-    first, other = (_all_files(folder) for folder in (simulated_scene, tmp_path / "other"))
+def test_other_seed_gives_other_noise(simulated_scene: Path, tmp_path: Path, done: Command) -> None:
+    done("simulate", tmp_path / "other", *SMALL, "--seed", 2)
+    first, other = (files_in(folder) for folder in (simulated_scene, tmp_path / "other"))
     assert set(first) == set(other)
     same = {name for name in first if first[name] == other[name]}
     # What chance has no part in: the lens, and what the reference camera would see of each object
@@ -70,25 +65,18 @@ def test_other_seed_gives_other_noise(
 
 def test_noise_free_set_holds_electrons_of_rays(simulated_scene: Path) -> None:
     truth, experiment = _truth(simulated_scene), paper_experiment(96, 72).grey()
-    light = [view.light for view in render(experiment.planes, experiment.optics, np.array(truth["true_rt_cam_ref"]))]
+    light = [view.light for view in render(experiment.planes, experiment.optics, np.array(truth.true_rt_cam_ref))]
     region = read_frame(simulated_scene / "object_region.png").pixels_dn > 127
-    scale_e = truth["photons_on_object"] * ETA / light[4][region].mean(dtype=float)
+    scale_e = truth.photons_on_object * ETA / light[4][region].mean(dtype=float)
     found, expected = _electrons(simulated_scene / "noise_free"), np.stack(light) * scale_e
     np.testing.assert_allclose(found, expected, atol=0.51 / 60_000 * expected.max())  # 16 bits, rounded
     settings = load_set(simulated_scene / "noise_free").settings
-    np.testing.assert_array_equal([view.rt_cam_ref for view in settings.view], truth["true_rt_cam_ref"])
+    np.testing.assert_array_equal([view.rt_cam_ref for view in settings.view], truth.true_rt_cam_ref)
 
 
 def test_dark_views_have_noise_of_eq_6(simulated_scene: Path) -> None:
     expected = _electrons(simulated_scene / "noise_free").astype(float) + DARK_E
-    residual = _electrons(simulated_scene) - expected
-    variance = expected + READ_VARIANCE_E2
-    normalised = residual / np.sqrt(variance)
-    count = normalised.size
-    assert abs(normalised.mean()) < 4 / np.sqrt(count)
-    # A nearly normal number's square has the variance 2, and a Poisson count of mean μ adds μ / variance² to it
-    deviation = np.sqrt(np.mean(2 + expected / variance**2) / count)
-    assert np.mean(normalised**2) == pytest.approx(1, abs=4 * deviation)
+    check_noise_of_eq_6(_electrons(simulated_scene), expected, READ_VARIANCE_E2)
 
 
 @pytest.mark.parametrize("snr", [0.16, 20.0])
@@ -109,12 +97,12 @@ def test_measured_snr_is_that_asked_for(snr: float, tmp_path: Path, done: Comman
 def test_photons_are_stated_by_formula_and_by_count(simulated_scene: Path) -> None:
     truth = _truth(simulated_scene)
     known = {"quantum_efficiency": ETA, "read_noise_e": READ_NOISE_E}
-    assert truth["photons_linear"] == pytest.approx(photons_from_linear_snr(0.16, **known))
-    assert truth["photons_linear"] == pytest.approx(3.84)
-    assert truth["photons_from_moments"] == pytest.approx(photons_from_moments(0.16, dark_e=DARK_E, **known))
+    assert truth.photons_linear == pytest.approx(photons_from_linear_snr(0.16, **known))
+    assert truth.photons_linear == pytest.approx(3.84)
+    assert truth.photons_from_moments == pytest.approx(photons_from_moments(0.16, dark_e=DARK_E, **known))
     region = read_frame(simulated_scene / "object_region.png").pixels_dn > 127
     on_object = _electrons(simulated_scene / "noise_free")[4][region].mean(dtype=float) / ETA
-    assert truth["photons_on_object"] == pytest.approx(on_object, rel=1e-4)
+    assert truth.photons_on_object == pytest.approx(on_object, rel=1e-4)
 
 
 def test_truth_planes_are_seen_in_reference_view(simulated_scene: Path) -> None:
@@ -125,10 +113,10 @@ def test_truth_planes_are_seen_in_reference_view(simulated_scene: Path) -> None:
     flat = read_frame(simulated_scene / "flat.tiff").pixels_dn
     seen = np.rint(rays @ np.diag([lens.fx_px, lens.fy_px]) + [lens.cx_px, lens.cy_px]).astype(int)
     inside = ((seen >= 1) & (seen < (95, 71))).all(axis=2)
-    assert [(plane["name"], plane["depth_mm"]) for plane in truth["planes"]] == [("truck", 500.0), ("airplane", 700.0)]
-    for plane in truth["planes"]:
-        texture = read_frame(simulated_scene / plane["texture"]).pixels_dn
-        visible = read_frame(simulated_scene / plane["visible"]).pixels_dn > 127
+    assert [(plane.name, plane.depth_mm) for plane in truth.planes] == [("truck", 500.0), ("airplane", 700.0)]
+    for plane in truth.planes:
+        texture = read_frame(simulated_scene / plane.texture).pixels_dn
+        visible = read_frame(simulated_scene / plane.visible).pixels_dn > 127
         assert texture.dtype == np.float32
         assert 0.03 < visible.mean() < 0.3
         column, row = seen[inside].T
@@ -139,19 +127,17 @@ def test_truth_planes_are_seen_in_reference_view(simulated_scene: Path) -> None:
         assert abs(difference.mean()) < 0.02 * texture[visible].mean()
 
 
-def test_set_states_true_or_nominal_poses(
-    simulated_scene: Path, tmp_path: Path, done: Command, small_options: tuple[object, ...]
-) -> None:
-    done("simulate", tmp_path / "set", *small_options, "--poses", "nominal")
+def test_set_states_true_or_nominal_poses(simulated_scene: Path, tmp_path: Path, done: Command) -> None:
+    done("simulate", tmp_path / "set", *SMALL, "--poses", "nominal")
     nodes = np.array([view.node for view in load_set(simulated_scene).settings.view])
     nominal = np.zeros((9, 6))
     nominal[:, 3:5] = 50.0 * (1 - nodes[:, ::-1])
-    true = np.array(_truth(simulated_scene)["true_rt_cam_ref"])
+    true = np.array(_truth(simulated_scene).true_rt_cam_ref)
     for folder, poses, stated in ((simulated_scene, "true", true), (tmp_path / "set", "nominal", nominal)):
-        assert _truth(folder)["poses"] == poses
+        assert _truth(folder).poses == poses
         np.testing.assert_array_equal(load_set(folder).poses_rt_cam_ref, stated)
     options = ("--position-error-mm", 0, "--rotation-error-mrad", 0, "--pitch-mm", 20)
-    done("simulate", tmp_path / "perfect", *small_options, *options)
+    done("simulate", tmp_path / "perfect", *SMALL, *options)
     poses_of_perfect = load_set(tmp_path / "perfect").poses_rt_cam_ref
     assert np.unique(poses_of_perfect[:, 3:5]).tolist() == [-20.0, 0.0, 20.0]
     assert not poses_of_perfect[:, [0, 1, 2, 5]].any()
@@ -162,59 +148,31 @@ def test_set_states_true_or_nominal_poses(
     assert errors[:, :3].std() == pytest.approx(3.5e-3, rel=4 / np.sqrt(48))
 
 
-def test_bayer_pixel_has_colour_of_its_filter(tmp_path: Path, done: Command, small_options: tuple[object, ...]) -> None:
-    done("simulate", tmp_path / "set", *small_options, "--colour", "bayer")
-    assert load_set(tmp_path / "set").settings.camera.mosaic == ("RG", "GB")
-    truth, experiment = _truth(tmp_path / "set"), paper_experiment(96, 72)
-    colours = next(render(experiment.planes, experiment.optics, np.array(truth["true_rt_cam_ref"])[4:5])).light
-    found = _electrons(tmp_path / "set" / "noise_free")[4]
+def test_bayer_pixel_has_colour_of_its_filter(colour_set: Path) -> None:
+    assert load_set(colour_set).settings.camera.mosaic == ("RG", "GB")
+    truth, experiment = _truth(colour_set), paper_experiment(64, 48)
+    colours = next(render(experiment.planes, experiment.optics, np.array(truth.true_rt_cam_ref)[4:5])).light
+    found = _electrons(colour_set / "noise_free")[4]
     scale_e = found.sum() / sum(
         colours[r::2, c::2, i].sum() for r, c, i in ((0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 2))
     )
     for row, column, colour in ((0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 2)):
         expected = scale_e * colours[row::2, column::2, colour]
         np.testing.assert_allclose(found[row::2, column::2], expected, atol=2e-4 * found.max())
-    assert read_frame(tmp_path / "set" / "truth" / "plane_00500.0.tiff").pixels_dn.shape == (72, 96, 3)
-
-
-def test_folder_of_other_files_is_never_overwritten(
-    tmp_path: Path, faintfield: Command, small_options: tuple[object, ...]
-) -> None:
-    (tmp_path / "theirs").mkdir()
-    (tmp_path / "theirs" / "thesis.tex").write_text("years of work")
-    before = _all_files(tmp_path)
-    for options in ((), ("--overwrite",)):
-        ended = faintfield("simulate", tmp_path / "theirs", *small_options, *options)
-        assert ended.returncode == 1
-        assert "OutputExists" in ended.stderr
-    assert _all_files(tmp_path) == before
-
-
-def test_same_seed_replaces_set_when_asked(
-    scene: Path, faintfield: Command, done: Command, small_options: tuple[object, ...]
-) -> None:
-    before = _all_files(scene)
-    (scene / "stale.txt").touch()
-    assert faintfield("simulate", scene, *small_options).returncode == 1
-    assert _all_files(scene) == {**before, "stale.txt": b""}
-    done("simulate", scene, *small_options, "--overwrite")
-    assert _all_files(scene) == before
-    assert [path.name for path in scene.parent.iterdir()] == [scene.name]
+    assert read_frame(colour_set / "truth" / "plane_00500.0.tiff").pixels_dn.shape == (48, 64, 3)
 
 
 @pytest.mark.parametrize("colour", ["grey", "bayer"])
-def test_truth_of_surfaces_is_depth_and_light(
-    colour: str, tmp_path: Path, done: Command, small_options: tuple[object, ...]
-) -> None:
+def test_truth_of_surfaces_is_depth_and_light(colour: str, tmp_path: Path, done: Command) -> None:
     """Both are those at the pixels of an ideal reference view."""
     surfaces, snr = tmp_path / "set", 5.0
-    words = ("simulate", surfaces, "--objects", "surfaces", *small_options, "--colour", colour, "--snr", snr)
+    words = ("simulate", surfaces, "--objects", "surfaces", *SMALL, "--colour", colour, "--snr", snr)
     assert json.loads(done("--json", *words).stdout)["snr"] == pytest.approx(snr, rel=1e-6)
     assert brightness(load_set(surfaces)).snr == pytest.approx(snr, rel=0.1)
     truth = ["truth/true_depth_mm.tiff", "truth/true_picture.tiff"]
-    assert set(_all_files(surfaces)) == FILES | set(truth)
-    assert json.loads((surfaces / "provenance.json").read_text())["options"]["objects"] == "surfaces"
-    stated = json.loads((surfaces / "truth.json").read_text())
+    assert set(files_in(surfaces)) == FILES | set(truth)
+    assert read_record(surfaces, "provenance.json")["options"]["objects"] == "surfaces"
+    stated = read_record(surfaces, "truth.json")
     assert (stated["planes"], stated["surface"]) == ([], {"depth_mm": truth[0], "picture": truth[1]})
     depth, picture = (read_frame(surfaces / name).pixels_dn for name in truth)
     assert depth.dtype == picture.dtype == np.float32
@@ -237,15 +195,13 @@ def test_truth_of_surfaces_is_depth_and_light(
     assert seen.mean() == pytest.approx(light[inside].mean(), rel=0.01)
 
 
-def test_set_of_surfaces_has_no_metrics_of_planes(
-    tmp_path: Path, done: Command, undrawn: None, small_options: tuple[object, ...]
-) -> None:
+def test_set_of_surfaces_has_no_metrics_of_planes(tmp_path: Path, done: Command, undrawn: None) -> None:
     folder, out = tmp_path / "set", tmp_path / "planes"
-    done("simulate", folder, "--objects", "surfaces", *small_options)
+    done("simulate", folder, "--objects", "surfaces", *SMALL)
     done("reconstruct", folder, "--depth-mm", 600, "--method", "backprojection", "--out", out)
     assert (out / "report.html").is_file()
     assert not (out / "metrics.json").exists()
-    outside = _truth(folder)
+    outside = read_record(folder, "truth.json")
     outside["surface"]["depth_mm"] = "../elsewhere.tiff"
     (tmp_path / "outside").mkdir()
     (tmp_path / "outside" / "truth.json").write_text(json.dumps(outside))

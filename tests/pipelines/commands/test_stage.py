@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 
 from faintfield.rig.stages.conformance import Check
-from tests.pipelines.conftest import Command
-from tests.pipelines.refusals import assert_refused
+from tests.pipelines.conftest import Command, assert_refused
 
 RIG = """
 [stage]

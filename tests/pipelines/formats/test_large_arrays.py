@@ -26,7 +26,7 @@ from faintfield.pipelines.formats import large_arrays
 from faintfield.pipelines.pages import report
 from faintfield.pipelines.reconstruction import overview
 from faintfield.pipelines.formats.sets.elemental_set import load_set
-from faintfield.pipelines.commands.reconstruct import reconstruct_and_report
+from faintfield.pipelines.workflows.reconstruct import reconstruct_and_report
 from faintfield.pipelines.reconstruction.request import Request
 elemental_set, warm = load_set(Path(sys.argv[1])), load_set(Path(sys.argv[1]).with_name("warm"))
 out, request = Path(sys.argv[2]), Request([500.0], ["backprojection"])

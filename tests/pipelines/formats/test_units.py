@@ -15,16 +15,15 @@ import numpy as np
 import pytest
 import tifffile
 
-from faintfield.pipelines.cli import run
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.results.records import PlaneFileRecord, ReconstructionRecord
 from faintfield.pipelines.formats.sets.elemental_file import read_set_file, write_set
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.formats.sets.stated import plane_stem, rounded_depth
 from faintfield.pipelines.formats.units import DepthUnit, LightUnit, StatedUnits, Units, json_of, record_of
-from tests.pipelines.conftest import SMALL, Command
+from tests.pipelines.conftest import SMALL, Command, made_once, run_undrawn
 from tests.pipelines.formats.results.test_golden import KINDS
-from tests.pipelines.forms import GOLDEN
+from tests.pipelines.forms import GOLDEN, read_record
 
 BRIGHT = ("--snr", 60, "--position-error-mm", 0, "--rotation-error-mrad", 0, "--objects", "surfaces")
 
@@ -36,6 +35,7 @@ UNITS_IN_TEXT = {
 }
 
 QUICK = ("--penalty-weight", 1, "--passes", 2)
+BACK = ("--method", "backprojection")
 
 # Times that were measured: of the command itself.
 WALL_TIMES = re.compile(
@@ -91,9 +91,8 @@ def test_negative_depth_is_read_as_disparity_only() -> None:
 @pytest.fixture(scope="module")
 def with_scale(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bright set in mm and electrons, of 9 views, at exactly the nodes of a grid."""
-    folder = tmp_path_factory.mktemp("units") / "set"
-    assert run([str(word) for word in ("simulate", folder, *SMALL, *BRIGHT)]) == 0
-    return folder
+    words = ("simulate", *SMALL, *BRIGHT)
+    return made_once(tmp_path_factory, "units", lambda folder: run_undrawn(*words, folder / "set")) / "set"
 
 
 def without_scale(folder: Path, depth: DepthUnit, light: LightUnit) -> Path:
@@ -187,54 +186,50 @@ def outputs(done: Command, folder: Path, out: Path, *calls: tuple[object, ...]) 
     return words
 
 
-def test_no_output_states_an_unknown_unit(
-    imported: tuple[Path, str], tmp_path: Path, done: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder, words = imported
-    out, layers = tmp_path / "out", list[dict[str, Any]]()
-    sweep = ("--out", out / "sweep", "--sweep-px", "-14:-4:5", "--method", "backprojection", "--depth-map")
-    words += outputs(done, folder, out, sweep)
-    viewer = SimpleNamespace(add_image=lambda data, **options: layers.append(options))
-    monkeypatch.setitem(sys.modules, "napari", SimpleNamespace(Viewer=lambda **_: viewer, run=lambda: None))
-    done("view", out / "sweep")
-    assert layers[0]["units"] == ("pixel",) * 3
-    assert layers[0]["axis_labels"] == ("disparity", "y", "x")
-    assert stated_units(out, words) == {}
-    assert "disparit" in words
-    record = json.loads((out / "sweep" / "reconstruction.json").read_text())["planes"][0]
-    # The reference view has 96 x 72 px, and its principal point in the middle; samples are its pixels
-    assert record["disparity_px"] == pytest.approx(-14, abs=1e-6)
-    assert record["pitch_px"] == pytest.approx(1.0)
-    assert record["origin_px"] == pytest.approx([-47.5, -35.5])
-    assert record["file"] == "plane_px_-014.000.tiff"
+ALL_KINDS_OF_RESULTS = [("--depth-mm", "auto", *BACK), ("--surface", *QUICK)]
 
 
-@pytest.mark.deep
 @pytest.mark.parametrize(
-    ("unit", "plane", "sweep"),
-    [("disparity_px", "--disparity-px=-8", "-14:-4:6"), ("relative", "--depth=700", "500:1000:6")],
+    ("unit", "sweep", "others"),
+    [
+        ("disparity_px", "--sweep-px=-14:-4:5", []),
+        pytest.param("disparity_px", "--sweep-px=-14:-4:6", ["--disparity-px=-8"], marks=pytest.mark.deep),
+        pytest.param("relative", "--sweep=500:1000:6", ["--depth=700"], marks=pytest.mark.deep),
+    ],
 )
-def test_no_output_of_any_command_states_unknown_units(
-    unit: DepthUnit, plane: str, sweep: str, with_scale: Path, imported: tuple[Path, str], tmp_path: Path, done: Command
-) -> None:
+def test_no_output_states_an_unknown_unit(
+    unit: DepthUnit, sweep: str, others: list[str], with_scale: Path, imported: tuple[Path, str], tmp_path: Path,
+    request: pytest.FixtureRequest, done: Command, monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    assert stated_units(with_scale, "").keys() == UNITS_IN_TEXT.keys()
     folder, words = imported
+    if not others:
+        request.getfixturevalue("seen")
     if unit == "relative":
         folder, words = Path(shutil.copytree(with_scale, tmp_path / "relative")), ""
         for path in [*folder.glob("*.json"), *folder.glob("noise_free*"), *folder.glob("object_region*")]:
             shutil.rmtree(path) if path.is_dir() else path.unlink()
         without_scale(folder, unit, "dn")
-    out, back = tmp_path / "out", ("--method", "backprojection")
-    words += outputs(
-        done,
-        folder,
-        out,
-        ("--out", out / "planes", plane, *QUICK, "--uncertainty"),
-        ("--out", out / "sweep", "--sweep-px" if unit == "disparity_px" else "--sweep", sweep, *back, "--depth-map"),
-        ("--out", out / "auto", "--depth-mm", "auto", *back),
-        ("--out", out / "surface", "--surface", *QUICK),
-    )
+    out, layers = tmp_path / "out", list[dict[str, Any]]()
+    kinds = [*((plane, *QUICK, "--uncertainty") for plane in others), *(ALL_KINDS_OF_RESULTS if others else ())]
+    calls = [("--out", out / f"{number}", *kind) for number, kind in enumerate(kinds)]
+    words += outputs(done, folder, out, ("--out", out / "sweep", sweep, *BACK, "--depth-map"), *calls)
+    viewer = SimpleNamespace(add_image=lambda data, **options: layers.append(options))
+    monkeypatch.setitem(sys.modules, "napari", SimpleNamespace(Viewer=lambda **_: viewer, run=lambda: None))
+    done("view", out / "sweep")
     assert stated_units(out, words) == {}
-    assert unit == "disparity_px" or "has no scale, so that lengths are relative" in words
+    if unit == "relative":
+        assert "has no scale, so that lengths are relative" in words
+        return
+    assert layers[0]["units"] == ("pixel",) * 3
+    assert layers[0]["axis_labels"] == ("disparity", "y", "x")
+    assert "disparit" in words
+    record = read_record(out / "sweep")["planes"][0]
+    # The reference view has 96 x 72 px, and its principal point in the middle; samples are its pixels
+    assert record["disparity_px"] == pytest.approx(-14, abs=1e-6)
+    assert record["pitch_px"] == pytest.approx(1.0)
+    assert record["origin_px"] == pytest.approx([-47.5, -35.5])
+    assert record["file"] == "plane_px_-014.000.tiff"
 
 
 @pytest.mark.parametrize("unit", ["mm", "relative", "disparity_px"])

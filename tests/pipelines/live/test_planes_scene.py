@@ -1,6 +1,5 @@
 """What live planes know of a session that is not complete, and what they compute from it."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,13 +17,14 @@ from faintfield.pipelines.live.planes_process import stretch
 from faintfield.pipelines.live.planes_scene import LiveScene, bins_of, live_scene
 from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
-from faintfield.pipelines.reconstruction.penalised import Objective, certified
-from faintfield.pipelines.reconstruction.solutions import Settings
+from faintfield.pipelines.reconstruction.planes.penalised import Objective, certified
+from faintfield.pipelines.reconstruction.planes.solutions import Settings
 from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.solver.initialization import back_projection, universal_penalty_weight
 from faintfield.rig.cameras.settings import FolderSettings
 from faintfield.rig.plan import nominal_poses_rt_cam_ref
 from faintfield.rig.session.session import read_plan, taken_frames
+from tests.pipelines.by_hand import write_fitted_noise
 from tests.pipelines.sessions import captured, rig_toml
 
 _DEPTH_MM = 500.0
@@ -36,8 +36,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A captured dark scene of two frames per node, with noise and geometry as if measured."""
     text = rig_toml(["dark_scene"]).replace("frames_per_node = 1", "frames_per_node = 2")
     folder = captured(tmp_path_factory.mktemp("live"), text.replace("pitch_mm = 100.0", "pitch_mm = 30.0"))
-    values = {"offset_dn": 100.0, "gain_dn_per_e": 2.0, "read_noise_e": 12**0.5, "dark_current_e_per_s": 0.5}
-    (folder / "noise.json").write_text(json.dumps({name: {"value": value} for name, value in values.items()}))
+    write_fitted_noise(folder, {"read_noise_e": 12**0.5, "dark_current_e_per_s": 0.5})
     write_geometry(folder / "geometry.json", 3)
     return folder
 

@@ -18,9 +18,8 @@ import tifffile
 from faintfield.pipelines.formats.image_files import grey_levels, white_level
 from faintfield.pipelines.pages import report_surface
 from tests.pipelines.by_hand import write_by_hand
-from tests.pipelines.conftest import Command, run_undrawn
+from tests.pipelines.conftest import Command, assert_refused, run_undrawn
 from tests.pipelines.forms import read_record
-from tests.pipelines.refusals import assert_refused
 from tests.pipelines.surfaces import write_example
 
 pytestmark = pytest.mark.usefixtures("undrawn")
@@ -148,7 +147,7 @@ def test_titles_say_whether_occlusion_was_kept(kept: bool, planes: Path, done: C
     (planes / "pmlem-osl").rename(planes / "occlusion")
     for path in (planes / "occlusion" / "reconstruction.json", planes / "metrics.json"):
         content = json.loads(path.read_text())
-        content["planes"] = [one | made if one["method"] == "pmlem-osl" else one for one in content["planes"]]
+        content["planes"] = [plane | (made if plane["method"] == "pmlem-osl" else {}) for plane in content["planes"]]
         write_by_hand(path, content)
     done("report", planes)
     page = _Page((planes / "report.html").read_text())
@@ -218,19 +217,10 @@ def test_missing_or_damaged_planes_are_named(planes: Path, tmp_path: Path, faint
     assert not list((tmp_path / "empty").iterdir())
 
 
-@pytest.fixture(scope="module")
-def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A surface in mm and one in px, to be read only."""
-    folder = tmp_path_factory.mktemp("surfaces")
-    write_example(folder / "in mm")
-    write_example(folder / "in px", unit="px", colours=3)
-    return folder
-
-
 @pytest.fixture
-def surface(written: Path, tmp_path: Path) -> Path:
+def surface(written_surface: Path, tmp_path: Path) -> Path:
     """A copy of the surface in mm that a test may change."""
-    return Path(shutil.copytree(written / "in mm", tmp_path / "<toys & more>"))
+    return Path(shutil.copytree(written_surface, tmp_path / "<toys & more>"))
 
 
 def _section(folder: Path, done: Command) -> str:
@@ -268,8 +258,9 @@ def test_pictures_are_those_of_folder(surface: Path, done: Command) -> None:
     assert still in above  # the picture leads the page
 
 
-def test_disparities_are_no_lengths(written: Path, tmp_path: Path, done: Command) -> None:
-    message = _words(_section(Path(shutil.copytree(written / "in px", tmp_path / "out")), done))
+def test_disparities_are_no_lengths(tmp_path: Path, done: Command) -> None:
+    write_example(tmp_path, unit="px", colours=3)
+    message = _words(_section(tmp_path, done))
     assert "Disparity searched −14.0 to −6.00 px" in message
     assert "Disparity, px." in message
     assert not re.search(r"\bmm\b|\bdepth, |point cloud", message)

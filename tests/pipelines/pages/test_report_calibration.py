@@ -22,9 +22,8 @@ from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.pages.report_calibration import find_calibration
 from faintfield.pipelines.pages.report_sets import photon_budget
 from tests.pipelines.by_hand import write_by_hand
-from tests.pipelines.conftest import Command, run_undrawn
+from tests.pipelines.conftest import Command, assert_refused, run_undrawn
 from tests.pipelines.forms import GOLDEN
-from tests.pipelines.refusals import assert_refused
 
 NOISE = json.loads((GOLDEN / "noise.json").read_bytes()) | {
     "read_noise_e": {"value": 3.4641, "se": 0.0022, "ci95": [3.4597, 3.4685]},

@@ -18,6 +18,7 @@ from faintfield.pipelines.pages.report_pictures import PlaneSections
 from faintfield.pipelines.pages.report_planes import Plane
 from faintfield.pipelines.pages.report_viewer import UNKNOWN_LEVEL, Fineness, Packed, ViewerPicture, pack, viewer_of
 from tests.pipelines.conftest import run_undrawn
+from tests.pipelines.forms import read_record
 
 
 def _levels(png: bytes) -> NDArray[np.int64]:
@@ -111,11 +112,11 @@ def test_page_of_set_states_numbers_units_and_places(simulated_scene: Path, tmp_
     page = (out / "report.html").read_text()
     assert "<script>alert(1)" not in page
     data: dict[str, Any] = json.loads(page.partition('id="viewer-data">')[2].partition("</script>")[0])
-    (light,) = (one for one in data["pictures"] if one["kind"] == "light")
+    (light,) = (picture for picture in data["pictures"] if picture["kind"] == "light")
     plane = tifffile.imread(out / "plane_00500.0.tiff")
     np.testing.assert_allclose(
         light["low"] + light["step"] * _picture_levels(light), plane, atol=0.5 * light["step"] * 1.01
     )
     assert (light["unit"], data["length"]) == ("e⁻ per pixel", "mm")
-    record = json.loads((out / "reconstruction.json").read_text())["planes"][0]
+    record = read_record(out)["planes"][0]
     assert (light["pitch"], light["origin"]) == (record["pitch_mm"], record["origin_mm"])

@@ -1,6 +1,5 @@
 """From frames to electrons: offset, gain, saturation, colours and mosaics, and where a plane's samples lie."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -16,16 +15,11 @@ from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, default_pitch_px, plane_grid
 from faintfield.recon.errors import GeometryMismatch
-from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.solver.initialization import back_projection
+from tests.pipelines.by_hand import channels_of, write_fitted_noise
 from tests.pipelines.conftest import Edit, SetMaker
 
 BAYER = ["RG", "GB"]
-
-
-def _channels(folder: Path) -> dict[str, ElementalImages]:
-    elemental_set = load_set(folder)
-    return {layout.name: load_channel(elemental_set, layout) for layout in channel_layouts(elemental_set)}
 
 
 def _back_projected(folder: Path, depth_mm: float = 100.0) -> NDArray[np.floating]:
@@ -38,7 +32,7 @@ def _back_projected(folder: Path, depth_mm: float = 100.0) -> NDArray[np.floatin
 
 def test_numbers_become_electrons_unless_saturated(make_set: SetMaker) -> None:
     noise = {"offset_dn": 100.0, "gain_dn_per_e": 2.0, "read_noise_e": 3.0, "dark_current_e_per_s": 0.2}
-    images = _channels(make_set([np.array([[100, 103], [97, 65535]], np.uint16)], noise=noise))["grey"]
+    images = channels_of(make_set([np.array([[100, 103], [97, 65535]], np.uint16)], noise=noise))["grey"]
     assert images.electrons.dtype == np.float32
     assert images.electrons.tolist() == [[[0.0, 1.5], [-1.5, 32717.5]]]
     assert images.background_e == pytest.approx(0.1, rel=1e-12)  # 0.2 e⁻/s in 0.5 s
@@ -46,7 +40,7 @@ def test_numbers_become_electrons_unless_saturated(make_set: SetMaker) -> None:
     assert images.valid is None
     views = [np.full((2, 3), 500, np.uint16), np.array([[500, 999, 1000], [1001, 500, 500]], np.uint16)]
     noise = {"offset_dn": 0.0, "gain_dn_per_e": 1.0, "read_noise_e": 1.0, "saturation_dn": 1000.0}
-    valid = _channels(make_set(views, name="saturated", noise=noise))["grey"].valid
+    valid = channels_of(make_set(views, name="saturated", noise=noise))["grey"].valid
     assert valid is not None
     assert valid.tolist() == [[[True] * 3] * 2, [[True, True, False], [False, True, True]]]
 
@@ -68,12 +62,12 @@ def test_view_unlike_its_set_is_refused_by_name(
     folder = make_set(grey_images, noise=noise)
     tifffile.imwrite(folder / "view_1.tiff", image, photometric="rgb" if image.ndim == 3 else "minisblack")
     with pytest.raises(failure, match=rf"view_1\.tiff: {words}"):
-        _channels(folder)
+        channels_of(folder)
 
 
 def test_each_colour_of_rgb_frames_is_channel(make_set: SetMaker) -> None:
     views = list(np.random.default_rng(1).integers(100, 900, (2, 5, 6, 3)).astype(np.uint16))
-    channels = _channels(make_set(views))
+    channels = channels_of(make_set(views))
     assert list(channels) == ["red", "green", "blue"]
     for index, images in enumerate(channels.values()):
         np.testing.assert_allclose(images.electrons, (np.stack(views)[..., index] - 100.0) / 2.0)
@@ -85,28 +79,21 @@ def test_each_mosaic_phase_is_lattice_of_its_colour(make_set: SetMaker) -> None:
     phases_of = {"red": [(0, 0)], "green": [(0, 1), (1, 0)], "blue": [(1, 1)]}
     layouts = channel_layouts(load_set(folder))
     assert {layout.name: [lattice.first for lattice in layout.lattices] for layout in layouts} == phases_of
-    channels = _channels(folder)
+    channels = channels_of(folder)
     for name, phases in phases_of.items():
         # View by view, and within a view phase by phase
         expected = [view[row:4:2, column:6:2] for view in (first, second) for row, column in phases]
         np.testing.assert_allclose(channels[name].electrons, (np.stack(expected) - 100.0) / 2.0)
 
 
-def _write_noise(folder: Path, *numbers: float, **others: Any) -> None:
-    """Write a fitted noise model of offset, gain, read noise and dark current."""
-    names = ("offset_dn", "gain_dn_per_e", "read_noise_e", "dark_current_e_per_s")
-    fitted = {name: {"value": value} for name, value in zip(names, numbers, strict=True)}
-    (folder / "noise.json").write_text(json.dumps(fitted | others))
-
-
 def test_maps_of_noise_follow_lattices(make_set: SetMaker) -> None:
     frame = np.random.default_rng(2).integers(90, 200, (4, 6)).astype(np.uint16)
     folder = make_set([frame], camera={"mosaic": BAYER}, noise="noise.json", exposure_s=2.0)
-    _write_noise(folder, 100.0, 2.0, 1.5, 0.0)
+    write_fitted_noise(folder)
     offset, dark, gain, read_e = np.random.default_rng(1).uniform(1.5, 9, (4, 4, 6)).astype(np.float32)
     maps = {"offset_dn": offset, "dark_current_e_per_s": dark, "gain_dn_per_e": gain, "read_noise_e": read_e}
     np.savez(folder / "noise_maps.npz", allow_pickle=False, **maps)
-    green = _channels(folder)["green"]
+    green = channels_of(folder)["green"]
 
     def lattices(pixels: NDArray[np.floating]) -> list[NDArray[np.floating]]:
         return [pixels[0::2, 1::2], pixels[1::2, 0::2]]
@@ -123,7 +110,7 @@ def test_hot_pixels_do_not_reach_plane(make_set: SetMaker, grey_images: Sequence
         for image in images:
             image[5, 9] = level
         folder = make_set(images, name=name, noise="noise.json")
-        _write_noise(folder, 100.0, 2.0, 3.0, 0.0, hot_pixels=[[5, 9]])
+        write_fitted_noise(folder, {"dark_current_e_per_s": 0.0}, hot_pixels=[[5, 9]])
         planes.append(_back_projected(folder))
     np.testing.assert_array_equal(planes[0], planes[1])
     assert planes[0].max() > 100

@@ -1,7 +1,5 @@
 """Depth maps and planes of best focus, on views of waves computed in closed form."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -9,10 +7,7 @@ from numpy.typing import NDArray
 from faintfield.recon.depth.agreement import _MODEL_ERROR, Agreement, agreement, bins_for, depth_map
 from faintfield.recon.depth.focus import SURE, likeliest_depth_mm, places_of_focus
 from faintfield.recon.likelihood.images import ElementalImages
-from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane_operator import PlaneOperator
-
-type Scene = Callable[[NDArray[np.floating], NDArray[np.floating], float], NDArray[np.floating]]
+from tests.recon.displaced import views_displaced_by
 
 SHAPE = (48, 96)
 OFFSETS = np.array([(row, column) for row in (-1, 0, 1) for column in (-2, -1, 0, 1, 2)], float)
@@ -21,40 +16,29 @@ DEPTHS_MM = 1 / np.linspace(1 / 400, 1 / 900, 25)
 NEAR, FAR = 17, 6  # planes of the sweep in which the two halves of the scene lie
 
 
-def _waves(x: NDArray[np.floating], y: NDArray[np.floating]) -> NDArray[np.floating]:
+def _light(x: NDArray[np.floating], y: NDArray[np.floating], level_e: float | None) -> NDArray[np.floating]:
+    """Return even light, or waves if no level is given."""
     waves = 6 * np.cos(x * 0.9 + y * 0.4) + 6 * np.cos(x * 0.35 - y * 0.8 + 1) + 5 * np.sin(0.6 * x + 0.2 * y)
-    return np.asarray(20 + waves)
+    return np.full_like(x, level_e) if level_e is not None else np.asarray(20 + waves)
 
 
-def _two_halves(x: NDArray[np.floating], y: NDArray[np.floating], level: float) -> NDArray[np.floating]:
-    del level
-    return _waves(x, y)
-
-
-def _problem(texture: Scene, seed: int = 3, scale: float = 1.0) -> tuple[list[Agreement], ElementalImages]:
+def _problem(near_e: float | None = None, far_e: float | None = None) -> list[Agreement]:
     """The left half is near, the right half far; pixels are computed from their coordinates, without an operator."""
     rows, columns = np.indices(SHAPE, float)
-    middle = SHAPE[1] / 2
     views = []
     for down, right in OFFSETS:
-        near, far = (DISPARITIES[index] for index in (NEAR, FAR))
-        on_near = (columns + near * right, rows + near * down)
-        on_far = (columns + far * right, rows + far * down)
-        views.append(np.where(on_near[0] < middle, texture(*on_near, 0.0), texture(*on_far, 1.0)))
-    electrons = np.random.default_rng(seed).poisson(scale * np.array(views)).astype(np.float32)
+        on_near, on_far = (
+            (columns + disparity * right, rows + disparity * down) for disparity in DISPARITIES[[NEAR, FAR]]
+        )
+        views.append(np.where(on_near[0] < SHAPE[1] / 2, _light(*on_near, near_e), _light(*on_far, far_e)))
+    electrons = np.random.default_rng(3).poisson(views).astype(np.float32)
     images = ElementalImages(electrons, background_e=0.0, read_variance_e2=0.5)
-    rays = np.stack([columns, rows], axis=-1)
-    planes = []
-    for disparity in DISPARITIES:
-        homographies = np.stack([np.eye(3)] * len(OFFSETS))
-        homographies[:, :2, 2] = disparity * OFFSETS[:, ::-1]
-        planes.append(agreement(PlaneOperator(homographies, rays, PlaneGrid(SHAPE, 1.0, (0.0, 0.0))), images))
-    return planes, images
+    return [agreement(views_displaced_by(disparity * OFFSETS, SHAPE, margin=0), images) for disparity in DISPARITIES]
 
 
 @pytest.fixture(scope="module")
 def halves() -> list[Agreement]:
-    return _problem(_two_halves)[0]
+    return _problem()
 
 
 def test_depth_of_each_half_is_right(halves: list[Agreement]) -> None:
@@ -67,10 +51,7 @@ def test_depth_of_each_half_is_right(halves: list[Agreement]) -> None:
 
 
 def test_squares_of_even_views_are_of_their_levels() -> None:
-    rows, columns = np.indices((12, 16), float)
-    operator = PlaneOperator(
-        np.stack([np.eye(3)] * 3), np.stack([columns, rows], axis=-1), PlaneGrid((12, 16), 1.0, (0.0, 0.0))
-    )
+    operator = views_displaced_by(np.zeros((3, 2)), (12, 16), margin=0)
     light_e, background_e, read_variance_e2 = np.array([18.0, 20.0, 25.0]), 3.0, 2.0
     electrons = np.broadcast_to((light_e + background_e)[:, None, None], (3, 12, 16)).astype(np.float32)
     result = agreement(operator, ElementalImages(electrons, background_e, read_variance_e2))
@@ -84,10 +65,7 @@ def test_squares_of_even_views_are_of_their_levels() -> None:
 
 @pytest.mark.parametrize("level_e", [0.0, 20.0])
 def test_dark_and_uniform_regions_have_no_confident_depth(level_e: float) -> None:
-    def flat_right(x: NDArray[np.floating], y: NDArray[np.floating], far: float) -> NDArray[np.floating]:
-        return np.where(far, level_e, _waves(x, y))
-
-    result = depth_map(_problem(flat_right)[0], DEPTHS_MM)
+    result = depth_map(_problem(far_e=level_e), DEPTHS_MM)
     assert (result.confidence[6:-6, 8:36] >= SURE).mean() > 0.8
     assert (result.confidence[6:-6, 62:86] >= SURE).mean() < 0.02
 
@@ -107,15 +85,11 @@ def test_planes_of_best_focus_are_located_and_refined(halves: list[Agreement]) -
 
 
 def test_noise_alone_has_no_plane_of_focus() -> None:
-    planes, _ = _problem(lambda x, y, far: np.full_like(x, 0.2) + 0 * y + 0 * far)
-    assert places_of_focus(depth_map(planes, DEPTHS_MM), len(DEPTHS_MM)) == []
+    assert places_of_focus(depth_map(_problem(0.2, 0.2), DEPTHS_MM), len(DEPTHS_MM)) == []
 
 
 def test_less_light_takes_larger_bins() -> None:
-    rows, columns = np.indices(SHAPE, float)
-    operator = PlaneOperator(
-        np.stack([np.eye(3)] * len(OFFSETS)), np.stack([columns, rows], axis=-1), PlaneGrid(SHAPE, 1.0, (0.0, 0.0))
-    )
+    operator = views_displaced_by(0 * OFFSETS, SHAPE, margin=0)
     # A pixel of λ electrons and 0.5 e⁻² of read noise has the power ratio λ²/(λ + 0.5); k² of it must reach 2
     for light_e, bins in ((30.0, 2), (1.0, 2), (0.4, 4), (0.2, 8)):
         images = ElementalImages(

@@ -8,9 +8,9 @@ from faintfield.recon.depth.agreement import Agreement
 from faintfield.recon.depth.focus import FocusMeasure, focus_measure, likeliest_depth_mm, sharp_depths_mm
 from faintfield.recon.depth.running import RunningPlane, seen_by_view
 from faintfield.recon.likelihood.images import ElementalImages
-from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.solver.initialization import back_projection
+from tests.recon.displaced import views_displaced_by
 
 SHAPE = (40, 50)
 HALVES = (np.array([0, 2]), np.array([1, 3]))
@@ -76,15 +76,11 @@ def views(shift_px: float = 0.0, level_e: float = 20.0, detail_e: float = 0.0, s
     return ElementalImages(electrons, background_e=0.0, read_variance_e2=0.0)
 
 
-def operator() -> PlaneOperator:
-    rows, columns = np.indices(SHAPE, float)
-    rays = np.stack([columns, rows], axis=-1)
-    return PlaneOperator(np.stack([np.eye(3)] * 4), rays, PlaneGrid(SHAPE, 1.0, (0.0, 0.0)))
+OVERLAID = views_displaced_by(np.zeros((4, 2)), SHAPE, margin=0)
 
 
 def test_focus_of_noise_is_zero_within_sigma() -> None:
-    h = operator()
-    result = [focus_measure(h, views(seed=seed), HALVES) for seed in range(60)]
+    result = [focus_measure(OVERLAID, views(seed=seed), HALVES) for seed in range(60)]
     detail = np.array([point.detail_e2 for point in result])
     sigma = np.mean([point.sigma_e2 for point in result])
     assert abs(detail.mean()) < 4 * sigma / np.sqrt(60)
@@ -92,33 +88,25 @@ def test_focus_of_noise_is_zero_within_sigma() -> None:
 
 
 def test_detail_counts_where_halves_agree() -> None:
-    h = operator()
-    in_focus = focus_measure(h, views(detail_e=8.0), HALVES)
+    in_focus = focus_measure(OVERLAID, views(detail_e=8.0), HALVES)
     # Opposite waves in the two halves are worse than none
-    opposite = focus_measure(h, views(shift_px=np.pi / 1.2, detail_e=8.0), HALVES)
+    opposite = focus_measure(OVERLAID, views(shift_px=np.pi / 1.2, detail_e=8.0), HALVES)
     assert in_focus.detail_e2 > 5 * in_focus.sigma_e2
     assert opposite.detail_e2 == pytest.approx(-in_focus.detail_e2, rel=0.2)
 
 
 def test_views_without_common_samples_measure_nothing() -> None:
-    homographies = np.stack([np.eye(3)] * 4)
-    homographies[1::2, 0, 2] = 1000.0
-    rows, columns = np.indices(SHAPE, float)
-    apart = PlaneOperator(homographies, np.stack([columns, rows], axis=-1), PlaneGrid(SHAPE, 1.0, (0.0, 0.0)))
+    apart = views_displaced_by(np.array([[0.0, 0.0], [0.0, 1000.0]] * 2), SHAPE, margin=0)
     assert focus_measure(apart, views(), HALVES) == FocusMeasure(0.0, 0.0)
 
 
-_SHAPE, _DEPTH_MM, _F_PX = (30, 40), 500.0, 50.0
-_GRID = PlaneGrid(_SHAPE, _DEPTH_MM / _F_PX, (-19.5 * _DEPTH_MM / _F_PX, -14.5 * _DEPTH_MM / _F_PX))
-_SHIFTS_MM = [(-60.0, -45.0), (60.0, -45.0), (0.0, 0.0), (60.0, 45.0), (-60.0, 52.0)]
+_SHAPE = (30, 40)
+_SHIFTS = np.array([(-4.5, -6.0), (-4.5, 6.0), (0.0, 0.0), (4.5, 6.0), (5.2, -6.0)])
 _HALVES = (np.array([0, 3]), np.array([1, 2, 4]))
 
 
 def views_operator(views: list[int], flat: np.ndarray | None, valid: np.ndarray | None) -> PlaneOperator:
-    rows, columns = np.indices(_SHAPE)
-    rays = np.stack([(columns - 19.5) / _F_PX, (rows - 14.5) / _F_PX], axis=-1)
-    homographies = [[[_DEPTH_MM, 0, x], [0, _DEPTH_MM, y], [0, 0, 1]] for x, y in (_SHIFTS_MM[view] for view in views)]
-    return PlaneOperator(np.array(homographies), rays, _GRID, flat=flat, valid=valid, workers=1)
+    return views_displaced_by(_SHIFTS[views], _SHAPE, margin=0, flat=flat, valid=valid)
 
 
 @pytest.fixture(params=["even", "vignetting and saturation"])

@@ -15,13 +15,14 @@ from faintfield.recon.operator.geometry import scene_geometry, window_geometry
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.operator.surface_operator import SurfaceOperator
+from tests.recon.displaced import pixel_rays
 from tests.recon.operator_cases import FACING_AT_500_MM, Case, cases
 
 
 def test_sample_indices_count_from_the_first_centre() -> None:
     grid = PlaneGrid((3, 5), 0.5, (-1.0, 2.0))
-    column, row, one = grid.index_from_plane() @ [0.0, 3.0, 1.0]
-    assert (column, row, one) == (2.0, 2.0, 1.0)
+    column, row, scale = grid.index_from_plane() @ [0.0, 3.0, 1.0]
+    assert (column, row, scale) == (2.0, 2.0, 1.0)
 
 
 def test_grid_covers_a_rectangle() -> None:
@@ -42,19 +43,14 @@ def test_binned_samples_lie_between_replaced_samples() -> None:
 _SHAPE = (5, 70)
 
 
-def _rays() -> np.ndarray:
-    columns, rows = np.meshgrid(np.arange(70.0), np.arange(5.0))
-    return np.stack([columns, rows], axis=-1)
-
-
 def test_operators_share_maps() -> None:
     flat = np.random.default_rng(1).uniform(0.5, 1, _SHAPE)
-    maps = DetectorMaps(_rays(), flat)
+    maps = DetectorMaps(pixel_rays(_SHAPE), flat)
     homographies, grid = np.eye(3)[np.newaxis], PlaneGrid((8, 80), 1.0, (-2.0, -2.0))
     for _ in range(2):
         assert np.shares_memory(scene_geometry(homographies[np.newaxis], maps, [grid], None, None).maps, maps.layers)
     shared = PlaneOperator(homographies, maps, grid)
-    alone = PlaneOperator(homographies, _rays(), grid, flat=flat)
+    alone = PlaneOperator(homographies, pixel_rays(_SHAPE), grid, flat=flat)
     plane = np.random.default_rng(2).uniform(0, 1, grid.shape).astype(np.float32)
     np.testing.assert_array_equal(shared.forward(plane), alone.forward(plane))
 
@@ -62,9 +58,9 @@ def test_operators_share_maps() -> None:
 def test_maps_refuse_flat_field_and_other_dtype() -> None:
     grid = PlaneGrid((8, 80), 1.0, (-2.0, -2.0))
     with pytest.raises(GeometryMismatch, match="already have a flat field; give no other"):
-        PlaneOperator(np.eye(3)[np.newaxis], DetectorMaps(_rays()), grid, flat=np.ones(_SHAPE))
+        PlaneOperator(np.eye(3)[np.newaxis], DetectorMaps(pixel_rays(_SHAPE)), grid, flat=np.ones(_SHAPE))
     with pytest.raises(GeometryMismatch, match="of type float32"):
-        PlaneOperator(np.eye(3)[np.newaxis], DetectorMaps(_rays()), grid, dtype=np.float64)
+        PlaneOperator(np.eye(3)[np.newaxis], DetectorMaps(pixel_rays(_SHAPE)), grid, dtype=np.float64)
 
 
 def drawn_slice(data: st.DataObject, size: int) -> slice:
@@ -106,13 +102,8 @@ def test_small_window_is_located_on_the_detector(corner: tuple[int, int]) -> Non
 
 def test_small_window_looks_at_few_pixels() -> None:
     """Views that overlay the samples see a window of 29 x 29 in as many pixels; rows come in blocks of 64."""
-    rays = np.stack(np.meshgrid(np.arange(400.0), np.arange(300.0)), axis=-1)
-    args = (
-        np.eye(3)[np.newaxis, np.newaxis],
-        DetectorMaps(rays, dtype=np.float64),
-        [PlaneGrid((300, 400), 1.0, (0.0, 0.0))],
-    )
-    whole = scene_geometry(*args, None, None)
+    maps, grid = DetectorMaps(pixel_rays((300, 400)), dtype=np.float64), PlaneGrid((300, 400), 1.0, (0.0, 0.0))
+    whole = scene_geometry(np.eye(3)[np.newaxis, np.newaxis], maps, [grid], None, None)
     reach = window_geometry(whole, PlaneGrid((29, 29), 1.0, (207.0, 131.0)), (131, 207)).reach[0]
     looked_at = reach[:, 1] - reach[:, 0]
     assert (looked_at[131:160] > 0).all()
@@ -136,7 +127,7 @@ def test_window_of_a_surface_keeps_its_pixels() -> None:
     inverse_depth[:, 240:] = 1 / 400
     poses = np.zeros((3, 6))
     poses[:, 3] = [-150.0, 0.0, 150.0]
-    rays = (np.stack(np.meshgrid(np.arange(480.0), np.arange(90.0)), axis=-1) - [240, 45]) / 800
+    rays = (pixel_rays((90, 480)) - [240, 45]) / 800
     grid = PlaneGrid((90, 480), 1 / 800, (-240 / 800, -45 / 800))
     whole = SurfaceOperator(ray_from_surface(poses), rays, grid, inverse_depth)
     for first in (60, 330):

@@ -15,7 +15,6 @@ from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages, LikelihoodName, PixelLikelihood
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.placement import EDGE_TOLERANCE
-from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.operator.surface_operator import SurfaceOperator
 from faintfield.recon.solver.data_fit import DataFit
 from tests.recon import step_scene
@@ -57,15 +56,6 @@ def rough(case: Case) -> NDArray[np.float64]:
     return inverse
 
 
-def compare(first: PlaneOperator, second: PlaneOperator, atol: float = 1e-9) -> None:
-    """Check that two operators have the same numbers."""
-    generator = np.random.default_rng(4)
-    samples, images = generator.normal(size=first.samples_shape), generator.normal(size=first.images_shape)
-    np.testing.assert_allclose(first.forward(samples), second.forward(samples), atol=atol)
-    np.testing.assert_allclose(first.adjoint(images), second.adjoint(images), atol=atol)
-    np.testing.assert_allclose(first.sensitivity(), second.sensitivity(), atol=atol)
-
-
 @pytest.mark.parametrize("overshoot", [0.9, -1.1])
 @pytest.mark.parametrize("axis", [0, 1])
 def test_pixel_sees_edge_only_within_tolerance(overshoot: float, axis: int) -> None:
@@ -104,8 +94,8 @@ def cast_views() -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.bool
     sights = [step_scene.cast(rt) for rt in poses()]
     what = np.stack([sight.what for sight in sights])
     away = [(x, y) for x in (-2.0, -1.0, 0.0, 1.0, 2.0) for y in (-2.0, -1.0, 0.0, 1.0, 2.0)]
-    beside = [np.stack([step_scene.cast(rt, shift).what for rt in poses()]) == what for shift in away]
-    return what, np.stack([sight.light for sight in sights]), np.all(beside, axis=0)
+    same = [np.stack([step_scene.cast(rt, shift).what for rt in poses()]) == what for shift in away]
+    return what, np.stack([sight.light for sight in sights]), np.all(same, axis=0)
 
 
 @pytest.mark.parametrize(("dtype", "atol"), [(np.float64, 1e-9), (np.float32, 1e-4)])
@@ -215,8 +205,13 @@ def test_every_surface_keeps_the_operator_contract(case: Case) -> None:
 @settings(max_examples=15)
 @given(case=cases())
 def test_surface_of_one_depth_is_a_plane(case: Case) -> None:
-    facing = replace(case, rt_ref_plane=case.rt_ref_plane * [0, 0, 0, 0, 0, 1])
-    compare(surface_of(case, np.full(case.grid.shape, 1 / case.rt_ref_plane[5])), facing.operator())
+    plane = replace(case, rt_ref_plane=case.rt_ref_plane * [0, 0, 0, 0, 0, 1]).operator()
+    surface = surface_of(case, np.full(case.grid.shape, 1 / case.rt_ref_plane[5]))
+    generator = np.random.default_rng(4)
+    samples, images = generator.normal(size=plane.samples_shape), generator.normal(size=plane.images_shape)
+    np.testing.assert_allclose(surface.forward(samples), plane.forward(samples), atol=1e-9)
+    np.testing.assert_allclose(surface.adjoint(images), plane.adjoint(images), atol=1e-9)
+    np.testing.assert_allclose(surface.sensitivity(), plane.sensitivity(), atol=1e-9)
 
 
 @pytest.mark.parametrize(

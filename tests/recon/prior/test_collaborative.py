@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.fft import dctn, idctn
 
 from faintfield.recon.likelihood.images import ElementalImages, Image
@@ -13,10 +12,6 @@ from faintfield.recon.solver.initialization import back_projection
 from tests.recon.displaced import SHAPE, views_displaced_by
 
 KERNEL = np.outer([0.2, 1.0, 0.2], [0.3, 1.0, 0.3])
-
-
-def inner(plane: NDArray[np.floating]) -> NDArray[np.floating]:
-    return plane[4:-4, 4:-4]
 
 
 def haar_matrix(count: int) -> Image:

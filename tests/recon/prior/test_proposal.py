@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import LinearConstraint, minimize
 
-from faintfield.pipelines.reconstruction.penalised import Objective
-from faintfield.pipelines.reconstruction.solutions import Settings
+from faintfield.pipelines.reconstruction.planes.penalised import Objective
+from faintfield.pipelines.reconstruction.planes.solutions import Settings
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.prior.evidence import Evidence, evidence_of_planes
 from faintfield.recon.prior.misfit import Misfit, misfits

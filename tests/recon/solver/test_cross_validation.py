@@ -5,15 +5,13 @@ import pytest
 from numpy.typing import NDArray
 
 from faintfield.recon.likelihood.images import ElementalImages, Image, PixelLikelihood
-from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.solver import windows
 from faintfield.recon.solver.cross_validation import cross_validated_weight, validation_views
 from faintfield.recon.solver.data_fit import DataFit, SceneProblem
 from faintfield.recon.solver.initialization import smooth_start, universal_penalty_weight
 from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.solver.pmlem import pmlem
-from tests.recon.displaced import dark_views, pieces
+from tests.recon.displaced import dark_views, pieces, run_until, views_displaced_by
 
 
 @pytest.mark.parametrize("views", [4, 13, 50])
@@ -38,10 +36,8 @@ def test_weight_is_nearly_the_best_for_the_truth() -> None:
     fit = DataFit(operator, images, float(start.mean()))
 
     def error(weight: float) -> float:
-        for iterate in pmlem(fit, start, penalty_weight=weight):
-            if iterate.certificate.distance < 0.01 or iterate.passes >= 10:
-                break
-        return float(np.mean((iterate.plane - truth)[8:-8, 8:-8] ** 2))
+        plane = run_until(pmlem(fit, start, penalty_weight=weight), 0.01, 10).plane
+        return float(np.mean((plane - truth)[8:-8, 8:-8] ** 2))
 
     chosen = cross_validated_weight(SceneProblem(operator, images), guess / 3, Penalty())  # a poor guess
     best = min(error(guess * 2 ** (step / 2)) for step in range(-3, 4))
@@ -84,8 +80,7 @@ def test_candidates_scale_penalty_by_share_of_training_views() -> None:
     """
     rows, left, right, variance_e2, views = 16, 5, 15, 4.0, 4
     truth = np.repeat([2.0, 8.0], [left, right]) * np.ones((rows, 1))
-    rays = np.stack(np.meshgrid(np.arange(float(left + right)), np.arange(float(rows))), axis=-1)
-    operator = PlaneOperator(np.stack([np.eye(3)] * views), rays, PlaneGrid(truth.shape, 1.0, (0.0, 0.0)))
+    operator = views_displaced_by(np.zeros((views, 2)), (rows, left + right), margin=0)
     images = ElementalImages(
         np.stack([truth.astype(np.float32)] * views), 0.0, 1.0, likelihood=PixelLikelihood("least-squares", level_e=3.0)
     )
@@ -100,17 +95,15 @@ def test_candidates_scale_penalty_by_share_of_training_views() -> None:
 
 
 def test_too_few_views_are_refused() -> None:
-    few = PlaneOperator(np.stack([np.eye(3)] * 3), np.zeros((4, 4, 2)), PlaneGrid((4, 4), 1.0, (0.0, 0.0)))
+    few = views_displaced_by(np.zeros((3, 2)), (4, 4), margin=0)
     with pytest.raises(ValueError, match="at least 4 views"):
         cross_validated_weight(SceneProblem(few, ElementalImages(np.ones((3, 4, 4)))), 1.0, Penalty())
 
 
 def test_views_that_see_nothing_are_left_out() -> None:
-    operator, images = dark_views(pieces(24), 1)
-    aside = np.stack([np.eye(3)] * 49)
-    aside[:, 0, 2] = np.where(np.arange(49) % 7 == 3, 0.5, 1000.0)
-    rays = np.stack(np.meshgrid(np.arange(24.0), np.arange(24.0)), axis=-1)
-    posed = SceneProblem(PlaneOperator(aside, rays, operator.grid), images)
+    aside = np.zeros((49, 2))
+    aside[:, 1] = np.where(np.arange(49) % 7 == 3, 0.5, 1000.0)
+    posed = SceneProblem(views_displaced_by(aside, (24, 24), margin=0), dark_views(pieces(24), 1)[1])
     assert posed.operator.seeing_views.tolist() == list(range(3, 49, 7))
     assert np.isfinite(list(cross_validated_weight(posed, 1.0, Penalty()).candidates.values())).all()
 
@@ -127,12 +120,12 @@ def test_candidate_ends_when_solver_cannot_descend(monkeypatch: pytest.MonkeyPat
     assert cross_validated_weight(SceneProblem(operator, images), 1.0, Penalty()).candidates
 
 
-def problem_of(shape: tuple[int, int], shifts: NDArray[np.float64] | None = None) -> SceneProblem:
-    """Return nine views that each see all of a plane but a few samples."""
-    rays = np.stack(np.meshgrid(np.arange(float(shape[1])), np.arange(float(shape[0]))), axis=-1)
-    homographies = np.stack([np.eye(3)] * 9)
-    homographies[:, 0, 2] = np.linspace(-3, 3, 9) if shifts is None else shifts
-    operator = PlaneOperator(homographies, rays, PlaneGrid(shape, 1.0, (0.0, 0.0)))
+FEW_SAMPLES = np.linspace(-3, 3, 9)
+
+
+def problem_of(shape: tuple[int, int], right: NDArray[np.float64] = FEW_SAMPLES) -> SceneProblem:
+    """Return nine views, displaced along the rows, that each see all of a plane but a few samples."""
+    operator = views_displaced_by(np.stack([0 * right, right], axis=1), shape, margin=0)
     return SceneProblem(operator, ElementalImages(np.ones((9, *shape), np.float32)))
 
 
@@ -170,7 +163,7 @@ def test_only_large_planes_have_windows(shape: tuple[int, int], least: int) -> N
 
 @pytest.mark.usefixtures("small_windows")
 def test_windows_with_few_views_are_left_out() -> None:
-    shifts = np.where(np.arange(9) < 6, 60.0, np.linspace(-3, 3, 9))  # six of nine views see only the right
+    shifts = np.where(np.arange(9) < 6, 60.0, FEW_SAMPLES)  # six of nine views see only the right
     columns = [window.operator.grids[0].origin_mm[0] for window in windows.windows_of(problem_of((64, 96), shifts), 4)]
     assert columns
     assert min(columns) >= 60

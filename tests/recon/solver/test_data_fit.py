@@ -11,7 +11,6 @@ import pytest
 from faintfield.recon.likelihood.images import ElementalImages, Image, LikelihoodName
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.occlusion import Occluders
-from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.operator.scene_operator import SceneOperator
 from faintfield.recon.prior.evidence import evidence_of_planes
 from faintfield.recon.smoothing import blurred
@@ -19,6 +18,7 @@ from faintfield.recon.solver.data_fit import DataFit, SceneProblem
 from faintfield.recon.solver.initialization import back_projection, mean_light_e, smooth_start, universal_penalty_weight
 from faintfield.recon.solver.pmlem import PmlemIterate, pmlem
 from faintfield.recon.solver.uncertainty import local_fits
+from tests.recon.displaced import noisy_images, pixel_rays, planes_displaced_by, run_until, views_displaced_by
 from tests.recon.operator_contract import dense_matrix
 from tests.recon.small_problems import (
     SHAPE,
@@ -26,7 +26,6 @@ from tests.recon.small_problems import (
     Likelihood,
     box,
     difference_matrix,
-    drawn_images,
     primal_dual_solution,
     problem,
     shifted_views,
@@ -39,10 +38,7 @@ WEIGHT = 0.8
 def solved(posed: SceneProblem, weight: float, tolerance: float = 1e-7, most: int = 4000) -> PmlemIterate:
     start = posed.start()
     fit = posed.fit(mean_light_e(posed.operator, start))
-    for iterate in pmlem(fit, start, penalty_weight=weight, tolerance=tolerance, dual=posed.dual()):
-        if iterate.certificate.distance <= tolerance or iterate.passes >= most:
-            break
-    return iterate
+    return run_until(pmlem(fit, start, penalty_weight=weight, tolerance=tolerance, dual=posed.dual()), tolerance, most)
 
 
 @pytest.mark.parametrize(("likelihood", "occluded"), [("shifted-poisson", True), ("least-squares", False)])
@@ -80,27 +76,25 @@ def _wide_scene(views: int) -> SceneProblem:
     generator = np.random.default_rng(5)
     homographies = np.stack([np.eye(3)] * 2 * views).reshape(2, views, 3, 3)
     homographies[0, :, :2, 2] = generator.uniform(-9, 9, (views, 2))
-    rays = np.stack(np.meshgrid(np.arange(128.0), np.arange(128.0)), axis=-1)
     grids = [PlaneGrid((32, 32), 4.0, (0.0, 0.0))] * 2
     hiding = Occluders([np.full((32, 32), 0.5)] * 2, [500.0, 700.0])
     electrons = generator.normal(1, 3, (views, 128, 128)).astype(np.float32)
-    operator = SceneOperator(homographies, rays, grids, occluders=hiding, workers=2)
+    operator = SceneOperator(homographies, pixel_rays((128, 128)), grids, occluders=hiding, workers=2)
     return SceneProblem(operator, ElementalImages(electrons, 0.1, 9.0))
 
 
 def test_scene_of_one_plane_equals_that_plane() -> None:
     posed = problem()
     plane = posed.operator
-    homographies, rays = posed.homographies[np.newaxis], posed.rays
-    scene_of_one = SceneOperator(homographies, rays, [plane.grid], dtype=np.float64, workers=1)
+    scene_of_one = planes_displaced_by([posed.shifts], SHAPE, dtype=np.float64)
     alone = solved(SceneProblem(plane, posed.images), 1.5)
     same = solved(SceneProblem(scene_of_one, posed.images), 1.5)
     np.testing.assert_array_equal(same.plane, alone.plane.ravel())
     # A plane that hides nothing changes nothing but the way to the metric, which is that of several planes
-    clear = Occluders([np.zeros(plane.grid.shape)], [500.0])
-    general = SceneOperator(homographies, rays, [plane.grid], occluders=clear, dtype=np.float64, workers=1)
+    clear = Occluders([np.zeros(SHAPE)], [500.0])
+    general = planes_displaced_by([posed.shifts], SHAPE, occluders=clear, dtype=np.float64)
     together = solved(SceneProblem(general, posed.images), 1.5)
-    np.testing.assert_allclose(together.plane.reshape(plane.grid.shape), alone.plane, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(together.plane.reshape(SHAPE), alone.plane, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("occluded", [False, True])
@@ -130,15 +124,8 @@ def test_left_out_views_do_not_count() -> None:
     assert not np.allclose(posed.fit(1.0).metric(start), first.metric(start))
 
 
-def small_operator() -> PlaneOperator:
-    rows, columns = np.indices((12, 16), float)
-    homographies = np.stack([np.eye(3)] * 3)
-    homographies[:, 0, 2] = [-2.3, 0.0, 3.1]
-    return PlaneOperator(homographies, np.stack([columns, rows], axis=-1), PlaneGrid((12, 16), 1.0, (0.0, 0.0)))
-
-
 def test_noise_map_bounds_curvature_by_mean_precision() -> None:
-    operator = small_operator()
+    operator = views_displaced_by(np.array([[0.0, -2.3], [0.0, 0.0], [0.0, 3.1]]), (12, 16), margin=0)
     electrons = np.random.default_rng(2).poisson(5.0, operator.images_shape).astype(np.float64)
     noise = np.random.default_rng(4).uniform(1.0, 6.0, (1, 12, 16))
     images = ElementalImages(electrons, background_e=0.0, read_variance_e2=noise)
@@ -195,7 +182,7 @@ def test_start_has_mean_level_far_from_seen_samples() -> None:
 
 def test_universal_weight_is_the_noise_of_the_gradient() -> None:
     operator = shifted_views(6)
-    images = drawn_images(operator, box(2, 6), background_e=0.5, variance_e2=12.0)
+    images = noisy_images(operator, box(2, 6), 0.5, 12.0, 2)
     weight = universal_penalty_weight(operator, images, np.full(SHAPE, 3.0))
     assert weight == pytest.approx(0.7 * np.sqrt(6 / 15.5), rel=1e-12)
     brighter = replace(images, background_e=0.5 + 15.5 * 3)

@@ -1,6 +1,5 @@
 """One-step-late PMLEM against dense algebra and its limits; total variation against its derivative."""
 
-from collections.abc import Iterator, Sequence
 from itertools import islice
 from typing import Any
 
@@ -11,10 +10,8 @@ from hypothesis import strategies as st
 
 from faintfield.recon.errors import NotConverged
 from faintfield.recon.likelihood.images import ElementalImages, Image
-from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.solver.initialization import smooth_start
 from faintfield.recon.solver.one_step_late import (
-    Iterate,
     IterationStep,
     oscillates,
     pmlem_one_step_late,
@@ -22,29 +19,21 @@ from faintfield.recon.solver.one_step_late import (
     updated_samples,
 )
 from faintfield.recon.solver.penalties import total_variation, total_variation_gradient
+from tests.recon.displaced import noisy_images
 from tests.recon.operator_contract import dense_matrix
-from tests.recon.small_problems import SHAPE, box, drawn_images, shifted_views
-
-
-def mlem(operator: PlaneOperator, images: ElementalImages, start: Image) -> Iterator[Iterate]:
-    return pmlem_one_step_late(operator, images, start, penalty_weight=0.0, epsilon=1.0)
-
-
-def shifted_data(images: ElementalImages) -> Image:
-    return np.asarray(np.maximum(images.electrons + images.read_variance_e2, 0)).ravel()
+from tests.recon.small_problems import SHAPE, box, shifted_views
 
 
 @pytest.mark.parametrize(("penalty_weight", "variance_e2"), [(0.0, 0.0), (0.4, 12.0)])
 def test_each_pass_agrees_with_dense_algebra(penalty_weight: float, variance_e2: float) -> None:
     operator = shifted_views(4)
-    images, f = (
-        drawn_images(operator, box(2, 6), variance_e2=variance_e2),
-        np.random.default_rng(4).uniform(1, 5, SHAPE),
-    )
+    images = noisy_images(operator, box(2, 6), 0.3, variance_e2, 2)
+    f = np.random.default_rng(4).uniform(1, 5, SHAPE)
     matrix, s = dense_matrix(operator), operator.sensitivity()
+    shifted = np.maximum(images.electrons + variance_e2, 0).ravel()
     for iterate in islice(pmlem_one_step_late(operator, images, f, penalty_weight=penalty_weight, epsilon=0.5), 3):
         expected = matrix @ f.ravel() + images.background_e + variance_e2
-        back = (matrix.T @ (shifted_data(images) / expected)).reshape(SHAPE)
+        back = (matrix.T @ (shifted / expected)).reshape(SHAPE)
         next_f = f / (s + penalty_weight * total_variation_gradient(f, 0.5)) * back
         fixed = ~updated_samples(s, penalty_weight)
         next_f[fixed] = f[fixed]
@@ -55,7 +44,7 @@ def test_each_pass_agrees_with_dense_algebra(penalty_weight: float, variance_e2:
 
 def test_samples_with_few_views_keep_their_start() -> None:
     operator = shifted_views(4, unseen_columns=3)
-    images, start = drawn_images(operator, box(2, 6)), np.random.default_rng(6).uniform(1, 2, SHAPE)
+    images, start = noisy_images(operator, box(2, 6), 0.3, 12.0, 2), np.random.default_rng(6).uniform(1, 2, SHAPE)
     *_, last = islice(pmlem_one_step_late(operator, images, start, penalty_weight=0.5, epsilon=1.0), 5)
     kept = operator.sensitivity() <= 0.5 * (2 + np.sqrt(2))
     assert (operator.sensitivity()[kept] > 0).any()
@@ -66,7 +55,7 @@ def test_samples_with_few_views_keep_their_start() -> None:
 
 def run(penalty_weight: float, epsilon: float) -> list[IterationStep]:
     operator = shifted_views(6)
-    images = drawn_images(operator, box(1, 3))
+    images = noisy_images(operator, box(1, 3), 0.3, 12.0, 2)
     start = smooth_start(operator, images)
     solver = pmlem_one_step_late(operator, images, start, penalty_weight=penalty_weight, epsilon=epsilon)
     return [iterate.step for iterate in islice(solver, 200)]
@@ -84,10 +73,6 @@ def test_large_weight_oscillates_and_small_weight_settles() -> None:
     assert (sensitivity[updated] > 2 * weight).all()
 
 
-def history(changes: Sequence[float], alternation: float) -> list[IterationStep]:
-    return [IterationStep(k + 1, change, alternation) for k, change in enumerate(changes)]
-
-
 @pytest.mark.parametrize(
     ("changes", "alternation", "verdict"),
     [
@@ -101,12 +86,13 @@ def history(changes: Sequence[float], alternation: float) -> list[IterationStep]
 def test_oscillation_is_opposing_steps_that_do_not_shrink(
     changes: list[float], alternation: float, verdict: bool
 ) -> None:
-    assert oscillates(history(changes, alternation), tolerance=1e-3) is verdict
+    steps = [IterationStep(k + 1, change, alternation) for k, change in enumerate(changes)]
+    assert oscillates(steps, tolerance=1e-3) is verdict
 
 
 def test_weight_beyond_its_limit_is_refused() -> None:
     operator = shifted_views(6)
-    images = drawn_images(operator, box(2, 6))
+    images = noisy_images(operator, box(2, 6), 0.3, 12.0, 2)
     limit = 6 / (2 + np.sqrt(2))
     with pytest.raises(NotConverged, match=rf"below {limit:.3g}"):
         pmlem_one_step_late(operator, images, np.ones(SHAPE), penalty_weight=1.01 * limit, epsilon=1.0)
@@ -117,7 +103,7 @@ def test_infinite_iterate_is_reported_with_its_pass() -> None:
     operator = shifted_views(2, dtype=np.float32)
     images = ElementalImages(np.full(operator.images_shape, 1e38, np.float32), 1e-9)
     with pytest.raises(NotConverged, match="pass 1 left"), np.errstate(over="ignore", invalid="ignore"):
-        next(mlem(operator, images, np.full(SHAPE, 1e-30)))
+        next(pmlem_one_step_late(operator, images, np.full(SHAPE, 1e-30), penalty_weight=0.0, epsilon=1.0))
 
 
 @pytest.mark.parametrize(
@@ -130,7 +116,7 @@ def test_infinite_iterate_is_reported_with_its_pass() -> None:
 )
 def test_arguments_out_of_range_are_refused(changed: dict[str, Any], words: str) -> None:
     operator = shifted_views(2)
-    images = drawn_images(operator, box(2, 6))
+    images = noisy_images(operator, box(2, 6), 0.3, 12.0, 2)
     good: dict[str, Any] = {"start": np.ones(SHAPE), "penalty_weight": 0.1, "epsilon": 1.0}
     with pytest.raises(ValueError, match=words):
         pmlem_one_step_late(operator, images, **{**good, **changed})

@@ -17,6 +17,7 @@ from faintfield.recon.solver.initialization import smooth_start
 from faintfield.recon.solver.penalties import Penalty, differences
 from faintfield.recon.solver.pmlem import PmlemIterate, norm, pmlem
 from faintfield.recon.solver.proximal import DualField
+from tests.recon.displaced import pixel_rays, run_until, views_displaced_by
 from tests.recon.small_problems import (
     SHAPE,
     DenseProblem,
@@ -54,10 +55,7 @@ def iterates_of(
 def solved(
     posed: DenseProblem, proposal: Image | None = None, *, tolerance: float = 1e-6, most: int = 400, **options: Any
 ) -> PmlemIterate:
-    for iterate in iterates_of(posed, proposal, tolerance=tolerance, **options):
-        if iterate.certificate.distance <= tolerance or iterate.passes >= most:
-            break
-    return iterate
+    return run_until(iterates_of(posed, proposal, tolerance=tolerance, **options), tolerance, most)
 
 
 def quadratic(delta: float) -> Callable[[Image], tuple[Image, Image]]:
@@ -193,11 +191,7 @@ def test_objective_never_rises(
     background_e: float, variance_e2: float, low: float, high: float, reached: float
 ) -> None:
     fit, start = started(problem(background_e=background_e, variance_e2=variance_e2, low=low, high=high))
-    iterates = []
-    for iterate in pmlem(fit, start, penalty_weight=0.5):
-        iterates.append(iterate)
-        if iterate.passes >= 40 or iterate.certificate.distance < 0.003:
-            break
+    iterates = list(islice(pmlem(fit, start, penalty_weight=0.5), 30))
     for before, after in pairwise(iterates):
         assert after.objective <= before.objective + 1e-6 * abs(before.objective)
     assert iterates[-1].certificate.distance < reached
@@ -208,8 +202,8 @@ def test_metric_of_even_light_is_hessian_row_sums() -> None:
     """Σ over pixels of (response)²/(response · light + b + σ²), which an even plane lets one count by hand."""
     response = 0.3
     posed, light_e = problem(), 4.0
-    grid, flat = PlaneGrid(SHAPE, 1.0, (0.0, 0.0)), np.full(posed.rays.shape[:2], response)
-    operator = PlaneOperator(posed.homographies, posed.rays, grid, flat=flat, dtype=np.float64)
+    flat = np.full(posed.operator.images_shape[1:], response)
+    operator = views_displaced_by(posed.shifts, SHAPE, flat=flat, dtype=np.float64)
     fit = DataFit(operator, posed.images, light_e)
     counted = posed.matrix[posed.counted].sum(axis=0).reshape(SHAPE)
     known_e2 = float(posed.images.background_e) + float(posed.images.read_variance_e2)
@@ -262,9 +256,7 @@ def test_without_light_optimum_is_black_and_certain() -> None:
     posed = problem()
     images = replace(posed.images, electrons=np.full_like(posed.images.electrons, -1.5))
     fit = DataFit(posed.operator, images, 1.0)
-    for iterate in islice(pmlem(fit, np.ones(SHAPE), penalty_weight=WEIGHT), 20):
-        if iterate.certificate.distance == 0:
-            break
+    iterate = run_until(pmlem(fit, np.ones(SHAPE), penalty_weight=WEIGHT), 0.0, 20)
     assert not iterate.plane.any()
     assert iterate.certificate.distance == 0
 
@@ -272,8 +264,7 @@ def test_without_light_optimum_is_black_and_certain() -> None:
 def test_unseen_samples_stay_finite() -> None:
     posed = problem()
     wide = PlaneGrid((4 * SHAPE[0], 4 * SHAPE[1]), 1.0, (-1.5 * SHAPE[1], -1.5 * SHAPE[0]))
-    rays = np.stack(np.meshgrid(np.arange(float(SHAPE[1])), np.arange(float(SHAPE[0]))), axis=-1)
-    operator = PlaneOperator(np.stack([np.eye(3)] * 12), rays, wide, dtype=np.float64)
+    operator = PlaneOperator(np.stack([np.eye(3)] * 12), pixel_rays(SHAPE), wide, dtype=np.float64)
     images = replace(posed.images, electrons=posed.images.electrons[:, 1:-1, 1:-1])
     fit, start = DataFit(operator, images, 3.0), smooth_start(operator, images)
     assert np.median(operator.sensitivity()) == 0

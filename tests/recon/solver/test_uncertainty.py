@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from faintfield.pipelines.reconstruction.penalised import Objective, certified, solve_pmlem
-from faintfield.pipelines.reconstruction.planes import solve
-from faintfield.pipelines.reconstruction.solutions import PriorName, Settings
+from faintfield.pipelines.reconstruction.planes.penalised import Objective, certified, solve_pmlem
+from faintfield.pipelines.reconstruction.planes.solutions import PriorName, Settings
+from faintfield.pipelines.reconstruction.planes.solve import solve
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.prior.answers import ProposalAnswers
 from faintfield.recon.prior.evidence import evidence_of_planes
@@ -93,10 +93,10 @@ def test_sigma_includes_contrast_that_the_penalty_removed() -> None:
     for residual in (noise, noise + lost):
         local = LocalFit(plane, np.full(shape, w), -w * residual, np.ones(shape), (1.0, 1.0))
         sigmas.append(standard_deviation(local, 60.0, Penalty(), np.random.default_rng(1)))
-    on, beside = np.s_[:, 60:], np.s_[:, :36]
-    assert np.sqrt(np.mean(sigmas[0][on] ** 2)) < 0.4
-    assert np.sqrt(np.mean(sigmas[1][on] ** 2)) == pytest.approx(1.5, rel=0.12)
-    assert sigmas[1][beside].mean() < 0.2
+    lit, dark = np.s_[:, 60:], np.s_[:, :36]
+    assert np.sqrt(np.mean(sigmas[0][lit] ** 2)) < 0.4
+    assert np.sqrt(np.mean(sigmas[1][lit] ** 2)) == pytest.approx(1.5, rel=0.12)
+    assert sigmas[1][dark].mean() < 0.2
 
 
 def test_sigma_of_a_black_plane_is_not_zero() -> None:

@@ -96,8 +96,8 @@ def test_the_sides_of_an_edge() -> None:
     index[4, 0] = 3  # not more than a slope
     near, far = near_side(index), near_side(index, of_near=False)
     assert np.argwhere(near).tolist() == [[1, 2], [1, 3], [1, 4], [2, 2], [2, 3], [2, 4]]
-    beside = [[0, 2], [0, 3], [0, 4], [1, 1], [1, 5], [2, 1], [2, 5], [3, 2], [3, 3], [3, 4]]
-    assert np.argwhere(far).tolist() == beside
+    far_samples = [[0, 2], [0, 3], [0, 4], [1, 1], [1, 5], [2, 1], [2, 5], [3, 2], [3, 3], [3, 4]]
+    assert np.argwhere(far).tolist() == far_samples
 
 
 def test_values_between_two_depths_are_interpolated() -> None:

@@ -1,5 +1,6 @@
 """Surfaces from simulated views against the truth; misleading scenes, where nothing may be sure and wrong."""
 
+from dataclasses import replace
 from functools import cache
 from unittest.mock import patch
 
@@ -14,12 +15,7 @@ from faintfield.recon.surface.estimate import SurfaceEstimate, estimate_surface
 from faintfield.recon.surface.evidence import DepthEvidence, Halves
 from faintfield.recon.surface.pinhole_views import UNKNOWN, PinholeViews
 from tests.recon import surface_scene
-from tests.recon.surface_scene import AXIS, FAR, FOCAL_PX, GRID, NEAR, NODE_MM, NODES, READ_VARIANCE_E2, SHAPE, UNMOVED
-
-# Light in electrons per pixel: its detail, 40 % of it, has about 1.4 times the noise's deviation
-LEVEL_E = 20.0
-FARTHEST, NEAREST = 1 / 650, 1 / 465
-DEPTHS = np.linspace(FARTHEST, NEAREST, 24)  # fewer than `equal_steps` would take, for speed
+from tests.recon.surface_scene import DEPTHS, FAR, FOCAL_PX, LEVEL_E, NEAR, NODE_MM, NODES, SHAPE, UNMOVED
 
 # Cameras that are equal steps apart, up to 2 mm
 ALMOST_REGULAR_MM = NODE_MM * (NODES[:, ::-1] - 2) + np.random.default_rng(4).uniform(-2, 2, (25, 2))
@@ -117,19 +113,14 @@ def _estimate_of(
     light: NDArray[np.float64], matrices: NDArray[np.float64] | None = None, seed: int = 7
 ) -> SurfaceEstimate:
     """Return the surface of the given light (view, row, column), with noise."""
-    generator = np.random.default_rng(seed)
-    known = generator.poisson(np.maximum(light, 0)) + generator.normal(0, READ_VARIANCE_E2**0.5, light.shape)
-    counted = np.where(light == UNKNOWN, UNKNOWN, known).astype(np.float32)
-    rays = surface_scene.matrices() if matrices is None else matrices
-    views = PinholeViews(counted, READ_VARIANCE_E2, rays, (FOCAL_PX, FOCAL_PX), AXIS, GRID)
-    return estimate_surface(views, DEPTHS, NODES)
+    views = surface_scene.noisy_views_of(light, seed)
+    return estimate_surface(views if matrices is None else replace(views, ray_from_surface=matrices), DEPTHS, NODES)
 
 
 def _sure(result: SurfaceEstimate, truth: NDArray[np.float64] | float | None = None) -> tuple[float, float]:
     """Return the shares of all samples that are sure and right, and sure and wrong."""
-    right = (
-        np.abs(result.inverse_depth / (surface_scene.inverse_depth() if truth is None else truth) - 1) < RIGHT_WITHIN
-    )
+    expected = surface_scene.inverse_depth() if truth is None else truth
+    right = np.abs(result.inverse_depth / expected - 1) < RIGHT_WITHIN
     sure = result.confidence >= SURE
     return float((sure & right).mean()), float((sure & ~right).mean())
 

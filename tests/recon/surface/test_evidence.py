@@ -15,13 +15,9 @@ from faintfield.recon.surface.held_out import predicted, seen_of, squared_errors
 from faintfield.recon.surface.pinhole_views import UNKNOWN, PinholeViews
 from faintfield.recon.surface.sweep import equal_steps, found_range
 from tests.recon import surface_scene
-from tests.recon.surface_scene import FAR, NEAR, NODES, SHAPE
+from tests.recon.surface_scene import DEPTHS, FAR, FARTHEST, LEVEL_E, NEAR, NEAREST, NODES, SHAPE
 
-# Light in electrons per pixel: its detail, 40 % of it, has about 1.4 times the noise's deviation
-LEVEL_E = 20.0
 LEFT_OUT = np.array([1, 8, 12, 15, 23])
-FARTHEST, NEAREST = 1 / 650, 1 / 465
-DEPTHS = np.linspace(FARTHEST, NEAREST, 24)
 
 
 @pytest.mark.parametrize(
@@ -70,11 +66,9 @@ def test_range_contains_the_scene_and_little_more(farthest: float, nearest: floa
 
 
 def test_noise_alone_has_no_range() -> None:
-    level_e = 5.0
-    noise = np.random.default_rng(1)
-    light = noise.poisson(level_e, (25, *SHAPE)) + noise.normal(0, surface_scene.READ_VARIANCE_E2**0.5, (25, *SHAPE))
+    views = surface_scene.noisy_views_of(np.full((25, *SHAPE), 5.0), 1)
     with pytest.raises(NothingInFocus, match=r"^the views tell the depth of [0-9.]+% of the picture; give"):
-        found_range(surface_scene.views_of(light), NODES, 1 / 1000, 1 / 380)
+        found_range(views, NODES, 1 / 1000, 1 / 380)
 
 
 def _evidence(views: PinholeViews) -> DepthEvidence:
@@ -89,9 +83,9 @@ def _index_of(inverse_depth: NDArray[np.float64]) -> NDArray[np.float64]:
 def test_right_surface_predicts_better_than_rivals() -> None:
     evidence = _evidence(surface_scene.drawn_views(LEVEL_E))
     kept = np.concatenate(evidence.halves)
-    beside = [kept[np.abs(NODES[kept] - NODES[view]).sum(axis=1) == 1] for view in LEFT_OUT]
-    right = predicted(evidence, _index_of(surface_scene.inverse_depth()), LEFT_OUT, beside)
-    wrong = predicted(evidence, _index_of(np.full(SHAPE, FAR)), LEFT_OUT, beside)
+    neighbours = [kept[np.abs(NODES[kept] - NODES[view]).sum(axis=1) == 1] for view in LEFT_OUT]
+    right = predicted(evidence, _index_of(surface_scene.inverse_depth()), LEFT_OUT, neighbours)
+    wrong = predicted(evidence, _index_of(np.full(SHAPE, FAR)), LEFT_OUT, neighbours)
     assert right.neighbours is not None
     assert 0.95 < right.surface < 1.4  # noise, and the cost of smoothing the light
     assert right.surface < 0.8 * wrong.surface
@@ -108,9 +102,9 @@ def test_neighbours_predict_faint_light_without_bias() -> None:
     generator = np.random.default_rng(4)
     light = 2.0 + generator.normal(0, 2.0, (25, *SHAPE))
     light[generator.random(light.shape) < 1 / 3] = UNKNOWN
-    beside = [np.setdiff1d(np.arange(25), LEFT_OUT)[:4]] * len(LEFT_OUT)
+    neighbours = [np.setdiff1d(np.arange(25), LEFT_OUT)[:4]] * len(LEFT_OUT)
     far = _index_of(np.full(SHAPE, FAR))
-    prediction = predicted(_evidence(surface_scene.views_of(light)), far, LEFT_OUT, beside)
+    prediction = predicted(_evidence(surface_scene.views_of(light)), far, LEFT_OUT, neighbours)
     assert prediction.neighbours == pytest.approx(1, abs=0.03)
     light[LEFT_OUT] = UNKNOWN
     prediction = predicted(_evidence(surface_scene.views_of(light)), far, LEFT_OUT, [])

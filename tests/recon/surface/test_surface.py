@@ -15,10 +15,6 @@ ONE_STEP, ANY_STEP = 0.7, 2.2
 DIRECTIONS = [(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1) if down or right]
 
 
-def _costs(*shape: int) -> NDArray[np.float32]:
-    return np.random.default_rng(8).uniform(0, 4, shape).astype(np.float32)
-
-
 def _change(step: int) -> float:
     return 0.0 if step == 0 else min(ONE_STEP, ANY_STEP) if abs(step) == 1 else ANY_STEP
 
@@ -34,7 +30,7 @@ def _best_on_path(costs: NDArray[np.float32], at: tuple[int, int], direction: tu
 
 
 def test_all_eight_paths_are_added_up() -> None:
-    costs = _costs(3, 4, 4)
+    costs = np.random.default_rng(8).uniform(0, 4, (3, 4, 4)).astype(np.float32)
     expected = [
         sum(_best_on_path(costs, (row, column), direction, z) for direction in DIRECTIONS)
         for row, column, z in np.ndindex(*costs.shape)

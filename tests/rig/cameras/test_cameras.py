@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 from faintfield.rig.cameras.aravis import AravisCamera
-from faintfield.rig.cameras.bounded import call_within
 from faintfield.rig.cameras.gphoto2 import GPhoto2Camera, shutter_s
 from faintfield.rig.cameras.micromanager import MicroManagerCamera
-from faintfield.rig.cameras.protocol import CameraReport, Exposure, Thermometer
+from faintfield.rig.cameras.protocol import CameraReport, Exposure, Thermometer, call_within
 from faintfield.rig.cameras.settings import (
     AravisSettings,
     CoolingSettings,
@@ -62,7 +61,7 @@ def test_exposure_is_either_file_or_array() -> None:
 
 def test_hanging_call_is_left_behind() -> None:
     never = threading.Event()
-    with pytest.raises(CameraTimeout, match=r"did not finish an exposure within 0\.01 s; "):
+    with pytest.raises(CameraTimeout, match=r"did not finish an exposure in 0\.01 s; "):
         call_within(0.01, never.wait, "an exposure")
     never.set()
     assert call_within(60.0, lambda: 7, "counting") == 7
@@ -166,19 +165,14 @@ def test_micromanager_faults(demo: MicroManagerCamera, tmp_path: Path) -> None:
         MicroManagerCamera(MicroManagerSettings(configuration=str(broken))).open()
     with pytest.raises(CameraError, match=r"'Binning' of Camera cannot be 'seventeen'; choose from 1, 2, 4, 8$"):
         MicroManagerCamera(MicroManagerSettings(properties={"Binning": "seventeen"})).open()
+    with pytest.raises(CameraTimeout, match=r"within 1e-06 s; "):
+        MicroManagerCamera(MicroManagerSettings(answer_s=1e-6)).open()
     demo.open()
     core = demo._core  # noqa: SLF001 - there is no other way to pull the virtual cable
     core.unloadDevice("Camera")
     with pytest.raises(CameraError, match=r"failed at an exposure .*; check its cable"):
         demo.expose(0.01, 1)
     demo.close()
-
-
-@pytest.mark.deep
-def test_micromanager_timeout() -> None:
-    pytest.importorskip("pymmcore_plus", reason="pymmcore-plus is not installed here: its time-out is not tried")
-    with pytest.raises(CameraTimeout, match=r"within 1e-06 s; "):
-        MicroManagerCamera(MicroManagerSettings(answer_s=1e-6)).open()
 
 
 @pytest.mark.parametrize(
@@ -246,7 +240,7 @@ def test_region_of_mosaic_begins_at_even_pixels() -> None:
 def test_missing_aravis_names_its_package() -> None:
     with (
         mock.patch("faintfield.rig.cameras.aravis_library.LIBRARY", "libaravis-0.0.so"),
-        pytest.raises(MissingExtra, match=r"needs libaravis-0\.0\.so, .*; run: apt-get install libaravis-0\.8-0"),
+        pytest.raises(MissingExtra, match=r"needs libaravis-0\.0\.so; run: apt-get install libaravis-0\.8-0"),
     ):
         AravisCamera(AravisSettings("Mono16")).open()
 
@@ -262,11 +256,11 @@ def test_failure_of_a_plugin_names_it() -> None:
     broken.open.side_effect = ValueError("no port")
     broken.expose.side_effect = [CameraTimeout("no frame"), ZeroDivisionError, frame]
     camera = PluginCamera("sky", broken)
-    with pytest.raises(CameraError, match="the plug-in 'sky' failed with ValueError: no port"):
+    with pytest.raises(CameraError, match="the plug-in 'sky' failed: ValueError: no port"):
         camera.open()
     with pytest.raises(CameraTimeout, match="no frame"):
         camera.expose(1.0, 1)
-    with pytest.raises(CameraError, match="'sky' failed with ZeroDivisionError"):
+    with pytest.raises(CameraError, match="'sky' failed: ZeroDivisionError"):
         camera.expose(1.0, 2)
     assert camera.expose(1.0, 3) is frame
     assert camera.report() is broken.report.return_value

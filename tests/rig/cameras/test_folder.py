@@ -131,10 +131,10 @@ def test_file_times_are_compared_with_the_folder_clock(program: Program) -> None
 
 def test_probe_for_the_folder_clock_is_removed(program: Program) -> None:
     camera = watching(program)
-    assert camera._request(5.0).folder_time_s is not None  # noqa: SLF001
+    assert camera._folder_time_s() is not None  # noqa: SLF001
     assert list(program.folder.iterdir()) == []
     with mock.patch.object(Path, "write_bytes", side_effect=PermissionError):
-        assert camera._request(5.0).folder_time_s is None  # noqa: SLF001
+        assert camera._folder_time_s() is None  # noqa: SLF001
 
 
 WHOLE, BLACK = ramp(rows=200), tiff(np.zeros((100, 100), np.uint16))

@@ -5,12 +5,10 @@ import socketserver
 import struct
 import threading
 import types
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
 from faintfield.rig.clock import WallClock
 from faintfield.testing import camera_contract
@@ -33,29 +31,18 @@ class Server(socketserver.StreamRequestHandler):
                 self.wfile.write(_PICTURE.astype(">u2").tobytes())
 
 
-@pytest.fixture
-def port() -> Iterator[int]:
-    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), Server) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield server.server_address[1]
-        server.shutdown()
-
-
-@pytest.fixture
-def module() -> types.ModuleType:
-    """Return the module that the document's first Python block is."""
+def test_documented_camera_meets_the_contract() -> None:
     block = re.search(r"^```python\n(.*?)^```$", _DOCUMENT.read_text(), flags=re.DOTALL | re.MULTILINE)
     assert block is not None
     module = types.ModuleType("faintfield_sky")
     exec(compile(block[1], _DOCUMENT, "exec"), module.__dict__)
-    return module
-
-
-def test_documented_camera_meets_the_contract(module: types.ModuleType, port: int) -> None:
     plugin = module.PLUGIN
-    camera: Any = plugin.make(plugin.settings(host="127.0.0.1", port=port), WallClock())
-    camera_contract(camera, 0.01)
-    camera.open()
-    assert camera.report().name == "Sky-1"
-    np.testing.assert_array_equal(camera.expose(0.01, 1).pixels, _PICTURE)
-    camera.close()
+    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), Server) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        camera: Any = plugin.make(plugin.settings(host="127.0.0.1", port=server.server_address[1]), WallClock())
+        camera_contract(camera, 0.01)
+        camera.open()
+        assert camera.report().name == "Sky-1"
+        np.testing.assert_array_equal(camera.expose(0.01, 1).pixels, _PICTURE)
+        camera.close()
+        server.shutdown()

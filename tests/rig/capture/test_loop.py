@@ -20,15 +20,14 @@ from faintfield.rig.errors import CaptureStopped, OutsideTravel, PlanRefused
 from faintfield.rig.plan import Grid, PlannedFrame, Stop
 from faintfield.rig.session.journal import Journal
 from faintfield.rig.session.resume import open_session
-from faintfield.rig.session.session import FrozenPlan, taken_frames
+from faintfield.rig.session.session import taken_frames
 from faintfield.rig.session.verify import verify
 from faintfield.rig.settings import SettleSettings, StepSettings
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.lab import SimulatedLab
 from faintfield.rig.stages.protocol import Point
-from tests.faults.capturing import BOARD, FRAMES, SMALL_RIG
-from tests.rig.capture.captures import Operator, assert_complete, capture
+from tests.faults.capturing import BOARD, FRAMES, SMALL_RIG, Operator, assert_complete, capture, events, frozen_plan
 from tests.rig.stages.benches import homed
 
 
@@ -46,9 +45,8 @@ def test_operator_is_led_through_all_steps(folder: Path) -> None:
         "Step 1 of 3: Bright set", "Step 2 of 3: Dark-scene set", "Step 3 of 3: Dark frames",
     ]  # fmt: skip
     assert any("Lights out" in line for line in operator.prompts[2].lines)
-    with Journal(folder / "journal.sqlite", read_only=True) as journal:
-        events = [event.detail for event in journal.events("prompt")]
-    assert [(event["key"], event["title"], event["answer"]) for event in events] == [
+    answers = [event.detail for event in events(folder, "prompt")]
+    assert [(detail["key"], detail["title"], detail["answer"]) for detail in answers] == [
         (prompt.key, prompt.title, "go") for prompt in operator.prompts
     ]
     last = operator.statuses[-1]
@@ -122,8 +120,8 @@ def test_impossible_rig_is_refused_before_motion() -> None:
 @pytest.mark.parametrize(
     ("offered_s", "wrong"),
     [
-        ((0.05, 0.2, 0.5, 2.0), r"exposure_s = 0\.1 is not offered .* nearest that is: (0\.05|0\.2);"),
-        ((0.1, 0.6, 1.5), r"exposure_s = 1 is not offered .* nearest that is: 1\.5;"),
+        ((0.05, 0.2, 0.5, 2.0), r"not offer exposure_s = 0\.1, the nearest is (0\.05|0\.2);"),
+        ((0.1, 0.6, 1.5), r"not offer exposure_s = 1, the nearest is 1\.5;"),
         ((0.1005, 0.995), None),
     ],
 )
@@ -184,9 +182,8 @@ def test_remaining_time_is_right_after_five_nodes(folder: Path) -> None:
         grid=Grid(2, 7, 50.0, Point(-350.0, -350.0)),
         step=(StepSettings("bright", 0.1), StepSettings("dark_scene", (0.1, 2.0)), StepSettings("dark", 1.0, 20)),
     )
-    plan = FrozenPlan(survey(open_rig(settings), settings).plan, settings)
     operator, estimates = Operator(), list[tuple[float, float]]()
-    with open_session(folder, plan) as session:
+    with open_session(folder, frozen_plan(settings)) as session:
         rig = open_rig(settings, session.journal)
         operator.on_status = lambda status: estimates.append((rig.clock.now_s(), status.to_go_s))
         Capture(session, rig, operator, lambda path: None).run()

@@ -19,8 +19,7 @@ from faintfield.rig.session.journal import Journal
 from faintfield.rig.session.session import taken_frames
 from faintfield.rig.settings import RigSettings
 from faintfield.rig.simulation.lab import SimulatedCamera
-from tests.faults.capturing import FRAMES, SMALL_RIG
-from tests.rig.capture.captures import Operator, capture
+from tests.faults.capturing import FRAMES, SMALL_RIG, Operator, capture, events
 
 # The sensor cools from 20 °C to -5 °C with a time constant of a minute.
 COOLED = SimulatedSettings(
@@ -32,9 +31,8 @@ def rig(camera: CameraSettings) -> RigSettings:
     return replace(SMALL_RIG, camera=camera)
 
 
-def events(folder: Path) -> list[dict[str, Any]]:
-    with Journal(folder / "journal.sqlite", read_only=True) as journal:
-        return [{"frame": event.frame, **event.detail} for event in journal.events("temperature")]
+def waits(folder: Path) -> list[dict[str, Any]]:
+    return [{"frame": event.frame, **event.detail} for event in events(folder, "temperature")]
 
 
 def temperatures_c(folder: Path) -> list[float | None]:
@@ -47,12 +45,12 @@ def test_every_step_begins_with_a_cool_sensor(tmp_path: Path) -> None:
     temperatures = temperatures_c(folder)
     assert len(set(temperatures)) == FRAMES  # each is that of its own time
     assert all(temperature is not None and abs(temperature + 5.0) <= 0.5 for temperature in temperatures)
-    waits = events(folder)
-    assert [wait["frame"] for wait in waits] == [0, 6, 12]
+    first, *others = waits(folder)
+    assert [wait["frame"] for wait in (first, *others)] == [0, 6, 12]
     # 25 K fall to 0.5 K in 60 s ln 50, less what passed since the camera was opened; then it stays there for 10 s
     until_s = 60.0 * math.log(50.0) + 10.0
-    assert until_s - 60.0 <= waits[0]["waited_s"] <= until_s + 15.0
-    assert [wait["waited_s"] for wait in waits[1:]] == [10.0, 10.0]
+    assert until_s - 60.0 <= first["waited_s"] <= until_s + 15.0
+    assert [wait["waited_s"] for wait in others] == [10.0, 10.0]
     lines = [status.doing for status in operator.statuses]
     waiting = [line for line in lines if line.startswith("sensor at")]
     assert any(line.startswith("sensor at 1") and line.endswith("C, waiting for -5.0 C") for line in waiting)
@@ -63,7 +61,7 @@ def test_every_step_begins_with_a_cool_sensor(tmp_path: Path) -> None:
 def test_default_is_not_to_wait(tmp_path: Path, start_c: float | None) -> None:
     camera = SimulatedSettings(size_px=(16, 12), start_temperature_c=start_c, cooling_s=60.0)
     assert capture(tmp_path / "session", settings=rig(camera)) is None
-    assert events(tmp_path / "session") == []
+    assert waits(tmp_path / "session") == []
     temperatures = temperatures_c(tmp_path / "session")
     if start_c is None:
         assert set(temperatures) == {-20.0}
@@ -100,7 +98,7 @@ def test_temperature_that_overshoots_is_not_settled(tmp_path: Path) -> None:
     readings = [-4.8, -5.2, -6.0, -6.5, -5.4, -5.6, -5.6, *[-5.0] * 1000]
     with mock.patch.object(SimulatedCamera, "temperature_c", side_effect=[-20.0, *readings]):
         assert capture(tmp_path / "session", settings=rig(COOLED)) is None
-    assert events(tmp_path / "session")[0]["waited_s"] == pytest.approx(14.0 + 10.0)
+    assert waits(tmp_path / "session")[0]["waited_s"] == pytest.approx(14.0 + 10.0)
 
 
 class CameraWithout:

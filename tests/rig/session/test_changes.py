@@ -1,6 +1,5 @@
-"""Which settings a session keeps, which may change before it is resumed, and what is recorded of it."""
+"""Settings that a session keeps, settings that may change before it is resumed, and their records."""
 
-import shutil
 from pathlib import Path
 from unittest import mock
 
@@ -11,14 +10,12 @@ from faintfield.rig.cameras.settings import FolderSettings, GPhoto2Settings, Sim
 from faintfield.rig.errors import PlanRefused
 from faintfield.rig.plan import CapturePlan
 from faintfield.rig.session.changes import adopt_settings, check_same_rig, find_changes, present_settings
-from faintfield.rig.session.journal import Journal
 from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.session import FrozenPlan, taken_frames
 from faintfield.rig.session.verify import verify
 from faintfield.rig.settings import CheckSettings, RigSettings
 from faintfield.rig.stages.protocol import StageSettings
-from tests.faults.capturing import SMALL_RIG
-from tests.rig.capture.captures import Operator, capture
+from tests.faults.capturing import SMALL_RIG, Operator, capture, events
 
 replace = msgspec.structs.replace
 
@@ -31,17 +28,11 @@ def with_checks(**values: float) -> RigSettings:
     return replace(SMALL_RIG, checks=CheckSettings(**values))  # type: ignore[arg-type]
 
 
-@pytest.fixture(scope="module")
-def begun(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A session of which four frames are taken."""
-    folder = tmp_path_factory.mktemp("begun") / "session"
-    capture(folder, Operator({}, {4: "stop"}))
-    return folder
-
-
 @pytest.fixture
-def session(begun: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(begun, tmp_path / "session"))
+def session(tmp_path: Path) -> Path:
+    """A session of which four frames are taken."""
+    capture(tmp_path / "session", Operator({}, {4: "stop"}))
+    return tmp_path / "session"
 
 
 @pytest.mark.parametrize(
@@ -132,9 +123,8 @@ def test_changes_are_recorded_and_apply(session: Path) -> None:
         assert opened.rig == strict
     capture(session, Operator({}, {2: "stop"}))
     assert present_settings(session) == strict
-    with Journal(session / "journal.sqlite", read_only=True) as journal:
-        events = [event.detail for event in journal.events("setting_changed")]
-    assert events == [{"key": "checks.saturation_dn", "old": None, "new": 1.0}]
+    changes = [event.detail for event in events(session, "setting_changed")]
+    assert changes == [{"key": "checks.saturation_dn", "old": None, "new": 1.0}]
     records = [committed.record for _, committed, _ in taken_frames(session)]
     assert [record.checks["saturated_share"] for record in records] == [0.0] * 4 + [1.0] * 2
     assert all(record.warnings for record in records[4:])
@@ -145,7 +135,6 @@ def test_change_back_is_recorded_but_no_repetition(session: Path) -> None:
     for now in (with_checks(leak_dn=9.0), with_checks(leak_dn=9.0), SMALL_RIG):
         with open_session(session, None) as opened:
             adopt_settings(opened, now)
-    with Journal(session / "journal.sqlite", read_only=True) as journal:
-        events = [(event.detail["old"], event.detail["new"]) for event in journal.events("setting_changed")]
-    assert events == [(8.0, 9.0), (9.0, 8.0)]
+    changes = [(event.detail["old"], event.detail["new"]) for event in events(session, "setting_changed")]
+    assert changes == [(8.0, 9.0), (9.0, 8.0)]
     assert present_settings(session) == SMALL_RIG

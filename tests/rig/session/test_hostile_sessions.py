@@ -11,9 +11,9 @@ import pytest
 
 from faintfield.rig.cameras.protocol import Exposure
 from faintfield.rig.errors import SessionBusy, SessionCorrupt, SessionUnreadable, SessionUnwritable
+from faintfield.rig.files import is_plain_name
 from faintfield.rig.plan import MAX_FRAMES
 from faintfield.rig.session.disk import lock_session
-from faintfield.rig.session.names import is_plain_name
 from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.session import read_plan, taken_frames
 from faintfield.rig.session.verify import verify

@@ -87,7 +87,7 @@ def test_file_name_outside_the_session_moves_nothing(unsealed: Path, tmp_path: P
     quoted = "||".join(f"char({ord(character)})" for character in name)
     session = forged(unsealed, version, f'UPDATE "commit" SET file = {quoted} WHERE intent = 3')
     before = sorted(tmp_path.rglob("*"))
-    assert_refused(session, "is not the name of a frame; restore")
+    assert_refused(session, "is no name of a frame; restore")
     assert (tmp_path / "victim.txt").read_text() == "important"
     assert sorted(tmp_path.rglob("*")) == before
 

@@ -18,7 +18,7 @@ from unittest import mock
 import pytest
 from msgspec.structs import replace
 
-from faintfield.rig.session.durable import sync_folder
+from faintfield.rig.files import sync_folder
 from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.verify import verify
 from faintfield.rig.settings import StepSettings
@@ -26,7 +26,7 @@ from tests.faults.capturing import SMALL_RIG, capture_small
 
 
 class Disk:
-    """What is on disk below a folder, as far as it is flushed.
+    """Flushed content of the disk below a folder.
 
     Parameters
     ----------

@@ -54,7 +54,7 @@ def view_of(
 
 
 def share_between(low_px: float, high_px: float, pixels: int) -> NDArray[np.float64]:
-    """How much of each pixel, one wide and centred on its index, lies between two edges."""
+    """Return the share of each pixel, one wide and centred on its index, that lies between two edges."""
     centres = np.arange(pixels)
     return np.asarray(np.clip(np.minimum(centres + 0.5, high_px) - np.maximum(centres - 0.5, low_px), 0.0, 1.0))
 

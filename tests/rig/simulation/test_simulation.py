@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from faintfield.rig.plan import centre_node, grid_nodes, nominal_poses_rt_cam_ref
-from faintfield.rig.simulation.cooling import Cooling
 from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
+from faintfield.rig.simulation.lab import Cooling
 from faintfield.rig.simulation.optics import SimulatedOptics, distort
 from faintfield.rig.simulation.sensor import SimulatedSensor
 

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from faintfield.rig.simulation.experiment import SimulatedExperiment, surface_experiment
+from faintfield.rig.simulation.experiment import surface_experiment
 from faintfield.rig.simulation.optics import SimulatedOptics
 from faintfield.rig.simulation.scene import RenderedView
 from faintfield.rig.simulation.shapes import Cylinder, Rectangle, Shape, Sphere
@@ -93,23 +93,6 @@ def test_shape_behind_or_around_the_camera_is_unmet() -> None:
     assert np.isinf(Sphere((0, 0, 0), 50).meet(np.zeros(3), ahead)).all()
 
 
-def test_inverse_depth_of_a_slanted_plane_is_linear() -> None:
-    depth = true_depth_mm([painted("wall", Rectangle((0.0, 0.4, 0.0, 0.0, 0.0, 500.0)), 1.0)], PINHOLE)
-    # Turned about y by 0.4, z along x is 500 - tan 0.4 · x
-    x = np.broadcast_to((np.arange(41) - 20) / 100, (31, 41))
-    np.testing.assert_allclose(1 / depth, (1 + np.tan(0.4) * x) / 500, rtol=1e-6)
-
-
-def test_depth_of_a_rod_follows_a_circle() -> None:
-    rod = painted("rod", Cylinder((-500.0, 0.0, 300.0), (500.0, 0.0, 300.0), 20.0), 1.0)
-    y = (np.arange(31) - 15) / 100
-    # |s (y, 1) - (0, 300)| = 20
-    root = np.sqrt(np.maximum(300**2 - (1 + y**2) * (300**2 - 20**2), 0))
-    expected = np.where(np.abs(y) < np.tan(np.arcsin(20 / 300)), (300 - root) / (1 + y**2), np.nan)
-    assert 10 < np.isfinite(expected).sum() < 31
-    np.testing.assert_allclose(true_depth_mm([rod], PINHOLE), np.repeat(expected[:, np.newaxis], 41, 1), rtol=1e-6)
-
-
 @pytest.mark.parametrize("name", SHAPES)
 def test_normals_are_where_the_distance_grows_fastest(name: str) -> None:
     shape, outside = SHAPES[name]
@@ -166,11 +149,6 @@ def test_nearer_surfaces_hide_farther_ones(reverse: bool) -> None:
     assert not view_of(surfaces, pose=from_behind).visible["rod"].any()
 
 
-@pytest.fixture(scope="module")
-def experiment() -> SimulatedExperiment:
-    return surface_experiment(120, 90).grey()
-
-
 def smooth(surface: Surface) -> Surface:
     """The surface with waves in place of its texture, which reading between pixels does not blur."""
     rows, columns = 2 * np.pi * np.indices((64, 64)) / 64
@@ -180,7 +158,8 @@ def smooth(surface: Surface) -> Surface:
 
 
 @pytest.mark.parametrize("view", [0, 45])
-def test_views_are_the_reference_moved_by_true_depth(view: int, experiment: SimulatedExperiment) -> None:
+def test_views_are_the_reference_moved_by_true_depth(view: int) -> None:
+    experiment = surface_experiment(120, 90).grey()
     optics, surfaces = experiment.optics.ideal(), [smooth(surface) for surface in experiment.surfaces]
     pose = experiment.poses_rt_cam_ref(0.3, 3.5e-3, np.random.default_rng(5))[view]
     reference, moved = view_of(surfaces, optics), view_of(surfaces, optics, pose)

@@ -1,34 +1,30 @@
 """Every stage meets the contract, over every kind of connection."""
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from functools import partial
 
 import pytest
 
 from faintfield.rig.devices import open_stage
+from faintfield.rig.plan import Grid
 from faintfield.rig.simulation.controller.bench import Bench, DirectLink, Link, PtyLink
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.stages.conformance import check_conformance
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.protocol import Point, StageSettings
 from faintfield.testing import stage_contract
-from tests.rig.stages.benches import CONTROLLERS, Controller, grbl, homed
+from tests.faults.stage_faults import filter_once, lose_steps
+from tests.rig.stages.benches import CONTROLLERS, Controller, firmware, homed, on_homing
 from tests.rig.stages.socket_link import SocketLink
-
-LINKS = [DirectLink, PtyLink, SocketLink]
-
-
-@pytest.fixture(params=LINKS)
-def link(request: pytest.FixtureRequest) -> Iterator[Link]:
-    link: Link = request.param()
-    yield link
-    if isinstance(link, PtyLink | SocketLink):
-        link.close()
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)
-def test_contract(controller: Controller, link: Link) -> None:
+@pytest.mark.parametrize("make_link", [DirectLink, PtyLink, SocketLink])
+def test_contract(controller: Controller, make_link: Callable[[], Link]) -> None:
+    link = make_link()
     stage_contract(Bench(controller, link).stage())
+    if isinstance(link, PtyLink | SocketLink):
+        link.close()
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)
@@ -49,11 +45,9 @@ def test_grid_of_49_nodes_takes_a_minute(controller: Controller) -> None:
     first = Point(travel.x_mm[0] + 50.0, travel.y_mm[0] + 50.0)
     stage.move_to(*first)
     started_s = bench.clock.now_s()
-    for row in range(7):
-        for column in range(7) if row % 2 == 0 else reversed(range(7)):
-            target = Point(first.x_mm + 50.0 * column, first.y_mm + 50.0 * row)
-            assert stage.move_to(*target).is_at(target)
-            assert bench.true_position() == pytest.approx(target, abs=1.0 / 160.0)
+    for stop in Grid(7, 7, 50.0, first).stops():
+        assert stage.move_to(*stop.target).is_at(stop.target)
+        assert bench.true_position() == pytest.approx(stop.target, abs=1.0 / 160.0)
     assert 33.0 < bench.clock.now_s() - started_s <= 60.0
 
 
@@ -76,24 +70,25 @@ def test_wrong_setting_fails_the_first_check() -> None:
 
 
 def test_slow_stage_fails_the_check_of_speed(bench: Bench, unhomed: Gantry) -> None:
+    settings = firmware(bench, SimulatedGrbl).settings
     for number in (110, 111):
-        grbl(bench).settings[number] = f"{0.5 * float(grbl(bench).settings[number]):.3f}"
+        settings[number] = f"{0.5 * float(settings[number]):.3f}"
     assert [check.name for check in check_conformance(unhomed) if not check.passed] == ["speed"]
 
 
 def test_lost_steps_fail_the_check_of_repeatability(bench: Bench, unhomed: Gantry) -> None:
     checks = check_conformance(unhomed)
     earlier = [next(checks) for _ in range(6)]
-    homings: list[bool] = []
 
-    def slip_after_the_timing(data: bytes) -> bytes:
-        homings.extend([True] * data.count(b"$H"))
-        if len(homings) == 4 and b"$J" in data:
-            bench.firmware.mechanics.axes[0].slip_mm += 1.0
-            homings.append(True)
+    def slip(data: bytes) -> bytes:
+        lose_steps(0, 1.0)(bench)
         return data
 
-    bench.wire.filters_to_controller.append(slip_after_the_timing)
+    def slip_at_next_jog(homing: int) -> None:
+        if homing == 4:  # after the timing
+            filter_once(bench.wire.filters_to_controller, slip, lambda data: b"$J" in data)
+
+    on_homing(bench, slip_at_next_jog)
     last = next(checks)
     assert all(check.passed for check in earlier)
     assert (last.name, last.passed) == ("repeatability", False)

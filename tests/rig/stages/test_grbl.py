@@ -11,7 +11,8 @@ from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.protocol import Box, Point, StageSettings
-from tests.rig.stages.benches import Controller, Traffic, grbl, homed
+from tests.faults.stage_faults import filter_once, report_idle_early
+from tests.rig.stages.benches import Controller, Traffic, firmware, homed
 
 
 def test_positions_are_independent_of_offset_and_report() -> None:
@@ -44,18 +45,11 @@ def test_stage_jogs_polls_rarely_and_never_unlocks(bench: Bench) -> None:
 
 
 def test_one_idle_report_does_not_end_a_wait(bench: Bench, stage: Gantry) -> None:
-    replaced: list[bytes] = []
-
-    def idle_while_it_moves(data: bytes) -> bytes:
-        if b"<Jog" in data and not replaced:
-            replaced.append(data)
-            return data.replace(b"<Jog", b"<Idle")
-        return data
-
-    bench.wire.filters_to_host.append(idle_while_it_moves)
-    grbl(bench).settings[110] = "3000.000"  # slower than the driver was told, so that it polls too soon
+    report_idle_early(bench)
+    # Slower than the driver was told, so that it polls too soon
+    firmware(bench, SimulatedGrbl).settings[110] = "3000.000"
     assert stage.move_to(-350.0, -350.0).is_at(Point(-350.0, -350.0))
-    assert replaced
+    assert bench.wire.filters_to_host == [], "it was reported"
 
 
 def with_version(version: bytes, data: bytes) -> bytes:
@@ -65,7 +59,7 @@ def with_version(version: bytes, data: bytes) -> bytes:
 def test_wrong_firmware_is_refused(bench: Bench) -> None:
     for version in (b"[VER:0.9j.20160316:]", b"[VER:3.7 FluidNC v3.7.8:]"):
         bench.wire.filters_to_host[:] = [partial(with_version, version)]
-        with pytest.raises(WrongFirmware, match=r"1\.1 or grblHAL is needed"):
+        with pytest.raises(WrongFirmware, match=r"flash 1\.1 or grblHAL"):
             bench.stage().connect()
     bench.wire.filters_to_host.clear()
     with pytest.raises(WrongFirmware, match="use protocol 'grbl'"):
@@ -153,14 +147,6 @@ def test_settings_that_change_while_read_are_refused(
     controller: Controller, start: bytes, old: bytes, new: bytes
 ) -> None:
     bench = Bench(controller)
-    changed: list[bytes] = []
-
-    def change_once(data: bytes) -> bytes:
-        if data.startswith(start) and not changed:
-            changed.append(data)
-            return data.replace(old, new)
-        return data
-
-    bench.wire.filters_to_host.append(change_once)
+    filter_once(bench.wire.filters_to_host, lambda data: data.replace(old, new), lambda data: data.startswith(start))
     with pytest.raises(StageLost, match="read differently"):
         bench.stage().connect()

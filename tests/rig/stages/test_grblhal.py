@@ -1,4 +1,4 @@
-"""What grblHAL does otherwise than GRBL, and how the driver copes with it."""
+"""Differences of grblHAL from GRBL, and the driver's handling of them."""
 
 import contextlib
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from faintfield.rig.simulation.controller.grblhal import SimulatedGrblHal
 from faintfield.rig.stages.drift import DriftWatch
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.protocol import Box
-from tests.rig.stages.benches import Traffic, grbl, hal, homed
+from tests.rig.stages.benches import Traffic, firmware, homed
 
 
 @pytest.fixture
@@ -70,11 +70,11 @@ def test_open_door_is_reported_and_discards_the_motion() -> None:
     stage = homed(bench)
     bench.firmware.receive(b"G53 G1 X-300 F3000\n")
     bench.clock.sleep_s(0.5)
-    grbl(bench).door_is_open = True
-    grbl(bench).open_door()
+    firmware(bench, SimulatedGrbl).door_is_open = True
+    firmware(bench, SimulatedGrbl).open_door()
     with pytest.raises(StageAlarm, match="door is open; close the door"):
         stage.recover()
-    grbl(bench).door_is_open = False
+    firmware(bench, SimulatedGrbl).door_is_open = False
     stage.recover()
     assert_nothing_goes_on(bench)
     assert stage.trusted, "the motion slowed down and was reset at rest"
@@ -85,7 +85,7 @@ def test_open_door_is_reported_and_discards_the_motion() -> None:
 def test_connecting_revives_a_board_silenced_by_alarm(controller: type[SimulatedGrbl], code: int) -> None:
     bench, traffic = Bench(controller, resets_on_open=False), Traffic()
     bench.clock.sleep_s(2.0)
-    grbl(bench).alarm(code)
+    firmware(bench, SimulatedGrbl).alarm(code)
     bench.clock.sleep_s(1.0)
     stage = bench.stage(traffic=traffic)
     stage.connect()
@@ -97,13 +97,13 @@ def test_connecting_revives_a_board_silenced_by_alarm(controller: type[Simulated
 
 def test_emergency_stop_has_to_be_released(bench: Bench, stage: Gantry) -> None:
     stage.move_to(-100.0, -100.0)
-    bench.clock.after(0.5, hal(bench).press_emergency_stop)
+    bench.clock.after(0.5, firmware(bench, SimulatedGrblHal).press_emergency_stop)
     for act in (lambda: stage.move_to(-300.0, -300.0), stage.recover, stage.recover):
         with pytest.raises(StageAlarm, match=r"ALARM:10: .*release the emergency stop, then") as caught:
             act()
         assert caught.value.code == 10
         assert not stage.trusted
-    hal(bench).release_emergency_stop()
+    firmware(bench, SimulatedGrblHal).release_emergency_stop()
     stage.recover()
     assert not stage.trusted
     stage.home()
@@ -112,7 +112,7 @@ def test_emergency_stop_has_to_be_released(bench: Bench, stage: Gantry) -> None:
 
 def test_emergency_stop_is_noticed_without_its_alarm(bench: Bench, stage: Gantry) -> None:
     bench.wire.filters_to_host.append(lambda data: b"" if b"ALARM" in data else data)
-    hal(bench).press_emergency_stop()
+    firmware(bench, SimulatedGrblHal).press_emergency_stop()
     with pytest.raises(StageAlarm, match="release the emergency stop"):
         stage.move_to(-100.0, -100.0)
     assert not stage.trusted

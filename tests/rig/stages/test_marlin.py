@@ -1,6 +1,5 @@
 """The Marlin driver on a simulated controller: one test for each peculiarity of the protocol."""
 
-from collections.abc import Callable
 from functools import partial
 
 import pytest
@@ -11,17 +10,13 @@ from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.marlin.controller import MarlinController
 from faintfield.rig.stages.protocol import Box, Point, StageSettings
-from tests.rig.stages.benches import homed, marlin
+from tests.faults.stage_faults import restart_unseen
+from tests.rig.stages.benches import firmware, homed
 
 
 @pytest.fixture
 def bench() -> Bench:
     return Bench(SimulatedMarlin)
-
-
-def without(*starts: bytes) -> Callable[[bytes], bytes]:
-    """Return a filter that removes lines with these beginnings."""
-    return lambda data: b"" if data.startswith(starts) else data
 
 
 def test_motors_stay_on_at_rest(bench: Bench, stage: Gantry) -> None:
@@ -48,8 +43,7 @@ def test_damaged_lines_are_sent_again_and_executed_once(bench: Bench, stage: Gan
 def test_recovery_notices_an_unheard_restart(bench: Bench, stage: Gantry) -> None:
     stage.recover()
     assert stage.trusted
-    bench.wire.filters_to_host.append(without(b"start"))
-    bench.firmware.restart()
+    restart_unseen(bench)
     bench.clock.sleep_s(5.0)
     stage.recover()
     assert not stage.trusted
@@ -136,15 +130,15 @@ def test_refusal_along_a_path_loses_the_position(bench: Bench, stage: Gantry, mo
 
 
 def test_controller_waiting_for_its_button_is_awaited(bench: Bench, stage: Gantry) -> None:
-    bench.clock.after(0.5, marlin(bench).wait_for_button)
-    bench.clock.after(300.0, marlin(bench).press_button)
+    bench.clock.after(0.5, firmware(bench, SimulatedMarlin).wait_for_button)
+    bench.clock.after(300.0, firmware(bench, SimulatedMarlin).press_button)
     assert stage.move_to(100.0, 100.0).is_at(Point(100.0, 100.0))
     assert bench.clock.now_s() > 300.0
     assert stage.trusted
 
 
 def test_button_is_awaited_for_ten_minutes_at_most(bench: Bench, stage: Gantry) -> None:
-    bench.clock.after(0.5, marlin(bench).wait_for_button)
+    bench.clock.after(0.5, firmware(bench, SimulatedMarlin).wait_for_button)
     begun_s = bench.clock.now_s()
     with pytest.raises(StageTimeout, match=r"'M400' within 60\d\.\d s, it waits for its button to be pressed; "):
         stage.move_to(100.0, 100.0)
@@ -154,7 +148,7 @@ def test_button_is_awaited_for_ten_minutes_at_most(bench: Bench, stage: Gantry) 
 
 def test_slow_motion_is_awaited_while_busy_within_bounds(bench: Bench, stage: Gantry) -> None:
     bound_s = 1.5 * 200.0 / 100.0 + 2.5
-    marlin(bench).settings["M203"] = 20.0
+    firmware(bench, SimulatedMarlin).settings["M203"] = 20.0
     assert stage.move_to(200.0, 0.0).trusted, "10 s, where 2.2 s were predicted"
     bench.firmware.mechanics.endless = True
     begun_s = bench.clock.now_s()

@@ -12,8 +12,7 @@ from faintfield.rig.errors import CameraError
 from faintfield.rig.micromanager import SharedCore
 from faintfield.rig.stages.conformance import check_conformance
 from faintfield.rig.stages.gantry import Gantry
-from faintfield.rig.stages.micromanager.controller import MicroManagerController
-from faintfield.rig.stages.micromanager.settings import MicroManagerStage
+from faintfield.rig.stages.micromanager import MicroManagerController, MicroManagerStage
 from faintfield.rig.stages.protocol import Box, StageSettings
 from faintfield.testing import stage_contract
 

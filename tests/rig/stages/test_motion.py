@@ -9,9 +9,15 @@ from hypothesis import strategies as st
 
 from faintfield.rig.errors import KeepOutCrossed, OutsideTravel
 from faintfield.rig.simulation.controller.kinematics import Profile
-from faintfield.rig.stages.motion import duration_s, one_sided_path, path_duration_s, timeout_s
+from faintfield.rig.stages.motion import (
+    StageWorkspace,
+    duration_s,
+    one_sided_path,
+    path_duration_s,
+    segment_meets,
+    timeout_s,
+)
 from faintfield.rig.stages.protocol import Box, MotionLimits, Point, Position
-from faintfield.rig.stages.workspace import StageWorkspace, segment_meets
 
 LIMITS = MotionLimits((100.0, 50.0), (500.0, 200.0))
 coordinates = st.floats(-300.0, 300.0).map(lambda value: round(value, 3))

@@ -9,6 +9,7 @@ import pytest
 
 from faintfield.rig.devices import open_stage
 from faintfield.rig.errors import StageAlarm, StageLost, StageTimeout
+from faintfield.rig.plan import Grid
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.protocol import Point, StageSettings
 from faintfield.testing import stage_contract
@@ -59,10 +60,8 @@ def test_grid_of_7_by_7(printer: tuple[Gantry, Command]) -> None:
     stage, _ = printer
     stage.connect()
     stage.home()
-    for row in range(7):
-        for column in range(7) if row % 2 == 0 else reversed(range(7)):
-            target = Point(20.0 + 50.0 * column, 20.0 + 50.0 * row)
-            assert stage.move_to(*target).is_at(target)
+    for stop in Grid(7, 7, 50.0, Point(20.0, 20.0)).stops():
+        assert stage.move_to(*stop.target).is_at(stop.target)
 
 
 @pytest.mark.parametrize(

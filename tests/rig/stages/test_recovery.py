@@ -13,7 +13,8 @@ from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.grbl.failures import alarm_failure, error_failure, state_failure
 from faintfield.rig.stages.grbl.messages import Report
 from faintfield.rig.stages.protocol import Point
-from tests.rig.stages.benches import Controller, Traffic, grbl, homed, marlin
+from tests.faults.stage_faults import lose_steps, restart_unseen, stick
+from tests.rig.stages.benches import Controller, Traffic, diagonal, firmware, homed
 
 type Fault = Callable[[Bench], object]
 
@@ -35,7 +36,7 @@ def interrupt() -> None:
 
 
 def alarm(code: int) -> Fault:
-    return lambda bench: grbl(bench).alarm(code)
+    return lambda bench: firmware(bench, SimulatedGrbl).alarm(code)
 
 
 def restart(bench: Bench) -> None:
@@ -44,12 +45,11 @@ def restart(bench: Bench) -> None:
 
 
 def unheard_restart(bench: Bench) -> None:
-    bench.wire.filters_to_host.append(lambda data: b"" if data.startswith((b"start", b"Grbl")) else data)
-    restart(bench)
+    restart_unseen(bench)
+    bench.clock.sleep_s(5.0)
 
 
-def slip(bench: Bench) -> None:
-    bench.firmware.mechanics.axes[0].slip_mm = 99.5  # the switch is nearer than the count says
+slip = lose_steps(0, 99.5)  # the switch is nearer than the count says
 
 
 def sent(data: bytes) -> Fault:
@@ -64,18 +64,8 @@ def later(fault: Callable[[Bench], None]) -> Fault:
     return lambda bench: bench.clock.after(0.5, lambda: fault(bench))
 
 
-def jam(bench: Bench) -> None:
-    bench.firmware.mechanics.axes[0].stuck = True
-
-
 def kill(bench: Bench) -> None:
-    marlin(bench).kill("Heating failed")
-
-
-def diagonal(stage: Gantry, distance_mm: float) -> Point:
-    """Return a point at a distance from the switches along both axes, within the travel."""
-    sign = 1.0 if stage.travel().x_mm[0] == 0.0 else -1.0
-    return Point(sign * distance_mm, sign * distance_mm)
+    firmware(bench, SimulatedMarlin).kill("Heating failed")
 
 
 def move(stage: Gantry) -> None:
@@ -95,14 +85,14 @@ FAULTS: list[tuple[Controller, Fault, Callable[[Gantry], object], type[BaseExcep
     (SimulatedGrbl, alarm(9), move, StageAlarm, "ALARM:9: ", False),
     (SimulatedGrbl, slip, move, StageAlarm, "ALARM:1", False),
     (SimulatedGrbl, later(lambda bench: interrupt()), move, KeyboardInterrupt, None, False),
-    (SimulatedGrbl, later(lambda bench: grbl(bench).pause()), move, StageAlarm, "on hold", True),
+    (SimulatedGrbl, later(lambda bench: firmware(bench, SimulatedGrbl).pause()), move, StageAlarm, "on hold", True),
     (SimulatedGrbl, sent(b"$J=G53 G90 X-200 F6000\n"), Gantry.position, StageAlarm, "moving without a command", True),
     (SimulatedGrbl, restart, Gantry.position, StageLost, "restarted", False),
-    (SimulatedGrbl, jam, Gantry.home, StageAlarm, "ALARM:9", False),
+    (SimulatedGrbl, stick, Gantry.home, StageAlarm, "ALARM:9", False),
     (SimulatedGrblHal, alarm(2), Gantry.position, StageAlarm, "ALARM:2:", True),
     (SimulatedGrblHal, alarm(17), Gantry.position, StageAlarm, "ALARM:17:", False),
     (SimulatedMarlin, kill, move, StageAlarm, "Heating failed", False),
-    (SimulatedMarlin, jam, Gantry.home, StageAlarm, "Homing Failed", False),
+    (SimulatedMarlin, stick, Gantry.home, StageAlarm, "Homing Failed", False),
     (SimulatedMarlin, unheard_restart, Gantry.position, StageLost, "waits for line 1 ", False),
 ]
 
@@ -160,7 +150,7 @@ def test_ctrl_c_breaks_off_homing(bench: Bench, unhomed: Gantry) -> None:
     with pytest.raises(KeyboardInterrupt):
         unhomed.home()
     bench.clock.sleep_s(0.1)
-    assert grbl(bench).state == "Alarm"
+    assert firmware(bench, SimulatedGrbl).state == "Alarm"
     unhomed.recover()
     unhomed.home()
     assert unhomed.trusted
@@ -190,7 +180,7 @@ def test_stop_in_motion_keeps_the_position(
 
 
 def test_motion_longer_than_predicted_is_stopped(bench: Bench, stage: Gantry) -> None:
-    grbl(bench).settings[110] = grbl(bench).settings[111] = "60.000"
+    firmware(bench, SimulatedGrbl).settings.update({110: "60.000", 111: "60.000"})
     begun_s = bench.clock.now_s()
     with pytest.raises(StageTimeout, match="still moves after"):
         stage.move_to(-300.0, -300.0)
@@ -210,7 +200,7 @@ def test_position_just_off_its_target_is_lost(stage: Gantry) -> None:
 
 
 def test_recovery_reads_the_settings_anew(bench: Bench, stage: Gantry) -> None:
-    grbl(bench).settings[130] = "200.000"
+    firmware(bench, SimulatedGrbl).settings[130] = "200.000"
     restart(bench)
     with pytest.raises(StageLost):
         stage.position()
@@ -241,9 +231,7 @@ def test_restart_after_alarm_2_loses_the_position(bench: Bench, stage: Gantry, h
     with pytest.raises(StageAlarm, match="ALARM:2"):
         stage.position()
     assert stage.trusted
-    if not heard:
-        bench.wire.filters_to_host.append(lambda data: b"" if b"Grbl" in data else data)
-    restart(bench)
+    (restart if heard else unheard_restart)(bench)
     stage.recover()
     assert not stage.trusted
 

@@ -1,11 +1,11 @@
-"""What the settings of a controller mean, computed by hand from the firmware's documentation."""
+"""Meaning of the settings of a controller, computed by hand from the firmware's documentation."""
 
 import pytest
 
 from faintfield.rig.errors import WrongFirmware
 from faintfield.rig.stages.grbl.settings import GrblSettings
 from faintfield.rig.stages.marlin import messages as marlin
-from faintfield.rig.stages.marlin.settings import MarlinSettings
+from faintfield.rig.stages.marlin.settings import marlin_identity
 from faintfield.rig.stages.protocol import Box, Identity, MotionLimits
 
 GRBL = {
@@ -34,7 +34,7 @@ def of_marlin(*changes: tuple[str, str], axes: tuple[str, str] = ("X", "Y"), tra
     for old, new in changes:
         assert old in lines
         lines = lines.replace(old, new)
-    return MarlinSettings(map(marlin.parse, lines.splitlines())).identity(axes, travel)
+    return marlin_identity(map(marlin.parse, lines.splitlines()), axes, travel)
 
 
 def test_identity_of_grbl() -> None:
@@ -135,7 +135,7 @@ def test_other_axes_of_marlin_have_own_settings() -> None:
 def test_marlin_without_limits_or_parser_gives_warning() -> None:
     travel = Box((0.0, 50.0), (0.0, 60.0))
     without_limits = of_marlin((MARLIN[-1], "ok"), travel=travel)
-    assert [warning.split(":")[0] for warning in without_limits.warnings] == ["the controller reports no limits"]
+    assert [warning.split(":")[0] for warning in without_limits.warnings] == ["no limits are reported"]
     without_parser = of_marlin(("PARSER:1", "PARSER:0"))
     assert [warning.split(":")[0] for warning in without_parser.warnings] == ["no emergency parser"]
 
@@ -145,7 +145,7 @@ def test_marlin_without_limits_or_parser_gives_warning() -> None:
     [
         (("M203 X100.00 Y50.00", "M203 X100.00 Y0.00"), "M203 Y=0: "),
         (("T300.00", "T-1.00"), "M204 T=-1: "),
-        (("Marlin 2.1.2.4", "Repetier 1.0"), "'Repetier 1.0 .*'; Marlin is needed"),
+        (("Marlin 2.1.2.4", "Repetier 1.0"), "'Repetier 1.0 .*', not Marlin"),
     ],
 )
 def test_impossible_values_of_marlin_are_refused_by_name(change: tuple[str, str], message: str) -> None:

@@ -1,11 +1,15 @@
 """Noise of values rounded to whole DN, against rounded numbers and sums over their distribution."""
 
+from dataclasses import replace
+from itertools import count
+
 import numpy as np
 import pytest
 from scipy import stats
 
 from faintfield.calib.noise import Conditions, Series, calibrate, measure_series
 from faintfield.calib.noise.likelihood.rounding import dark_roundings, flat_rounding
+from tests.calib.noise.darkroom import dark_series, expose, specimen
 
 SHAPE = (64, 80)
 EVERY = np.ones(SHAPE, bool)
@@ -13,14 +17,9 @@ EVERY = np.ones(SHAPE, bool)
 
 def rounded_darks(offset_dn: float, spread_dn: float, noise_dn: float, seed: int, frames: int = 20) -> list[Series]:
     """Return two series of darks without dark current, whose pixels' offsets differ by `spread_dn`."""
-    rng = np.random.default_rng(seed)
-    offsets = offset_dn + spread_dn * rng.standard_normal(SHAPE)
-    series = []
-    for exposure_s in (1.0, 10.0):
-        frames_dn = [np.rint(offsets + noise_dn * rng.standard_normal(SHAPE)) for _ in range(frames)]
-        named = [(f"{exposure_s} {k}", frame.astype(np.uint16)) for k, frame in enumerate(frames_dn)]
-        series.append(measure_series(named, Conditions("dark", exposure_s)))
-    return series
+    noise = {"gain_dn_per_e": 1.0, "read_noise_e": noise_dn, "dark_current_e_per_s": 0.0, "dsnu_e": spread_dn}
+    chip, rng = specimen(seed, shape=SHAPE, offset_dn=offset_dn, **noise)
+    return dark_series(chip, (1.0, 10.0), frames, rng)
 
 
 def variance_of_rounded(mean_dn: float, noise_dn: float) -> float:
@@ -65,29 +64,25 @@ def test_read_noise_of_half_a_dn_is_right() -> None:
     estimates = [calibrate(darks, 255.0).estimates["read_noise_dn"] for darks in series]
     values = np.array([estimate.value for estimate in estimates], float)
     assert abs(values.mean() / 0.5 - 1) < 0.004
-    assert (
-        sum((estimate.ci95 or (1.0, 0.0))[0] <= 0.5 <= (estimate.ci95 or (1.0, 0.0))[1] for estimate in estimates) >= 3
-    )
+    intervals = [estimate.ci95 or (1.0, 0.0) for estimate in estimates]
+    assert sum(low <= 0.5 <= high for low, high in intervals) >= 3
 
 
 def coarse_camera(seed: int, drift_dn: float, offset_dn: float) -> list[Series]:
     """Measure 8 bits, 0.02 DN per electron, 12 e- of read noise: 0.24 DN, with a level that rises by frames."""
-    rng, shape, count = np.random.default_rng(seed), (96, 96), 0
-    offsets = offset_dn + 0.2 * rng.standard_normal(shape)
+    converter = {"offset_dn": offset_dn, "gain_dn_per_e": 0.02, "ceiling_dn": 255.0}
+    chip, rng = specimen(seed, shape=(96, 96), **converter, read_noise_e=12.0, dark_current_e_per_s=5.0, dsnu_e=10.0)
+    levels_dn = (chip.offset_dn + drift_dn * index for index in count())
 
-    def take(mean_e: float, conditions: Conditions, frames: int) -> Series:
-        nonlocal count
-        named = []
-        for k in range(frames):
-            electrons = rng.poisson(mean_e, shape) + 12.0 * rng.standard_normal(shape)
-            dn = offsets + 0.02 * electrons + drift_dn * count
-            named.append((f"{conditions} {k}", np.clip(np.rint(dn), 0, 255).astype(np.uint8)))
-            count += 1
+    def measured(conditions: Conditions, frames: int) -> Series:
+        moving = [replace(chip, offset_dn=next(levels_dn)) for _ in range(frames)]
+        photons = conditions.photons or 0.0
+        named = [(f"{k}", expose(now, conditions.exposure_s, rng, photons)) for k, now in enumerate(moving)]
         return measure_series(named, conditions)
 
-    series = [take(5.0 * t, Conditions("dark", t), 6) for t in (0.01, 1.0, 10.0)]
-    photons = np.linspace(1500.0, 22000.0, 12)
-    return [*series, *(take(0.5 * p, Conditions("flat", 0.01, j, p), 2) for j, p in enumerate(photons))]
+    darks = [measured(Conditions("dark", t), 6) for t in (0.01, 1.0, 10.0)]
+    photons = np.linspace(1500.0, 22000.0, 12).tolist()
+    return [*darks, *(measured(Conditions("flat", 0.01, level, light), 2) for level, light in enumerate(photons))]
 
 
 @pytest.mark.parametrize(("drift_dn", "offset_dn"), [(0.0, 10.25), (0.03, 10.0)])

@@ -1,6 +1,5 @@
 """`export zarr`: what the libraries of OME-Zarr and zarr read is what was reconstructed, where it is."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -8,8 +7,8 @@ import numpy as np
 import pytest
 import tifffile
 
-from tests.pipelines.conftest import Command
-from tests.pipelines.refusals import assert_refused
+from tests.pipelines.conftest import Command, assert_refused
+from tests.pipelines.forms import read_record
 
 zarr = pytest.importorskip("zarr")
 ome_zarr_models = pytest.importorskip("ome_zarr_models")
@@ -30,11 +29,6 @@ def _scales(multiscale: Any) -> list[tuple[list[float], list[float]]]:
     return [(list(scale.scale), list(translation.translation)) for scale, translation in pairs]
 
 
-def _planes(out: Path) -> list[dict[str, Any]]:
-    planes: list[dict[str, Any]] = json.loads((out / "reconstruction.json").read_text())["planes"]
-    return planes
-
-
 def test_sweep_is_in_mm_and_milliradians(sweep: Path, tmp_path: Path, done: Command) -> None:
     stack = tmp_path / "sweep.ome.zarr"
     done("export", "zarr", sweep, stack)
@@ -46,7 +40,7 @@ def test_sweep_is_in_mm_and_milliradians(sweep: Path, tmp_path: Path, done: Comm
         ("x", "space", None),
     ]
     ((scale, translation),) = _scales(multiscale)
-    first = _planes(sweep)[0]
+    first = read_record(sweep)["planes"][0]
     assert scale[:2] == [1.0, pytest.approx(50.0)]
     assert translation[:2] == [0.0, 500.0]
     for axis, start in ((3, first["origin_mm"][0]), (2, first["origin_mm"][1])):
@@ -55,23 +49,24 @@ def test_sweep_is_in_mm_and_milliradians(sweep: Path, tmp_path: Path, done: Comm
     assert group.attrs["faintfield"]["row_and_column"] == "mrad"
     pixels = group["0"][:]
     assert pixels.dtype == np.float32
-    np.testing.assert_array_equal(pixels[0], [tifffile.imread(sweep / plane["file"]) for plane in _planes(sweep)])
+    np.testing.assert_array_equal(
+        pixels[0], [tifffile.imread(sweep / plane["file"]) for plane in read_record(sweep)["planes"]]
+    )
 
 
 @pytest.mark.usefixtures("undrawn")
 def test_large_colour_planes_have_several_resolutions(
-    tmp_path: Path, done: Command, small_options: tuple[object, ...], monkeypatch: pytest.MonkeyPatch
+    colour_set: Path, tmp_path: Path, done: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("faintfield.pipelines.formats.exchange.zarr._COARSEST_PX", 30)
+    monkeypatch.setattr("faintfield.pipelines.formats.exchange.zarr._COARSEST_PX", 20)
     monkeypatch.setattr("faintfield.pipelines.formats.exchange.zarr._CHUNK_PX", 40)
-    done("simulate", tmp_path / "set", *small_options, "--colour", "bayer", "--snr", 20)
     out, stack = tmp_path / "out", tmp_path / "sweep.ome.zarr"
-    done("reconstruct", tmp_path / "set", "--out", out, "--depth-mm", 500, "--method", "backprojection")
+    done("reconstruct", colour_set, "--out", out, "--depth-mm", 500, "--method", "backprojection")
     done("export", "zarr", out, stack)
     group, multiscale = _image(stack)
     plane = np.moveaxis(tifffile.imread(out / "plane_00500.0.tiff"), 2, 0)
     assert [dataset.path for dataset in multiscale.datasets] == ["0", "1", "2"]
-    assert [group[level].shape for level in "012"] == [(3, 1, 72, 96), (3, 1, 36, 48), (3, 1, 18, 24)]
+    assert [group[level].shape for level in "012"] == [(3, 1, 48, 64), (3, 1, 24, 32), (3, 1, 12, 16)]
     assert group["0"].chunks == (1, 1, 40, 40)
     np.testing.assert_array_equal(group["0"][:, 0], plane)
     # A sample of any resolution is the mean of those it stands for, and lies in their middle
@@ -83,22 +78,6 @@ def test_large_colour_planes_have_several_resolutions(
         for axis, index in ((2, 2), (3, 5)):
             middle = finest[1][axis] + finest[0][axis] * (index * size + (size - 1) / 2)
             assert translation[axis] + scale[axis] * index == pytest.approx(middle)
-
-
-def test_only_earlier_exports_are_replaced(sweep: Path, tmp_path: Path, done: Command, faintfield: Command) -> None:
-    stack = tmp_path / "sweep.ome.zarr"
-    done("export", "zarr", sweep, stack)
-    assert_refused(faintfield("export", "zarr", sweep, stack), "OutputExists")
-    done("export", "zarr", sweep, stack, "--overwrite")
-    (stack / "notes.txt").touch()
-    ended = faintfield("export", "zarr", sweep, stack, "--overwrite")
-    assert_refused(ended, "OutputExists", "holds files already (notes.txt)")
-    # Arrays of other programs have a zarr.json, too
-    theirs = tmp_path / "theirs.zarr"
-    zarr.open_group(theirs, mode="w", zarr_format=3).create_array("0", shape=(3,), dtype="float32")[:] = [1, 2, 3]
-    for words in ((), ("--overwrite",)):
-        assert_refused(faintfield("export", "zarr", sweep, theirs, *words), "OutputExists")
-        np.testing.assert_array_equal(zarr.open_group(theirs, mode="r")["0"][:], [1, 2, 3])
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -119,4 +98,6 @@ def test_only_planes_in_equal_steps_are_stacked(
     assert [axis.unit for axis in multiscale.axes] == [None, "millimeter", "millimeter", "millimeter"]
     ((scale, translation),) = _scales(multiscale)
     assert scale == [1.0, pytest.approx(1.0), 5.0, 5.0]
-    assert translation[2:] == [pytest.approx(value) for value in _planes(tmp_path / "mm")[0]["origin_mm"][::-1]]
+    assert translation[2:] == [
+        pytest.approx(value) for value in read_record(tmp_path / "mm")["planes"][0]["origin_mm"][::-1]
+    ]

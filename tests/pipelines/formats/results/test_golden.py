@@ -5,7 +5,6 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from faintfield.pipelines.cli import run
 from faintfield.pipelines.formats.files import write_json
 from faintfield.pipelines.formats.results.geometry import GeometryRecord
 from faintfield.pipelines.formats.results.noise import NoiseRecord
@@ -40,8 +39,6 @@ KINDS: dict[str, type[msgspec.Struct]] = {
 PAIR = ("--depth-mm", 500, "--depth-mm", 700)
 SWEEP = ("--sweep-mm", "400:800:5", "--method", "backprojection")
 
-DEEP = ("PMLEM", "one-step-late", "sweep", "depth map")
-
 # Options that make results from the small scene, and the golden files of the same form.
 FRESH: dict[str, tuple[tuple[object, ...], tuple[str, ...]]] = {
     "PMLEM": ((*PAIR, "--prior", "tv"), ("reconstruction_pmlem", "plane_pmlem")),
@@ -60,24 +57,15 @@ def test_golden_file_is_written_as_it_was_read(path: Path, tmp_path: Path) -> No
     assert (tmp_path / path.name).read_bytes() == path.read_bytes()
 
 
-@pytest.fixture(scope="module")
-def golden_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A set of fewer views and pixels than the golden one, with more light."""
-    folder = tmp_path_factory.mktemp("golden") / "set"
-    words = ("simulate", folder, "--seed", 3, "--size-px", 96, 72, "--rows", 5, "--columns", 5, "--snr", 2)
-    assert run([str(word) for word in words]) == 0
-    return folder
-
-
 @pytest.mark.parametrize(
-    "call", [pytest.param(call, marks=[pytest.mark.deep] if call in DEEP else []) for call in FRESH]
+    "call", [pytest.param(call, marks=[] if call == "learned prior" else [pytest.mark.deep]) for call in FRESH]
 )
 def test_fresh_results_have_the_form_of_golden_ones(
-    call: str, seen: Searches, golden_scene: Path, tmp_path: Path, done: Command, monkeypatch: pytest.MonkeyPatch
+    call: str, seen: Searches, bright_scene: Path, tmp_path: Path, done: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(confidence, "SURE", 0.9 * FOUND_CONFIDENCE)
     options, names = FRESH[call]
-    done("reconstruct", golden_scene, "--out", tmp_path, *options)
+    done("reconstruct", bright_scene, "--out", tmp_path, *options)
     for name in names:
         kind = name.rpartition("_")[0]
         file = "plane_00500.0.json" if kind == "plane" else f"{kind}.json"

@@ -1,6 +1,5 @@
 """Planes and stacks as ImageJ and napari see them: the right scale, named and labelled."""
 
-import json
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -12,6 +11,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from tests.pipelines.conftest import Command
+from tests.pipelines.forms import read_record
 
 
 def _calibration(path: Path) -> tuple[dict[str, Any], float, NDArray[Any]]:
@@ -35,7 +35,7 @@ def test_sweep_is_imagej_stack_of_angles(sweep: Path) -> None:
     assert -description["zorigin"] * description["spacing"] == 500.0
     assert description["Labels"][0] == "500 mm, 4.167 mm/px"
     assert description["Labels"][-1].startswith("700 mm, ")
-    record = json.loads((sweep / "reconstruction.json").read_text())["planes"][0]
+    record = read_record(sweep)["planes"][0]
     assert -description["xorigin"] * record["pitch_mm"] == pytest.approx(record["origin_mm"][0])
     assert -description["yorigin"] * record["pitch_mm"] == pytest.approx(record["origin_mm"][1])
     for plane, depth in zip(pixels, (500, 550, 600, 650, 700), strict=True):
@@ -57,10 +57,9 @@ def test_planes_of_one_pitch_are_stacked_in_mm(scene: Path, tmp_path: Path, done
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_colour_sweep_is_composite(small_options: tuple[object, ...], tmp_path: Path, done: Command) -> None:
-    done("simulate", tmp_path / "set", *small_options, "--colour", "bayer")
+def test_colour_sweep_is_composite(colour_set: Path, tmp_path: Path, done: Command) -> None:
     words = ("--sweep-mm", "500:600:3", "--method", "backprojection")
-    done("reconstruct", tmp_path / "set", *words, "--out", tmp_path / "out")
+    done("reconstruct", colour_set, *words, "--out", tmp_path / "out")
     description, _, pixels = _calibration(tmp_path / "out" / "stack.tiff")
     assert [description[key] for key in ("mode", "channels", "slices", "axes")] == ["composite", 3, 3, "ZCYX"]
     assert len(description["Labels"]) == 9

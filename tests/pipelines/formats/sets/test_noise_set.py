@@ -24,16 +24,10 @@ from faintfield.rig.plan import StepKind
 from faintfield.rig.session.session import taken_frames
 from faintfield.rig.simulation.lab import SimulatedCamera, SimulatedLab
 from tests.calib.noise.darkroom import specimen
+from tests.pipelines.by_hand import FITTED, write_fitted_noise
 from tests.pipelines.conftest import SetMaker
 from tests.pipelines.noise_sets import measure_sensor, take_set, write_frames
 from tests.pipelines.sessions import captured, rig_toml
-
-FITTED = {
-    "offset_dn": {"value": 100.0, "se": 0.1},
-    "gain_dn_per_e": {"value": 2.0, "se": 0.01},
-    "read_noise_e": {"value": 3.0, "se": 0.02},
-    "dark_current_e_per_s": {"value": 0.2, "se": 0.01},
-}
 
 
 class TestNoiseJson:
@@ -42,13 +36,13 @@ class TestNoiseJson:
     @pytest.fixture
     def folder(self, make_set: SetMaker, grey_images: Sequence[NDArray[np.uint16]]) -> Path:
         folder = make_set(grey_images, noise="noise.json")
-        (folder / "noise.json").write_text(json.dumps(FITTED | {"hot_pixels": [[3, 15], [11, 0]]}))
+        write_fitted_noise(folder, hot_pixels=[[3, 15], [11, 0]])
         return folder
 
     def test_unknown_dark_current_counts_as_zero(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        changes = {"quantum_efficiency": 0.5, "saturation_dn": {"value": 4095.0}}
+        changes: dict[str, Any] = {"quantum_efficiency": 0.5, "saturation_dn": {"value": 4095.0}}
         changes["dark_current_e_per_s"] = {"value": None, "why": "all exposures are equally long"}
-        (folder / "noise.json").write_text(json.dumps(FITTED | changes))
+        write_fitted_noise(folder, **changes)
         elemental_set = load_set(folder)
         noise = elemental_set.noise
         assert (noise.offset_dn, noise.gain_dn_per_e, noise.read_noise_e) == (100.0, 2.0, 3.0)
@@ -69,7 +63,7 @@ class TestNoiseJson:
             (folder / "noise.json").write_text(content)
             with pytest.raises(BadValue, match=rf"(noise\.json|elemental\.toml): .*{words}"):
                 load_set(folder)
-        (folder / "noise.json").write_text(json.dumps(FITTED))
+        write_fitted_noise(folder)
         np.savez(folder / "noise_maps.npz", offset_dn=np.ones((16, 12), bool))
         with pytest.raises(BadValue, match=r"offset_dn has shape \(16, 12\), expected is \(12, 16\)"):
             load_set(folder)

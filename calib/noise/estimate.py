@@ -1,0 +1,62 @@
+"""A measured value with its standard error and interval, or the reason why there is none."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+_NO_SPREAD = "the values are not much likelier with a spread, so that none was fitted; record more darks"
+
+# Standard errors by which a variance is negative beyond chance: once in a thousand sound measurements, or less.
+_HIDDEN_SIGMA = 3.2
+
+# Largest exponent of an interval's end over its value; nothing beyond is of use.
+_MAX_EXPONENT = 50.0
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A measured value, or the reason why there is none.
+
+    Attributes
+    ----------
+    value : float, optional
+        None if the frames do not determine it.
+    se : float, optional
+        Standard error.
+    ci95 : tuple of float, optional
+        95 % confidence interval.
+    why : str, optional
+        Why there is no value, and what to record to get one.
+    """
+
+    value: float | None
+    se: float | None = None
+    ci95: tuple[float, float] | None = None
+    why: str | None = None
+
+
+def interval(value: float, se: float, quantile: float, *, positive: bool = False) -> Estimate:
+    """Return an estimate with its interval, which is symmetric on a logarithmic scale for positive quantities."""
+    if positive:
+        factor = float(np.exp(min(quantile * se / value, _MAX_EXPONENT)))
+        return Estimate(value, se, (value / factor, value * factor))
+    return Estimate(value, se, (value - quantile * se, value + quantile * se))
+
+
+def root(variance: float, se: float, quantile: float, scale: float = 1.0) -> Estimate:
+    """Return the root of a variance, times a scale; no value if the variance is significantly negative.
+
+    Where it is negative by chance, the interval is from 0 to the root of one standard error at least.
+    """
+    if not se:
+        return Estimate(None, why=_NO_SPREAD)
+    if variance < -_HIDDEN_SIGMA * se:
+        return Estimate(
+            None,
+            why=f"there is less scatter than the pixels' noise alone makes, by {-variance / se:.2g} standard errors "
+            f"(limit {_HIDDEN_SIGMA:g}), so that a spread would be hidden; the noise of the frames is not independent, "
+            "as when pickup changes its phase from frame to frame, which means of 10 frames or more show less",
+        )
+    low = float(np.sqrt(max(variance - quantile * se, 0.0))) * scale
+    high = float(np.sqrt(max(variance + quantile * se, se))) * scale
+    return Estimate(float(np.sqrt(max(variance, 0.0))) * scale, (high - low) / (2 * quantile), (low, high))

@@ -1,0 +1,1 @@
+"""The fit of the series, with the scatter between them."""

@@ -1,1 +1,0 @@
-"""Misfit of the model to the frames: scatter, goodness of fit, drift, contradictions."""

@@ -1,1 +1,0 @@
-"""`faintfield export`: sets and results become files of other people's programs."""

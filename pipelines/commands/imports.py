@@ -1,0 +1,117 @@
+"""`faintfield import`: sets of images, or of frames, from files of other programs; grids of pictures: `import_grid`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from faintfield.pipelines.arguments import ImportOptions, Positive
+
+if TYPE_CHECKING:
+    from faintfield.pipelines.formats.exchange.emva1288 import ImportedFrames
+    from faintfield.pipelines.formats.exchange.imported_set import ImportedSet
+
+_DEFAULTS = ImportOptions()
+
+type Result = ImportedSet
+type Frames = ImportedFrames
+
+
+def import_colmap(src: Path, out: Path, /, *, options: ImportOptions = _DEFAULTS) -> Result:
+    """Make an elemental set from a COLMAP model, text or binary, and its images.
+
+    Parameters
+    ----------
+    src
+        Folder of the sparse model: cameras and images, .bin or .txt.
+    out
+        Folder to write.
+    """
+    from faintfield.pipelines.formats.exchange.colmap import import_model
+
+    return import_model(src, out, options)
+
+
+def import_mrcal(src: Path, out: Path, /, *, options: ImportOptions = _DEFAULTS) -> Result:
+    """Make an elemental set from a folder of .cameramodel files and images of the same names.
+
+    Parameters
+    ----------
+    src
+        Folder of .cameramodel files, one per image, all with the same lens but for its principal point.
+    out
+        Folder to write.
+    """
+    from faintfield.pipelines.formats.exchange.mrcal import import_camera_models
+
+    return import_camera_models(src, out, options)
+
+
+def import_nerfstudio(src: Path, out: Path, /, *, options: ImportOptions = _DEFAULTS) -> Result:
+    """Make an elemental set from the transforms.json of nerfstudio or instant-ngp and its images.
+
+    Parameters
+    ----------
+    src
+        The transforms.json, or the folder that holds it.
+    out
+        Folder to write.
+    """
+    from faintfield.pipelines.formats.exchange.nerfstudio import import_transforms
+
+    return import_transforms(src, out, options)
+
+
+def import_poses(
+    src: Path,
+    out: Path,
+    /,
+    *,
+    fx_px: Positive,
+    fy_px: Positive | None = None,
+    cx_px: float | None = None,
+    cy_px: float | None = None,
+    distortion: tuple[float, ...] = (),
+    options: ImportOptions = _DEFAULTS,
+) -> Result:
+    """Make an elemental set from a table of camera positions and its images.
+
+    The first line of the table names its columns: name, x, y, z or x_mm, y_mm, z_mm, and qw, qx, qy, qz if cameras are
+    turned. A position is where the camera is; the quaternion turns the camera's axes (x right, y down, z forward) into
+    those of the positions. Without quaternions all cameras look along z, with x right and y down.
+
+    Parameters
+    ----------
+    src
+        The table: CSV, with commas, semicolons or tabs.
+    out
+        Folder to write.
+    fx_px
+        Focal length.
+    fy_px
+        Focal length of the other axis; the same by default.
+    cx_px
+        Principal point, where the first pixel's centre is 0; the middle of the picture by default.
+    cy_px
+        Likewise, of the other axis.
+    distortion
+        k1, k2, p1, p2, k3 … in OpenCV's order.
+    """
+    from faintfield.pipelines.formats.exchange.pose_table import import_table
+
+    return import_table(src, out, options, fx_px, fy_px or fx_px, (cx_px, cy_px), distortion)
+
+
+def import_emva1288(descriptor: Path, out: Path, /, *, overwrite: bool = False) -> Frames:
+    """Make a noise set of EMVA 1288 reference data.
+
+    Parameters
+    ----------
+    descriptor
+        The data's descriptor file; images lie beside it.
+    out
+        Folder to write: noise.toml and copies of the images.
+    overwrite
+        Replace an earlier set in OUT.
+    """
+    from faintfield.pipelines.formats.exchange.emva1288 import import_data
+
+    return import_data(descriptor, out, overwrite=overwrite)

@@ -1,1 +1,0 @@
-"""`faintfield import`: other people's files become a set."""

@@ -1,0 +1,255 @@
+"""`--depth-mm auto`: the depths of objects, found by comparing the views."""
+
+from pathlib import Path
+
+import numpy as np
+from msgspec import UNSET
+from numpy.typing import NDArray
+
+from faintfield.calib.homography import fronto_parallel_rt_ref_plane, image_lattice, transfer
+from faintfield.pipelines.console import inform, working
+from faintfield.pipelines.formats.results.records import BestFocusRecord
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
+from faintfield.pipelines.formats.sets.stated import rounded_depth
+from faintfield.pipelines.reconstruction.depth.comparison import BinnedViews, Compared, binned_views
+from faintfield.pipelines.reconstruction.depth.significance import check_places
+from faintfield.recon.depth.agreement import DepthEstimate
+from faintfield.recon.depth.focus import MIN_SAMPLES, SURE, likeliest_depth_mm, places_of_focus
+from faintfield.recon.depth.significance import Significance
+from faintfield.recon.errors import NothingInFocus
+
+# Depths of a search, and searches, each in the range in which the last found anything.
+_DEPTHS, _SEARCHES = 48, 3
+
+# Steps of the search on both sides of a place, between which its depth is refined.
+_STEPS_AROUND = 2
+
+# Search again if the range shrinks to less than this share of the last one.
+_SHRUNK_ENOUGH = 0.6
+
+# Steps that a range keeps on both sides of what was found, and the quantiles of the sure samples that were found.
+_MARGIN_STEPS = 2.0
+_RANGE_OF_SURE = (0.01, 0.99)
+
+# Limit of the movement of the outermost view from one depth to the next, in bins: more would miss objects between.
+_MAX_BINS_PER_STEP = 1.5
+
+# Depths at which the views share less than this of the reference view, on average, are not searched.
+_MIN_OVERLAP = 0.25
+
+# Depths at which the overlap is computed.
+_OVERLAP_DEPTHS = 80
+
+# Margin of a range of disparities that an import found: a share of the range, and in px.
+_RANGE_MARGIN, _MIN_MARGIN_PX = 0.1, 0.2
+
+# Least movement of the outermost view over a range that is searched, in px: depths beside a single plane show it.
+_LEAST_MOVED_PX = 12.0
+
+# Movement of the outermost view from one plane of a sweep of the range to the next, in px, and limits of its planes.
+_SWEEP_STEP_PX, _FEWEST_PLANES, _MOST_PLANES = 0.5, 8, 96
+
+# Depths farther than this many times the nearest are taken for infinity.
+_INFINITY = 1e4
+
+
+def best_focus(elemental_set: ElementalSet, out: Path, range_mm: tuple[float, float] | None = None) -> BestFocusRecord:
+    """Find the planes of best focus.
+
+    The range is searched in equal steps of 1/depth, in bins of pixels that suit the steps and the light; then the part
+    in which anything was found is searched more finely. Each depth with a large part of the picture is refined on its
+    own samples.
+
+    Parameters
+    ----------
+    elemental_set : ElementalSet
+        The set.
+    out : Path
+        Folder of a temporary file for the images if memory is short.
+    range_mm : (float, float), optional
+        Range to search; by default `searched_range_mm`.
+
+    Raises
+    ------
+    NothingInFocus
+        The views agree on nothing in this range, or no better than shuffled ones.
+    """
+    near_mm, far_mm = sorted(range_mm or searched_range_mm(elemental_set))
+    ranges, compared, found, significance = _narrowed(elemental_set, out, (near_mm, far_mm))
+    sure = found.confidence >= SURE
+    places = places_of_focus(found, _DEPTHS)
+    if not places:
+        raise _nothing(elemental_set, ranges[0])
+    depths = sorted({rounded_depth(elemental_set, _refined(compared, found, place)) for place in places})
+    between = elemental_set.depths_text(near_mm, far_mm, join=" and ")
+    inform(f"planes of best focus between {between}: {elemental_set.depths_text(*depths)}")
+    return BestFocusRecord(
+        depth_mm=depths,
+        searched_mm=ranges,
+        depths_per_search=_DEPTHS,
+        bins_px=compared.bins_px,
+        share_of_sure=[float(place.sum() / sure.sum()) for place in places],
+        p_value=significance.p_value if significance else UNSET,
+        z_shuffled=significance.z if significance else UNSET,
+        shuffles=significance.shuffles if significance else UNSET,
+    )
+
+
+def found_range_mm(elemental_set: ElementalSet, out: Path) -> tuple[float, float]:
+    """Return the nearest and farthest depth between which the views agree on anything, with a margin.
+
+    Raises
+    ------
+    NothingInFocus
+        As `best_focus`.
+    """
+    return _narrowed(elemental_set, out, searched_range_mm(elemental_set))[0][-1]
+
+
+def sweep_of_range(elemental_set: ElementalSet, range_mm: tuple[float, float]) -> list[float]:
+    """Return depths from the nearest to the farthest, in equal steps of disparity.
+
+    From one to the next, a point moves by at most half a pixel in the outermost view, unless that took more than
+    `_MOST_PLANES` planes.
+    """
+    moved_px = _moved_px(elemental_set, range_mm)
+    count = int(np.ceil(moved_px / _SWEEP_STEP_PX)) + 1
+    planes = int(np.clip(count, _FEWEST_PLANES, _MOST_PLANES))
+    step_px = moved_px / (planes - 1)
+    inform(
+        f"sweep: {planes} planes, {step_px:.2g} px apart in the outermost view, "
+        f"over {elemental_set.depths_text(*range_mm)}"
+    )
+    inverse = np.linspace(1 / range_mm[0], 1 / range_mm[1], planes)
+    return list(dict.fromkeys(rounded_depth(elemental_set, depth) for depth in (1 / inverse).tolist()))
+
+
+def _moved_px(elemental_set: ElementalSet, range_mm: tuple[float, float]) -> float:
+    """Return by how much a point moves in the outermost view from one end of a range of depths to the other."""
+    moved_mm = float(np.linalg.norm(elemental_set.poses_rt_cam_ref[:, 3:5], axis=1).max())
+    return elemental_set.settings.camera.fx_px * moved_mm * (1 / range_mm[0] - 1 / range_mm[1])
+
+
+def _narrowed(
+    elemental_set: ElementalSet, out: Path, range_mm: tuple[float, float]
+) -> tuple[list[tuple[float, float]], Compared, DepthEstimate, Significance | None]:
+    """Search a range, then the part of it in which anything was found.
+
+    Returns all ranges, the last comparison, and the significance of the first.
+    """
+    views = views_of_search(elemental_set, range_mm, out)
+    significance = check_places(views, range_mm)
+    ranges = [range_mm]
+    while True:
+        compared = views.compared(_searched_depths(ranges[-1]))
+        found = compared.depth_map()
+        sure = found.confidence >= SURE
+        if np.count_nonzero(sure) < MIN_SAMPLES:
+            raise _nothing(elemental_set, range_mm)
+        first, last = np.quantile(found.index[sure], _RANGE_OF_SURE) + np.array([-_MARGIN_STEPS, _MARGIN_STEPS])
+        if len(ranges) == _SEARCHES or last - first > _SHRUNK_ENOUGH * _DEPTHS:
+            return ranges, compared, found, significance
+        inverse = np.interp([first, last], np.arange(_DEPTHS), 1 / np.asarray(compared.depths_mm))
+        narrower = float(1 / inverse[0]), float(1 / inverse[1])
+        if _moved_px(elemental_set, narrower) < _LEAST_MOVED_PX:
+            return ranges, compared, found, significance
+        ranges.append(narrower)
+        views = views_of_search(elemental_set, ranges[-1], out)
+
+
+def _searched_depths(range_mm: tuple[float, float]) -> list[float]:
+    """Return the depths of a search, in equal steps of 1/depth, the nearest first."""
+    depths: list[float] = (1 / np.linspace(1 / range_mm[0], 1 / range_mm[1], _DEPTHS)).tolist()
+    return depths
+
+
+def views_of_search(elemental_set: ElementalSet, range_mm: tuple[float, float], out: Path) -> BinnedViews:
+    """Return the views in bins of pixels that suit the steps of a search; `out` is for a temporary file."""
+    step_px = _moved_px(elemental_set, range_mm) / (_DEPTHS - 1)
+    least_px = int(np.ceil(step_px / _MAX_BINS_PER_STEP))
+    with working("reading views"):
+        return binned_views(elemental_set, _searched_depths(range_mm)[_DEPTHS // 2], out, min_bins_px=least_px)
+
+
+def imported_range_px(elemental_set: ElementalSet) -> tuple[float, float] | None:
+    """Return the range of disparities that an import found, None if it found none."""
+    arrangement = elemental_set.settings.arrangement
+    return None if arrangement is None else arrangement.disparity_range_px
+
+
+def searched_range_mm(elemental_set: ElementalSet) -> tuple[float, float]:
+    """Return the nearest and farthest depth at which a set can show anything.
+
+    This is the range of disparities that an import found, with a margin, if the set states it. Otherwise it follows
+    from the poses. At the near end the views share a quarter of the reference view, on average. At the far end they
+    no longer do (cameras that look inwards), or else it is infinity.
+    """
+    baseline_mm = float(np.linalg.norm(elemental_set.poses_rt_cam_ref[:, 3:], axis=1).max())
+    if baseline_mm <= 0:
+        raise NothingInFocus("all views were taken from one place, which tells no depths apart; give --depth")
+    imported_px = imported_range_px(elemental_set)
+    if imported_px is not None:
+        return _range_of_disparities(elemental_set, *imported_px)
+    depths = np.geomspace(0.3 * baseline_mm, 1000 * baseline_mm, _OVERLAP_DEPTHS)
+    shared = np.array([overlap(elemental_set, depth) for depth in depths])
+    best = int(shared.argmax())
+    if shared[best] < _MIN_OVERLAP:
+        raise NothingInFocus(
+            f"the views share {shared[best]:.0%} of the reference view at most, "
+            f"at {elemental_set.depth_text(depths[best])}; "
+            "give the range to search by --sweep, or that of a surface by --depth-range-mm"
+        )
+    overlapping = shared >= _MIN_OVERLAP
+    first = best - int(np.argmin(np.append(overlapping[best::-1], False))) + 1
+    last = best + int(np.argmin(np.append(overlapping[best:], False))) - 1
+    endless = last == len(depths) - 1
+    return float(depths[first]), float(_INFINITY * depths[first] if endless else depths[last])
+
+
+def _range_of_disparities(elemental_set: ElementalSet, least_px: float, largest_px: float) -> tuple[float, float]:
+    """Return the nearest and farthest depth of a range of disparities with a margin, at most infinity."""
+    at_zero, slope = elemental_set.inverse_depth_of_disparity()
+    moved_mm = float(np.linalg.norm(elemental_set.poses_rt_cam_ref[:, 3:5], axis=1).max())
+    wide_px = _LEAST_MOVED_PX / max(abs(slope) * elemental_set.settings.camera.fx_px * moved_mm, 1e-9)
+    found_px = largest_px - least_px
+    margin_px = max(_RANGE_MARGIN * found_px, _MIN_MARGIN_PX, 0.5 * (wide_px - found_px))
+    far, near = sorted(at_zero + slope * end_px for end_px in (least_px - margin_px, largest_px + margin_px))
+    if near <= 0:
+        raise NothingInFocus(
+            f"{elemental_set.folder}: arrangement.disparity_range_px = "
+            f"{least_px:g} to {largest_px:g} lies behind infinity by "
+            "the poses; correct one of them"
+        )
+    return 1 / near, 1 / max(far, near / _INFINITY)
+
+
+def overlap(elemental_set: ElementalSet, depth_mm: float) -> float:
+    """Return the share of the reference view's part of a plane that the views see, too, on average."""
+    pixels = image_lattice(elemental_set.settings.camera.size_px)
+    plane = fronto_parallel_rt_ref_plane(depth_mm)
+    centres = elemental_set.principal_points_px()
+    camera = elemental_set.settings.camera
+    # The lens has the camera's principal point; a view with its own has its picture shifted
+    shifts = centres - np.array([camera.cx_px, camera.cy_px])
+    seen = [
+        transfer(elemental_set.lens, rt, plane, pixels - shifts[elemental_set.reference_view]) + shift
+        for rt, shift in zip(elemental_set.poses_rt_cam_ref, shifts, strict=True)
+    ]
+    inside = np.all((np.array(seen) > -0.5) & (np.array(seen) < np.array(camera.size_px) - 0.5), axis=2)
+    return float(inside.mean())
+
+
+def _refined(compared: Compared, found: DepthEstimate, place: NDArray[np.bool_]) -> float:
+    """Return the depth, between those of the search, at which the views agree best on a place."""
+    middle = round(float(np.median(found.index[place])))
+    near = slice(max(middle - _STEPS_AROUND, 0), middle + _STEPS_AROUND + 1)
+    return likeliest_depth_mm(compared.planes[near], compared.depths_mm[near], place)
+
+
+def _nothing(elemental_set: ElementalSet, range_mm: tuple[float, float]) -> NothingInFocus:
+    return NothingInFocus(
+        f"between {elemental_set.depths_text(*range_mm, join=' and ')} "
+        f"there is no depth at which the views agree on at least "
+        f"{MIN_SAMPLES} bins of pixels that stand out of the noise; give another range by --sweep "
+        "FIRST:LAST:COUNT, more light, or --depth"
+    )

@@ -1,0 +1,192 @@
+"""The depth map of a sweep, its confidence, and the all-in-focus picture: computed, written, recorded."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.pipelines.formats.files import remove, sha256, write_record, write_whole
+from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.image_files import ONE_PIXEL, encoded, grey_levels, white_level, write_plane
+from faintfield.pipelines.formats.results.plane_files import Origin, read_current
+from faintfield.pipelines.formats.results.records import DEPTH_MAP_FILE, DepthMapFileRecord, DepthMapRecord, Method
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
+from faintfield.pipelines.formats.sets.stated import unit_of_maps
+from faintfield.pipelines.reconstruction.depth.map_pictures import map_picture
+from faintfield.pipelines.reconstruction.operators import plane_grid
+
+# The file of the depths by their unit.
+_FILES = {"mm": "depth_mm.tiff", "px": "disparity_px.tiff", "relative": "depth.tiff"}
+
+ALL_IN_FOCUS, CONFIDENCE = "all_in_focus", "depth_confidence"
+
+
+@dataclass(frozen=True)
+class _Map:
+    """A depth map on the samples of the reference view.
+
+    Attributes
+    ----------
+    record : DepthMapRecord
+        What reconstruction.json records of it.
+    limits : (float, float)
+        Of the sweep, in the unit of the record, ascending.
+    index : float array (row, column)
+        Between which planes of the sweep each sample lies; given everywhere, even where nothing is known.
+    values, confidence : float array (row, column)
+        Depth or disparity in the unit of the record, NaN where it is not known; and the probability that this is right.
+    """
+
+    record: DepthMapRecord
+    limits: tuple[float, float]
+    index: NDArray[np.float64]
+    values: NDArray[np.float64]
+    confidence: NDArray[np.float64]
+
+
+def check_sweep(elemental_set: ElementalSet, depths_mm: Sequence[float]) -> None:
+    """Refuse a set or a sweep that can have no depth map, before its planes are made.
+
+    Raises
+    ------
+    BadValue
+        The set has too few views, or too small ones.
+    GeometryMismatch
+        The views share too little at the depths of the sweep.
+    NothingInFocus
+        All views were taken from one place.
+    """
+    from faintfield.pipelines.reconstruction.depth.search import check_overlap, check_views
+
+    check_views(elemental_set, "a depth map")
+    check_overlap(elemental_set, (min(depths_mm), max(depths_mm)))
+
+
+def check_light(elemental_set: ElementalSet, depths_mm: Sequence[float], out: Path) -> None:
+    """Refuse views that agree no better than shuffled ones in a sweep (NothingInFocus).
+
+    `out` is for a temporary file if memory is short.
+    """
+    from faintfield.pipelines.reconstruction.depth.search import check_agreement
+
+    check_agreement(elemental_set, (min(depths_mm), max(depths_mm)), out)
+
+
+def kept_depth_map(folders: Mapping[Method, Path], origins: Mapping[Method, Origin]) -> DepthMapRecord | None:
+    """Return the record of the maps if each method's folder has those of its provenance."""
+    kept = [
+        read_current(folder / DEPTH_MAP_FILE, DepthMapFileRecord, origins[method]) for method, folder in folders.items()
+    ]
+    return kept[0].depth_map if kept and kept[0] is not None and all(kept) else None
+
+
+def write_depth_map(
+    elemental_set: ElementalSet,
+    planes: Mapping[tuple[Method, float], Path],
+    disparities_px: Mapping[float, float],
+    origins: Mapping[Method, Origin],
+) -> DepthMapRecord:
+    """Write the maps and the all-in-focus picture into each folder of planes, and return their record.
+
+    Depths and their confidence are those of `reconstruct --surface` in the range of the sweep.
+
+    Parameters
+    ----------
+    elemental_set : ElementalSet
+        The set.
+    planes : mapping of (method, depth in mm) to Path
+        Files of the planes; each method has a folder.
+    disparities_px : mapping of depth in mm to px
+        Disparity of every depth if disparities were asked for: the map then is in px.
+    origins : mapping of Method to Provenance
+        Provenance of each method's planes: maps with the same are kept.
+
+    Raises
+    ------
+    GeometryMismatch
+        The range of the sweep is too wide, or views, poses and range do not fit together.
+    """
+    folders = {method: path.parent for (method, _), path in planes.items()}
+    kept = kept_depth_map(folders, origins)
+    if kept is not None:
+        return kept
+    depths = sorted({depth for _, depth in planes})
+    found = _map_of(elemental_set, depths, disparities_px)
+    for method, folder in folders.items():
+        remove(folder / DEPTH_MAP_FILE)
+        sharp = _all_in_focus([planes[method, depth] for depth in depths], found.index)
+        hashes = _write_maps(folder, found, sharp)
+        vouching = DepthMapFileRecord(1, found.record, hashes, **msgspec.structs.asdict(origins[method]))
+        write_record(folder / DEPTH_MAP_FILE, vouching)
+    return found.record
+
+
+def _map_of(elemental_set: ElementalSet, depths_mm: Sequence[float], disparities_px: Mapping[float, float]) -> _Map:
+    """Return the depth map of a sweep, nearest depth first, in px if there are disparities."""
+    # Here, because planes need none of it
+    from faintfield.pipelines.reconstruction.depth.luminance import default_bins
+    from faintfield.pipelines.reconstruction.depth.search import depths_of_set, enlarged, in_unit
+    from faintfield.recon.surface.confidence import SURE
+
+    bins, shape = default_bins(elemental_set), plane_grid(elemental_set, 1.0).shape
+    _, estimate = depths_of_set(elemental_set, bins, (depths_mm[0], depths_mm[-1]), find_range=False)
+    inverse_depth, confidence = (enlarged(part, shape, bins) for part in (estimate.inverse_depth, estimate.confidence))
+    unit = unit_of_maps(elemental_set.units, as_px=bool(disparities_px))
+    scale = [
+        disparities_px[depth] if disparities_px else in_unit(elemental_set, 1 / depth, unit) for depth in depths_mm
+    ]
+    known = confidence.astype(np.float32) >= SURE  # as in the file
+    values = np.clip(in_unit(elemental_set, inverse_depth, unit), min(scale), max(scale))
+    record = DepthMapRecord(
+        file=_FILES[unit],
+        confidence=f"{CONFIDENCE}.tiff",
+        all_in_focus=f"{ALL_IN_FOCUS}.tiff",
+        unit=unit,
+        bins_px=bins,
+        sure_above=SURE,
+        sure_share=float(known.mean()),
+        median=float(np.median(values[known])) if known.any() else None,
+    )
+    index = np.interp(-inverse_depth, -1 / np.asarray(depths_mm), np.arange(len(depths_mm)))
+    return _Map(record, (min(scale), max(scale)), index, np.where(known, values, np.nan), confidence)
+
+
+def _write_maps(folder: Path, found: _Map, sharp: NDArray[np.float32]) -> dict[str, str]:
+    """Write the maps and the all-in-focus picture with their previews; return their hashes by file name."""
+    record = found.record
+    label = "disparity (px)" if record.unit == "px" else f"depth ({record.unit})"
+    pictures: dict[str, tuple[NDArray[np.floating], bytes]] = {
+        record.file: (found.values, map_picture(found.values, label, *found.limits)),
+        record.confidence: (found.confidence, map_picture(found.confidence, "probability of the depth", 0.0, 1.0)),
+        record.all_in_focus: (sharp, encoded(grey_levels(sharp, white_level(sharp)), ".png")),
+    }
+    for name, (values, picture) in pictures.items():
+        write_plane(folder / name, values, ONE_PIXEL)
+        write_whole((folder / name).with_suffix(".png"), picture)
+    files = [path for name in pictures for path in (folder / name, (folder / name).with_suffix(".png"))]
+    return {path.name: sha256(path) for path in files}
+
+
+def _all_in_focus(paths: Sequence[Path], index: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Return each sample (row, column[, colour]) interpolated between the two planes around its depth.
+
+    The samples are those of the farthest plane, which has the most if all planes have the same pitch. One plane at a
+    time is in memory.
+    """
+    sharp: NDArray[np.float32] | None = None
+    for number, path in reversed(list(enumerate(paths))):
+        plane = np.asarray(read_frame(path).pixels_dn, np.float32)
+        if sharp is None:
+            rows, columns = plane.shape[:2]
+            at = cv2.resize(index.astype(np.float32), (columns, rows), interpolation=cv2.INTER_NEAREST)
+        elif plane.shape != sharp.shape:
+            plane = cv2.resize(plane, (columns, rows), interpolation=cv2.INTER_LINEAR)
+        share = np.maximum(1 - np.abs(at - number), 0)
+        part = plane * (share if plane.ndim == 2 else share[:, :, np.newaxis])
+        sharp = part if sharp is None else sharp + part
+    assert sharp is not None
+    return sharp

@@ -1,0 +1,244 @@
+"""The depth of a surface from the views of a set: the range that is asked for or found, and the depths in it.
+
+The maps of `--surface` and of `--depth-map` both come from here.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.pipelines.console import inform, working
+from faintfield.pipelines.errors import BadValue
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
+from faintfield.pipelines.reconstruction.depth.autofocus import overlap, searched_range_mm, views_of_search
+from faintfield.pipelines.reconstruction.depth.comparison import BETWEEN_PIXELS
+from faintfield.pipelines.reconstruction.depth.luminance import luminance
+from faintfield.pipelines.reconstruction.depth.significance import check_places
+from faintfield.recon.errors import GeometryMismatch, NothingInFocus
+from faintfield.recon.surface.estimate import SurfaceEstimate, estimate_surface
+from faintfield.recon.surface.pinhole_views import PinholeViews
+from faintfield.recon.surface.sweep import equal_steps, found_range
+
+# Fewest views whose halves can find depths by each other's light.
+_MIN_VIEWS = 4
+
+# Smallest side of a view: a smaller one has no room for the patches and windows in which detail is compared.
+_MIN_SIDE_PX = 24
+
+# Least that the other views see of the reference view's part of the scene at some depth of a given range, on average,
+# and the number of depths in it that are tried.
+_MIN_OVERLAP, _TRIED = 0.1, 8
+
+# Movement in samples of the outermost view from one depth to the next above which the user is warned, and refused.
+_COARSE, _TOO_COARSE = 3.5, 16.0
+
+
+def check_views(elemental_set: ElementalSet, wanted: str) -> None:
+    """Refuse a set whose views tell no depths.
+
+    Parameters
+    ----------
+    elemental_set : ElementalSet
+        The set.
+    wanted : str
+        What the depths are for, as the messages name it.
+
+    Raises
+    ------
+    BadValue
+        The set has too few views, or too small ones.
+    NothingInFocus
+        All views were taken from one place.
+    """
+    views, size_px = len(elemental_set.settings.view), elemental_set.settings.camera.size_px
+    if views < _MIN_VIEWS:
+        raise BadValue(
+            f"{elemental_set.folder}: has {views} views, and {wanted} needs at least {_MIN_VIEWS}; capture more nodes"
+        )
+    if min(size_px) < _MIN_SIDE_PX:
+        raise BadValue(
+            f"{elemental_set.folder}: has views of {size_px[0]} x {size_px[1]} px, and {wanted} needs at least "
+            f"{_MIN_SIDE_PX} px along each side; use larger ones"
+        )
+    if not np.linalg.norm(elemental_set.poses_rt_cam_ref[:, 3:], axis=1).max() > 0:
+        raise NothingInFocus(
+            f"{elemental_set.folder}: all views were taken from one place, "
+            "which tells no depths apart; correct the poses, or "
+            "capture several nodes"
+        )
+
+
+def limits_mm(elemental_set: ElementalSet, range_mm: tuple[float, float] | None) -> tuple[float, float]:
+    """Return the nearest and farthest depth to consider: those of a range, or where the views overlap.
+
+    Raises
+    ------
+    GeometryMismatch
+        The views share too little at the depths of a given range.
+    NothingInFocus
+        The views overlap nowhere.
+    """
+    if range_mm is None:
+        return searched_range_mm(elemental_set)
+    check_overlap(elemental_set, range_mm)
+    return range_mm
+
+
+def check_agreement(elemental_set: ElementalSet, range_mm: tuple[float, float], out: Path) -> None:
+    """Refuse views that agree no better than shuffled ones in a range of depths (NothingInFocus).
+
+    `out` is for a temporary file if memory is short.
+    """
+    check_places(views_of_search(elemental_set, range_mm, out), range_mm)
+
+
+def check_overlap(elemental_set: ElementalSet, range_mm: tuple[float, float]) -> None:
+    """Refuse a range of depths, nearest and farthest, at which the views share too little (GeometryMismatch)."""
+    near_mm, far_mm = range_mm
+    depths = 1 / np.linspace(1 / near_mm, 1 / far_mm, _TRIED)
+    own = 1 / len(elemental_set.settings.view)  # the share of the reference view itself
+    shared = (max(overlap(elemental_set, depth) for depth in depths.tolist()) - own) / (1 - own)
+    if shared < _MIN_OVERLAP:
+        between = elemental_set.depths_text(near_mm, far_mm, join=" and ")
+        raise GeometryMismatch(
+            f"between {between} the other views see {shared:.0%} of what the reference view sees, "
+            f"on average, and {_MIN_OVERLAP:.0%} are needed; correct the range, or the poses and their signs"
+        )
+
+
+def depths_of_set(
+    elemental_set: ElementalSet,
+    bins: int,
+    range_mm: tuple[float, float],
+    *,
+    find_range: bool,
+    out: Path | None = None,
+) -> tuple[NDArray[np.float64], SurfaceEstimate]:
+    """Return the 1/depths that are compared, ascending, and the depth of each sample of the bins by them.
+
+    The samples are those of `between_pixels`; `enlarged` brings their maps to the pixels.
+
+    Parameters
+    ----------
+    elemental_set : ElementalSet
+        The set.
+    bins : int
+        Pixels along a side of a bin.
+    range_mm : (float, float)
+        Nearest and farthest depth.
+    find_range : bool
+        Search this range for that of the scene first.
+    out : Path, optional
+        Test in this folder whether the views agree better than shuffled ones; by default `check_agreement` did so.
+
+    Raises
+    ------
+    GeometryMismatch
+        The range is too wide, or views, poses and range do not fit together.
+    NothingInFocus
+        Nothing is found in the range, or the views agree no better than shuffled ones.
+    """
+    nodes, views = nodes_of(elemental_set), between_pixels(luminance(elemental_set, bins))
+    near, far = 1 / range_mm[0], 1 / range_mm[1]
+    with naming_range(elemental_set, far, near):
+        if find_range:
+            with working("searching the range of depths"):
+                far, near = found_range(views, nodes, far, near)
+        depths = equal_steps(views, far, near)
+        _check_steps(views, depths)
+    if out is not None:
+        check_agreement(elemental_set, range_mm, out)
+    with naming_range(elemental_set, far, near):
+        inform(f"surface {_between(elemental_set, far, near)}: comparing {len(depths)} depths")
+        with working("finding the depths of the surface"):
+            return depths, estimate_surface(views, depths, nodes)
+
+
+@contextmanager
+def naming_range(elemental_set: ElementalSet, far: float, near: float) -> Iterator[None]:
+    """Name the range of 1/depth in which views, poses and surface do not fit together."""
+    try:
+        yield
+    except GeometryMismatch as failure:
+        raise GeometryMismatch(f"surface {_between(elemental_set, far, near)}: {failure}") from failure
+    except NothingInFocus as failure:
+        option = "--disparity-range-px" if elemental_set.units.depth == "disparity_px" else "--depth-range-mm"
+        raise NothingInFocus(
+            f"{_between(elemental_set, far, near)} {failure}; give the range by {option} NEAR:FAR, or more light"
+        ) from failure
+
+
+def _between(elemental_set: ElementalSet, far: float, near: float) -> str:
+    """Return a range of 1/depth in words."""
+    return f"between {elemental_set.depths_text(float(f'{1 / near:.4g}'), float(f'{1 / far:.4g}'), join=' and ')}"
+
+
+def nodes_of(elemental_set: ElementalSet) -> NDArray[np.intp]:
+    """Return row and column of the node of each view; a row of views if no nodes are stated."""
+    views = elemental_set.settings.view
+    if any(view.node is None for view in views):
+        return np.array([(0, index) for index in range(len(views))])
+    return np.array([view.node for view in views])
+
+
+def _check_steps(views: PinholeViews, depths: NDArray[np.float64]) -> None:
+    """Refuse a range whose depths are far apart, or warn of it."""
+    step = float(depths[1] - depths[0]) * float(views.reach.max())
+    apart = (
+        f"{len(depths)} depths are compared, and from one to the next a point moves by {step:.1f} bins in the "
+        f"outermost view, where {_COARSE:g} are enough to miss objects"
+    )
+    if step > _TOO_COARSE:
+        raise GeometryMismatch(f"{apart}; give a narrower range, above all a farther near end")
+    if step > _COARSE:
+        inform(f"warning: {apart}; a narrower range would find more")
+
+
+def between_pixels(views: PinholeViews) -> PinholeViews:
+    """Return the views with the samples of the surface moved to `BETWEEN_PIXELS`, right and down.
+
+    Interpolation between pixels blurs, and detail that is not blurred counts for more. On a regular grid of nodes, some
+    depths bring all views to whole pixels, and would be favoured. At this place the mean of `w² + (1 − w)²` over the
+    weights w of interpolation is 2/3, as it is over all places: such depths are no longer special.
+    """
+    (x, y), pitch = views.grid.origin_mm, views.grid.pitch_mm
+    moved = BETWEEN_PIXELS * pitch
+    return replace(views, grid=replace(views.grid, origin_mm=(x + moved, y + moved)))
+
+
+def enlarged(
+    part: NDArray[np.floating], shape: tuple[int, int], bins: int, *, moved: float = BETWEEN_PIXELS
+) -> NDArray[np.float64]:
+    """Return a map of bins on the samples of a picture, each with the nearest value.
+
+    Parameters
+    ----------
+    part : float array (row, column)
+        The map.
+    shape : (int, int)
+        Rows and columns of the picture.
+    bins : int
+        Samples of the picture along a side of a bin.
+    moved : float
+        By how much the samples of the map lie right of and below the middles of the bins, in bins.
+    """
+    rows, columns = (
+        np.clip(np.floor((np.arange(size) + 0.5) / bins - moved), 0, count - 1).astype(np.intp)
+        for size, count in zip(shape, part.shape, strict=True)
+    )
+    return np.asarray(part[np.ix_(rows, columns)], np.float64)
+
+
+def in_unit[Numbers: (float, NDArray[np.float64])](
+    elemental_set: ElementalSet, inverse_depth: Numbers, unit: Literal["mm", "px", "relative"]
+) -> Numbers:
+    """Return depths as the poses have them, or disparities in px from one node to the next."""
+    if unit != "px":
+        return 1 / inverse_depth
+    at_zero, slope = elemental_set.inverse_depth_of_disparity()
+    return (inverse_depth - at_zero) / slope

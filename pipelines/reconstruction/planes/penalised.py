@@ -1,0 +1,210 @@
+"""PMLEM with its weight chosen from the data: planes at the certified optimum of likelihood and penalty."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from msgspec import structs
+
+from faintfield.pipelines.formats.results.records import Certificate, PenaltyRecord, SolveRecord, WeightScore
+from faintfield.pipelines.reconstruction.planes.solutions import Settings, Solution, mean_e
+from faintfield.recon.likelihood.images import Image, select_likelihood
+from faintfield.recon.solver.cross_validation import MIN_VIEWS, cross_validated_weight
+from faintfield.recon.solver.data_fit import SceneProblem
+from faintfield.recon.solver.initialization import mean_light_e, universal_penalty_weight
+from faintfield.recon.solver.penalties import Penalty
+from faintfield.recon.solver.pmlem import PmlemIterate, pmlem
+from faintfield.recon.solver.proximal import DualField
+from faintfield.recon.solver.uncertainty import (
+    Answers,
+    LocalProblem,
+    error_of_answers,
+    local_fits,
+    standard_deviation,
+)
+
+# Largest number of passes over the data.
+MAX_PASSES = 30
+
+# PMLEM stops when its plane is this close to the optimum: root mean square, relative to the plane.
+_TOLERANCE = 0.01
+
+# Seed of the draws by which standard deviations are estimated: the same result every time.
+_SEED = 1
+
+# What bounds the distance to the optimum, in words.
+_PMLEM_CERTIFICATE = (
+    "bound on the relative distance to the optimum, from its optimality conditions in the metric of the data; "
+    "see docs/physics.md"
+)
+
+
+@dataclass(frozen=True)
+class Objective:
+    """Objective that PMLEM minimises, without the penalty's weight.
+
+    Attributes
+    ----------
+    posed : SceneProblem
+        The operator, and the images with their likelihood.
+    penalty : Penalty
+        Penalty of a plane.
+    start : float array
+        Where to begin.
+    level_e : float
+        Mean light of the samples that the views see, in electrons.
+    """
+
+    posed: SceneProblem
+    penalty: Penalty
+    start: Image
+    level_e: float
+
+    @classmethod
+    def of(cls, posed: SceneProblem, settings: Settings) -> "Objective":
+        """Choose likelihood and penalty according to the settings, the light and the noise."""
+        start = posed.start()
+        level_e = mean_light_e(posed.operator, start)
+        likelihood = select_likelihood(posed.images, settings.likelihood, level_e)
+        posed = replace(posed, images=replace(posed.images, likelihood=likelihood))
+
+        def noise_e() -> float:
+            return float(1 / np.sqrt(np.median(posed.fit(level_e).metric(start)[posed.well_seen()])))
+
+        return cls(posed, Penalty.for_noise(settings.penalty, noise_e), start, level_e)
+
+
+def solve_pmlem(objective: Objective, settings: Settings) -> list[Solution]:
+    """Run PMLEM to its certificate and return the planes; all their records are of the one iteration."""
+    choice = _choose_weight(objective, settings)
+    record, iterate = certified(objective, choice.start, choice.weight, choice.dual, settings)
+    record = structs.replace(
+        record,
+        penalty_weight_chosen=choice.chosen,
+        passes_before=1 + choice.passes,
+        penalty_weight_curve=choice.curve,
+    )
+    planes = objective.posed.operator.planes_of(iterate)
+    return [Solution(plane, structs.replace(record, mean_e=mean_e(plane))) for plane in planes]
+
+
+def with_sigma(
+    objective: Objective, solutions: list[Solution], answers: Callable[[int, LocalProblem], Answers] | None = None
+) -> list[Solution]:
+    """Return planes with their standard deviation beside them.
+
+    Parameters
+    ----------
+    objective : Objective
+        What they minimise.
+    solutions : list of Solution
+        All planes of one colour.
+    answers : callable, optional
+        Returns how the plane of an index answers to noise, given what the views say near it; as the optimum of
+        likelihood and penalty by default.
+    """
+    operator, weight = objective.posed.operator, solutions[0].record.penalty_weight or 0.0
+    samples = operator.samples_of([solution.plane for solution in solutions])
+    generator = np.random.default_rng(_SEED)
+    fits = local_fits(operator, objective.posed.fit(objective.level_e), samples)
+    sigmas = []
+    for index, local in enumerate(fits):
+        if answers is None:
+            sigmas.append(standard_deviation(local, weight, objective.penalty, generator))
+        else:
+            problem = LocalProblem(local, weight, objective.penalty)
+            sigmas.append(error_of_answers(answers(index, problem), generator))
+    return [
+        replace(solution, sidecars=solution.sidecars | {"sigma": sigma})
+        for solution, sigma in zip(solutions, sigmas, strict=True)
+    ]
+
+
+def certified(
+    objective: Objective, start: Image, weight: float, dual: DualField, settings: Settings
+) -> tuple[SolveRecord, Image]:
+    """Run PMLEM with a given weight to its certificate; return its record and samples.
+
+    The dual field says from where, and from which proposal the penalty counts.
+    """
+    iterates = pmlem(
+        objective.posed.fit(objective.level_e),
+        start,
+        penalty_weight=weight,
+        penalty=objective.penalty,
+        tolerance=_TOLERANCE,
+        dual=dual,
+    )
+    limit = settings.passes or MAX_PASSES
+    for count, iterate in enumerate(iterates, 1):
+        if iterate.certificate.distance <= _TOLERANCE or max(count, iterate.passes) >= limit:
+            break
+    record = SolveRecord(
+        penalty_weight=weight,
+        penalty_weight_chosen="given",
+        passes=iterate.passes,
+        objective=iterate.objective,
+        certificate=_certificate(iterate),
+        mean_e=mean_e(iterate.plane),
+        penalty=PenaltyRecord(objective.penalty.name, objective.penalty.smoothing_e),
+        likelihood=objective.posed.images.likelihood.name,
+    )
+    return record, iterate.plane
+
+
+def solve_then_sigma(objective: Objective, settings: Settings) -> tuple[Solution, Callable[[], Image]]:
+    """Reconstruct one colour of one plane by PMLEM; also return a function that computes its standard deviation.
+
+    That takes memory for many planes, but neither the images nor the operator: the caller can drop these first.
+    """
+    (solution,) = solve_pmlem(objective, settings)
+    (local,) = local_fits(objective.posed.operator, objective.posed.fit(objective.level_e), solution.plane)
+    weight, generator = solution.record.penalty_weight or 0.0, np.random.default_rng(_SEED)
+    return solution, partial(standard_deviation, local, weight, objective.penalty, generator)
+
+
+def _certificate(iterate: PmlemIterate) -> Certificate:
+    """Return the distance of an iterate to the optimum."""
+    certificate = iterate.certificate
+    return Certificate(
+        kind=_PMLEM_CERTIFICATE,
+        value=float(certificate.distance),
+        stationarity=float(certificate.stationarity),
+        slack=float(certificate.slack),
+        tolerance=_TOLERANCE,
+        reached=bool(certificate.distance <= _TOLERANCE),
+        passes=iterate.passes,
+        inner_steps=iterate.inner_steps,
+    )
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """A penalty weight, how it was chosen, and where a reconstruction with it may start."""
+
+    weight: float
+    chosen: str
+    start: Image
+    dual: DualField
+    passes: float = 0.0
+    curve: list[WeightScore] | None = None
+
+
+def _choose_weight(objective: Objective, settings: Settings) -> _Choice:
+    """Return the penalty weight for PMLEM: as given, or else by cross-validation."""
+    posed, start = objective.posed, objective.start
+    if settings.penalty == "none":
+        return _Choice(0.0, "none: no penalty", start, posed.dual())
+    if settings.penalty_weight is not None:
+        return _Choice(settings.penalty_weight, "given", start, posed.dual())
+    guess = universal_penalty_weight(posed.operator, posed.images, start)
+    if len(posed.operator.seeing_views) < MIN_VIEWS:
+        return _Choice(guess, "from the noise level: too few views to hold some out", start, posed.dual())
+    found = cross_validated_weight(posed, guess, objective.penalty, objective.level_e)
+    curve = [WeightScore(weight, loss) for weight, loss in found.candidates.items()]
+    chosen = "predicts held-out views best"
+    if found.solution is None:
+        return _Choice(found.weight, f"{chosen}, in windows of the plane", start, posed.dual(), found.passes, curve)
+    nearest = np.maximum(found.solution.plane, 1e-3 * start)
+    return _Choice(found.weight, chosen, nearest, found.solution.dual, found.passes, curve)

@@ -1,0 +1,158 @@
+"""Planes by a prior: proposals beyond total variation, and what the data make of them."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from msgspec import UNSET, structs
+
+from faintfield.pipelines.formats.results.records import PriorRecord, SolveRecord
+from faintfield.pipelines.reconstruction.planes.penalised import Objective, certified, with_sigma
+from faintfield.pipelines.reconstruction.planes.solutions import PriorName, Settings, Solution, mean_e
+from faintfield.recon.likelihood.images import Image
+from faintfield.recon.prior.answers import ProposalAnswers
+from faintfield.recon.prior.evidence import Evidence, evidence_of_planes
+from faintfield.recon.prior.misfit import misfits
+from faintfield.recon.prior.patches import patch_candidates
+from faintfield.recon.prior.proposal import Candidates, PlaneProposal, propose, regions_of
+from faintfield.recon.solver.cross_validation import MIN_VIEWS
+from faintfield.recon.solver.uncertainty import Answers, LocalProblem
+
+
+def with_prior(
+    objective: Objective,
+    solutions: Sequence[Solution],
+    settings: Settings,
+    *,
+    others: Image | None = None,
+) -> list[Solution]:
+    """Return planes under the prior of the settings, given those of total variation.
+
+    The proposal x̂ is a mixture of candidates chosen by held-out views. What is returned is the certified optimum of
+    `min L(f) + β TV(f − x̂)` over f ≥ 0, with the β of total variation: where the data contradict the proposal, they
+    win. Its record says how far they moved it. Groups of alike patches are found in the sum with `others` (samples),
+    the planes in other colours, if given. Standard deviations are added where the settings ask for them.
+    """
+    operator = objective.posed.operator
+    if settings.prior == "tv":
+        found, answers = list(solutions), None
+    elif len(operator.seeing_views) < MIN_VIEWS:
+        found, answers = [_without(solution, "too few views to hold some out") for solution in solutions], None
+    else:
+        samples = operator.samples_of([solution.plane for solution in solutions])
+        evidences = evidence_of_planes(operator, objective.posed.images, samples, others=others)
+        why_not = _contradiction(objective, samples, evidences)
+        made = None if why_not else _about_proposals(objective, solutions, evidences, settings, others=others)
+        if made is None:
+            why_not = why_not or "total variation predicts held-out views best"
+            found, answers = [_without(solution, why_not) for solution in solutions], None
+        else:
+            found, answers = made
+    return with_sigma(objective, found, answers) if settings.uncertainty else found
+
+
+def _contradiction(objective: Objective, samples: Image, evidences: Sequence[Evidence]) -> str | None:
+    """Return how the views contradict planes by more than noise, None if they do not."""
+    operator, images = objective.posed.operator, objective.posed.images
+    regions = [regions_of(*of_plane) for of_plane in zip(operator.planes_of(samples), evidences, strict=True)]
+    found = next((misfit for misfit in misfits(operator, images, samples, regions) if misfit.contradicts), None)
+    if found is None:
+        return None
+    return (
+        f"the views differ from the plane by more than noise where it has detail ({found.detail:.3f} times the "
+        f"variance, {found.smooth:.3f} where it is smooth), as by errors of poses and optics, or objects that hide "
+        "others, which a prior may take for detail"
+    )
+
+
+def _about_proposals(
+    objective: Objective,
+    solutions: Sequence[Solution],
+    evidences: Sequence[Evidence],
+    settings: Settings,
+    *,
+    others: Image | None,
+) -> tuple[list[Solution], Callable[[int, LocalProblem], Answers]] | None:
+    """Return the planes about their proposals, and how each answers to noise; None if nothing is proposed."""
+    operator, first = objective.posed.operator, solutions[0].record
+    weight = first.penalty_weight or 0.0
+    samples = operator.samples_of([solution.plane for solution in solutions])
+    no_network = _why_no_network(evidences) if settings.prior != "patches" else None
+    candidates = _candidates(settings.prior if no_network is None else "patches")
+    proposals = propose(objective.posed, samples, evidences, weight, candidates, others=others)
+    if all(weights.get("tv") == 1 for proposal in proposals for weights in proposal.mixture.values()):
+        return None
+    proposed = operator.samples_of([proposal.picture for proposal in proposals])
+    dual = replace(objective.posed.dual(), proposal=proposed)
+    record, found = certified(objective, np.maximum(proposed, 1e-3 * objective.start), weight, dual, settings)
+    record = structs.replace(
+        record,
+        penalty_weight_chosen=first.penalty_weight_chosen,
+        penalty_weight_curve=first.penalty_weight_curve,
+        passes_before=(first.passes_before or 0) + first.passes,
+    )
+    planes = zip(operator.planes_of(found), solutions, proposals, strict=True)
+
+    def answers(index: int, problem: LocalProblem) -> Answers:
+        return ProposalAnswers(problem, proposals[index], solutions[index].plane)
+
+    return [
+        _solution(plane, record, solution.sidecars, proposal, settings, no_network)
+        for plane, solution, proposal in planes
+    ], answers
+
+
+def _why_no_network(evidences: Sequence[Evidence]) -> str | None:
+    """Return why a plane is unlike those that the network knows, None if all are like them."""
+    from faintfield.pipelines.reconstruction.planes.learned_prior import outside_range  # OpenCV is slow to load
+
+    reasons = (outside_range(evidence.pilot, evidence.noise) for evidence in evidences)
+    return next((reason for reason in reasons if reason is not None), None)
+
+
+def _candidates(prior: PriorName) -> Candidates:
+    """Return the function that makes the candidates of a prior."""
+    if prior == "patches":
+        return patch_candidates
+    return partial(_with_network, alone=prior == "learned")
+
+
+def _with_network(evidence: Evidence, *, alone: bool) -> dict[str, Image]:
+    """Return the candidates from patches and what the network makes of them; alone: only that and total variation's."""
+    from faintfield.pipelines.reconstruction.planes.learned_prior import learned_estimate  # OpenCV is slow to load
+
+    found = patch_candidates(evidence)
+    patches = (found["wiener"] + found["twice"]) / 2
+    variance = evidence.noise.variance
+    found["learned"] = learned_estimate(evidence.picture, evidence.pilot, patches, variance)
+    return {name: found[name] for name in ("tv", "learned")} if alone else found
+
+
+def _solution(
+    plane: Image,
+    record: SolveRecord,
+    sidecars: dict[str, Image],
+    proposal: PlaneProposal,
+    settings: Settings,
+    no_network: str | None,
+) -> Solution:
+    """Return one plane with how far the data moved it from its proposal."""
+    moved = np.zeros_like(plane)
+    np.divide(plane - proposal.picture, proposal.sigma, out=moved, where=proposal.sigma > 0)
+    seen = np.isfinite(proposal.sigma)
+    rms = float(np.sqrt(np.mean(np.square(moved[seen], dtype=np.float64))))
+    prior = PriorRecord(
+        name=settings.prior,
+        mixture=proposal.mixture,
+        moved_sigma=rms,
+        no_network=UNSET if no_network is None else no_network,
+    )
+    if settings.proposal:
+        sidecars = sidecars | {"proposal": proposal.picture, "moved": moved}
+    return Solution(plane, structs.replace(record, mean_e=mean_e(plane), prior=prior), sidecars)
+
+
+def _without(one: Solution, reason: str) -> Solution:
+    """Return the plane of total variation, and say why it is that."""
+    return replace(one, record=structs.replace(one.record, prior=PriorRecord(name="tv", left_out=reason)))

@@ -1,0 +1,1 @@
+"""A surface with its picture: request, reconstruction, files, film."""

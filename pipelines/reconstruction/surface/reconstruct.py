@@ -1,0 +1,268 @@
+"""One picture, sharp everywhere, with the depth of each of its samples: `reconstruct --surface`."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erfinv
+
+from faintfield.pipelines.console import inform, progress
+from faintfield.pipelines.errors import OutputExists
+from faintfield.pipelines.formats.files import remove, remove_leftovers, require_room
+from faintfield.pipelines.formats.large_arrays import memory_or_file
+from faintfield.pipelines.formats.provenance import provenance
+from faintfield.pipelines.formats.results.plane_files import read_current
+from faintfield.pipelines.formats.results.records import DEPTH_MAP_FILE
+from faintfield.pipelines.formats.results.surface import (
+    SURFACE_FILE,
+    HeldOutRecord,
+    SurfaceChannel,
+    SurfaceFacts,
+    SurfaceFileRecord,
+    SurfaceRecord,
+)
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
+from faintfield.pipelines.formats.sets.stated import in_units, light_per_e, unit_of_maps
+from faintfield.pipelines.reconstruction.channels import (
+    SHARE_OF_DISK,
+    ChannelLayout,
+    channel_layouts,
+    keeping_frames,
+    load_channel,
+)
+from faintfield.pipelines.reconstruction.depth.accuracy import write_depth_errors
+from faintfield.pipelines.reconstruction.depth.autofocus import imported_range_px
+from faintfield.pipelines.reconstruction.depth.luminance import default_bins
+from faintfield.pipelines.reconstruction.depth.search import (
+    check_views,
+    depths_of_set,
+    enlarged,
+    in_unit,
+    limits_mm,
+    naming_range,
+)
+from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
+from faintfield.pipelines.reconstruction.planes.penalised import Objective, solve_then_sigma
+from faintfield.pipelines.reconstruction.planes.prior import with_prior
+from faintfield.pipelines.reconstruction.planes.solutions import Solution, mean_e
+from faintfield.pipelines.reconstruction.surface.files import SurfaceMaps, write_surface
+from faintfield.pipelines.reconstruction.surface.parallax import aperture_of
+from faintfield.pipelines.reconstruction.surface.request import SurfaceRequest
+from faintfield.recon.operator.surface_operator import SurfaceOperator
+from faintfield.recon.prior.patches import refined
+from faintfield.recon.solver.data_fit import SceneProblem
+from faintfield.recon.surface.confidence import RIGHT_WITHIN, SURE, UNKNOWN_BELOW
+from faintfield.recon.surface.estimate import SurfaceEstimate
+from faintfield.recon.surface.held_out import Prediction
+
+# Bytes of a sample in the files: TIFFs of one number and of one per colour, a point, and the picture on the page; and
+# bytes of previews, film and page, which do not grow with the picture.
+_NUMBERS, _NUMBERS_PER_COLOUR, _POINT_BYTES, _FIXED_BYTES = 4, 2, 27, 30_000_000
+
+
+def reconstruct_surface(
+    elemental_set: ElementalSet, out: Path, request: SurfaceRequest, pages: Sequence[Path] = ()
+) -> SurfaceRecord:
+    """Reconstruct the surface of a set, and write it with its record; one that is up to date is kept.
+
+    The caller has `out` to itself, see `formats.files.exclusive`.
+
+    Parameters
+    ----------
+    elemental_set : ElementalSet
+        The set.
+    out : Path
+        Folder of the files.
+    request : SurfaceRequest
+        The range of depths, and how the light is solved.
+    pages : sequence of Path
+        Pages that show an earlier surface: they are removed before its files are.
+
+    Raises
+    ------
+    BadValue
+        The set has too few views, or too small ones.
+    OutputExists
+        `out` holds a depth map, whose files have the same names.
+    GeometryMismatch
+        The views share too little at the depths of a given range, or the range is too wide.
+    NothingInFocus
+        All views were taken from one place; they agree no better than shuffled ones; or no range of depths is given,
+        and none is found.
+    """
+    started = time.monotonic()
+    _check(elemental_set, out)
+    elemental_set = keeping_frames(elemental_set, out)
+    unit = unit_of_maps(elemental_set.units, as_px=request.unit == "px")
+    options = in_units(elemental_set, request.options(elemental_set.poses))
+    origin = provenance("reconstruct", options, elemental_set.input_hashes(), elemental_set.units)
+    kept = read_current(out / SURFACE_FILE, SurfaceFileRecord, origin)
+    if kept is not None:
+        return kept.surface
+    layouts = channel_layouts(elemental_set)
+    grid = plane_grid(elemental_set, 1.0)
+    needed_bytes = _needed_bytes(grid.shape, len(layouts), proposal=request.settings.proposal)
+    require_room(out, int(needed_bytes / (1 - SHARE_OF_DISK)))  # decoded frames take the rest
+    range_mm = limits_mm(elemental_set, request.depth_range_mm)
+    find_range = request.depth_range_mm is None and imported_range_px(elemental_set) is None
+    remove_leftovers(out)
+    bins = default_bins(elemental_set)
+    depths, estimate = depths_of_set(elemental_set, bins, range_mm, find_range=find_range, out=out)
+    far, near = float(depths[0]), float(depths[-1])
+    inverse_depth = enlarged(estimate.inverse_depth, grid.shape, bins)
+    with naming_range(elemental_set, far, near):
+        lights = {
+            layout.name: _light(elemental_set, layout, inverse_depth, request, out)
+            for layout in progress(layouts, "picture")
+        }
+    facts = SurfaceFacts(
+        unit=unit,
+        searched=(in_unit(elemental_set, near, unit), in_unit(elemental_set, far, unit)),
+        range_found=request.depth_range_mm is None,
+        depths=len(depths),
+        bins_px=bins,
+        rounds=estimate.rounds,
+        sure_above=SURE,
+        held_out=_held_out(estimate.prediction),
+        channels=[in_units(elemental_set, _channel(name, light)) for name, light in lights.items()],
+        wall_time_s=time.monotonic() - started,
+    )
+    maps = _maps(elemental_set, inverse_depth, estimate, list(lights.values()), unit, bins)
+    for page in pages:
+        remove(page)
+    record = write_surface(out, maps, facts, origin)
+    write_depth_errors(elemental_set, out, record.depth, record.unit)
+    return record
+
+
+def _check(elemental_set: ElementalSet, out: Path) -> None:
+    """Refuse sets and folders for which no surface can be made."""
+    check_views(elemental_set, "a surface")
+    if (out / DEPTH_MAP_FILE).exists():
+        raise OutputExists(
+            f"{out}: holds the depth map of a sweep, whose files have the names of the surface's; give another --out"
+        )
+
+
+def _needed_bytes(shape: tuple[int, int], colours: int, *, proposal: bool) -> int:
+    """Return about how much disk the results take, with the page that shows them again."""
+    numbers = _NUMBERS + (1 + proposal) * _NUMBERS_PER_COLOUR * colours
+    of_sample = numbers * np.dtype(np.float32).itemsize + _POINT_BYTES + 3 * colours
+    return shape[0] * shape[1] * of_sample + _FIXED_BYTES
+
+
+def _light(
+    elemental_set: ElementalSet,
+    layout: ChannelLayout,
+    inverse_depth: NDArray[np.floating],
+    request: SurfaceRequest,
+    out: Path,
+) -> Solution:
+    """Return one colour of the picture on a surface of known depth, with `sigma` and `visibility` beside it.
+
+    `sigma` is that of total variation's picture; it is computed when the images are gone.
+    """
+    images = load_channel(elemental_set, layout, memory_or_file(out))
+    factory = OperatorFactory(elemental_set, layout, images)
+    operator = factory.of_surface(inverse_depth, plane_grid(elemental_set, 1.0))
+    _name_blind_views(elemental_set, operator, len(layout.lattices))
+    objective = Objective.of(SceneProblem(operator, images), request.settings)
+    solution, sigma = solve_then_sigma(objective, request.settings)
+    if request.filtered:
+        solution = replace(solution, plane=refined(operator, images, solution.plane))
+    else:
+        (solution,) = with_prior(objective, [solution], request.settings)
+    visibility = _visibility(operator, layout)
+    del images, factory, operator, objective
+    return replace(solution, sidecars=solution.sidecars | {"sigma": sigma(), "visibility": visibility})
+
+
+def _visibility(operator: SurfaceOperator, layout: ChannelLayout) -> NDArray[np.floating]:
+    """Return the number of views that see each sample: pixels count alike, whatever their response.
+
+    A view has fewer pixels than samples in a colour of a mosaic.
+    """
+    response = operator.response()
+    inverse = np.divide(1, response, out=np.zeros_like(response), where=response > 0)
+    samples_per_px = np.prod(layout.lattices[0].step) / len(layout.lattices)
+    return operator.adjoint_of_map(inverse) * operator.dtype.type(samples_per_px)
+
+
+def _name_blind_views(elemental_set: ElementalSet, operator: SurfaceOperator, phases: int) -> None:
+    """Inform the user of views that see nothing of the surface: a pose may be wrong."""
+    blind = {int(view) // phases for view in np.setdiff1d(operator.all_views, operator.seeing_views)}
+    if blind:
+        first = elemental_set.settings.view[min(blind)].image
+        inform(f"{len(blind)} views see nothing of the surface, {first} for one; are their poses right?")
+
+
+def _channel(name: str, light: Solution) -> SurfaceChannel:
+    """Return the record of one colour."""
+    record = light.record
+    return SurfaceChannel(
+        channel=name,
+        penalty_weight=record.penalty_weight,
+        penalty_weight_chosen=record.penalty_weight_chosen,
+        penalty_weight_curve=record.penalty_weight_curve or None,
+        certificate=record.certificate,
+        passes=record.passes,
+        likelihood=record.likelihood or "",
+        mean_e=mean_e(light.plane),
+        prior=record.prior,
+    )
+
+
+def _held_out(prediction: Prediction | None) -> HeldOutRecord | None:
+    """Return the record of the views that were left out, None if there are none, or none sees the surface."""
+    if prediction is None or not prediction.pixels:
+        return None
+    return HeldOutRecord(
+        views=prediction.views.tolist(),
+        pixels=prediction.pixels,
+        surface=prediction.surface,
+        planes=prediction.planes,
+        standard_error=prediction.standard_error,
+        neighbours=prediction.neighbours,
+    )
+
+
+def _maps(
+    elemental_set: ElementalSet,
+    inverse_depth: NDArray[np.float64],
+    estimate: SurfaceEstimate,
+    lights: list[Solution],
+    unit: Literal["mm", "px", "relative"],
+    bins: int,
+) -> SurfaceMaps:
+    """Return what is known of each sample."""
+    grid = plane_grid(elemental_set, 1.0)
+    confidence = enlarged(estimate.confidence, grid.shape, bins).astype(np.float32)
+    known = confidence >= UNKNOWN_BELOW
+    depth = in_unit(elemental_set, inverse_depth, unit)
+    # Of a normal distribution that lies within the tolerance with this probability
+    sigma = RIGHT_WITHIN / (np.sqrt(2) * erfinv(np.maximum(confidence, UNKNOWN_BELOW)))
+    slope = np.abs(in_unit(elemental_set, inverse_depth * (1 + 1e-6), unit) - depth) / 1e-6
+    light = light_per_e(elemental_set)
+    proposed = all("proposal" in solution.sidecars for solution in lights)
+    return SurfaceMaps(
+        grid=grid,
+        picture=_colours([light * solution.plane for solution in lights]),
+        picture_sigma=_colours([light * solution.sidecars["sigma"] for solution in lights]),
+        picture_proposal=_colours([light * solution.sidecars["proposal"] for solution in lights]) if proposed else None,
+        picture_moved=_colours([solution.sidecars["moved"] for solution in lights]) if proposed else None,
+        depth=np.where(known, depth, np.nan),
+        depth_sigma=np.where(known, sigma * slope, np.nan),
+        depth_confidence=confidence,
+        visibility=np.mean([solution.sidecars["visibility"] for solution in lights], axis=0),
+        inverse_depth=inverse_depth,
+        aperture_mm=aperture_of(elemental_set.poses_rt_cam_ref),
+    )
+
+
+def _colours(parts: list[NDArray[np.floating]]) -> NDArray[np.floating]:
+    """Return one array of all colours, (row, column[, colour])."""
+    return parts[0] if len(parts) == 1 else np.stack(parts, -1)

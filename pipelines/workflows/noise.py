@@ -1,0 +1,126 @@
+"""A sensor measured from dark and flat frames, with its pages; two measurements compared: `faintfield noise`."""
+
+from pathlib import Path
+
+from faintfield.calib.noise.strips import maps_by
+from faintfield.pipelines.calibration.noise import calibrate_sensor, noise_maps, noise_record
+from faintfield.pipelines.calibration.noise_comparison import CHANCE, MapChange, NoiseComparison, compare_noise
+from faintfield.pipelines.console import inform, working
+from faintfield.pipelines.errors import MissingFile
+from faintfield.pipelines.formats.files import removed_if_empty
+from faintfield.pipelines.formats.large_arrays import maps_in_files
+from faintfield.pipelines.formats.results.noise import NOISE_FILE, STANDARD, NoiseRecord, write_noise
+from faintfield.pipelines.formats.results.noise_fit import FitRecord, Measured
+from faintfield.pipelines.formats.sets.noise_set import FILE_NAME, load_noise_set
+from faintfield.pipelines.pages.emva_page import EMVA_PAGE, emva_page
+from faintfield.pipelines.pages.noise_page import draw_page
+
+_SHOWN = (
+    ("gain_dn_per_e", "K, system gain", "DN/e⁻"),
+    ("offset_dn", "mu_y.dark(0), offset", "DN"),
+    ("read_noise_e", "sigma_d, read noise", "e⁻"),
+    ("dark_current_e_per_s", "mu_I, dark current", "e⁻/s"),
+    ("dsnu_e", "DSNU (pixel)", "e⁻"),
+    ("prnu", "PRNU (pixel)", ""),
+    ("quantum_efficiency", "eta, quantum efficiency", "e⁻/photon"),
+)
+
+
+def measure_sensor(folder: Path, out: Path | None = None) -> NoiseRecord:
+    """Measure a sensor from the frames in a folder, and write the result with its pages, there if not to `out`."""
+    if not folder.exists():
+        raise MissingFile(f"{folder}: no such folder; name a folder with {FILE_NAME} and frames")
+    folder, settings = load_noise_set(folder)
+    out = out or folder
+    with removed_if_empty(out), maps_by(maps_in_files(out)):
+        sensor = calibrate_sensor(folder, settings)
+        with working("drawing the pages"):
+            pages = {
+                f"noise_page{f'_{phase.name}' if phase.name else ''}.png": draw_page(
+                    calibration, f"{folder.resolve().name} {phase.name}"
+                )
+                for phase, calibration in zip(sensor.readout.phases, sensor.phases, strict=True)
+            }
+            record = noise_record(sensor)
+            pages[EMVA_PAGE] = emva_page(folder.resolve().name, record, sensor.emva).encode()
+        record = write_noise(out, record, noise_maps(sensor), pages)
+    _inform_of(record)
+    inform(f"{out / NOISE_FILE}")
+    return record
+
+
+def _inform_of(record: NoiseRecord) -> None:
+    """Print the main numbers and every warning; a reason that holds for several numbers is given once."""
+    inform(f"{STANDARD}; likelihood: {record.likelihood}")
+    explained: dict[str, str] = {}
+    for name, label, unit in _SHOWN:
+        measured: Measured = getattr(record, name)
+        if measured.value is None or measured.ci95 is None:
+            reason = measured.why or ""
+            inform(f"  {label}: not identifiable: {'as for ' + explained[reason] if reason in explained else reason}")
+            explained.setdefault(reason, label.partition(",")[0])
+        else:
+            low, high = measured.ci95
+            inform(f"  {label}: {measured.value:.5g} {unit} (95 %: {low:.5g} to {high:.5g})")
+    if record.fit:
+        _inform_of_fit(record.fit)
+    counts = {kind: len(getattr(record, f"{kind}_pixels")) for kind in ("hot", "noisy", "dead")}
+    inform("  pixels: " + ", ".join(f"{count} {kind}" for kind, count in counts.items()))
+    for warning in record.warnings:
+        inform(f"  warning: {warning}")
+
+
+def _inform_of_fit(fit: FitRecord) -> None:
+    """Print what the flats say of saturation and response, as far as they do."""
+    saturation, error = fit.saturation, fit.linearity_error
+    if saturation.level_dn is not None:
+        full, capacity = fit.saturation_e, ""
+        if full.value is not None:
+            ends = "" if full.ci95 is None else f" (95 %: {full.ci95[0]:.5g} to {full.ci95[1]:.5g})"
+            capacity = f", mu_e.sat {full.value:.5g} e⁻{ends}"
+        inform(f"  saturation: {saturation.level_dn:.5g} DN ({saturation.limit}){capacity}")
+    if error.value is not None and error.ci95 is not None:
+        low, high = error.ci95
+        inform(f"  LE, linearity error: {error.value:.3%} (95 %: {low:.3%} to {high:.3%})")
+
+
+def compare_sensors(first: Path, second: Path) -> NoiseComparison:
+    """Compare two measurements, and print a table of the quantities, and what is known of pixels and maps."""
+    comparison = compare_noise(first, second)
+    inform(f"A: {comparison.first}")
+    inform(f"B: {comparison.second}")
+    quantities = comparison.quantities
+    names = [f"{quantity.plane}: {quantity.name}" if quantity.plane else quantity.name for quantity in quantities]
+    wide = max(map(len, names))
+    inform(f"{'':{wide}}  {'A':>12} {'B':>12} {'B - A':>12} {'in sigma':>9}  verdict")
+    for name, change in zip(names, quantities, strict=True):
+        numbers = " ".join(
+            "-".rjust(12) if n is None else f"{n:12.5g}" for n in (change.first, change.second, change.difference)
+        )
+        sigma = "-" if change.sigma is None else f"{change.sigma:+.1f}"
+        inform(f"{name:{wide}}  {numbers} {sigma:>9}  {change.verdict}{f': {change.why}' if change.why else ''}")
+    for count in comparison.pixels:
+        inform(
+            f"{count.kind} pixels: {count.both} in both, {count.only_first} in A only, {count.only_second} in B only"
+        )
+    for difference in comparison.maps:
+        _inform_of_map(difference)
+    for note in comparison.notes:
+        inform(f"note: {note}")
+    changed = ", ".join(comparison.changed) or "nothing"
+    inform(
+        f"changed: {changed} (beyond {comparison.limit_sigma:.1f} sigma, so that {CHANCE:.0%} of "
+        f"{comparison.comparisons} comparisons together are false alarms)"
+    )
+    return comparison
+
+
+def _inform_of_map(change: MapChange) -> None:
+    """Print how the maps of a quantity differ."""
+    label = f"{change.plane}: {change.name} map" if change.plane else f"{change.name} map"
+    if change.rms_dn is None or change.expected_dn is None:
+        inform(f"{label}: {change.verdict}: {change.why}")
+    else:
+        inform(
+            f"{label}: differs by {change.rms_dn:.4g} DN rms, expected {change.expected_dn:.4g} DN: {change.verdict}"
+        )

@@ -1,0 +1,109 @@
+"""Planes or a surface of a set or session, with the report: `faintfield reconstruct`."""
+
+import time
+from contextlib import ExitStack
+from pathlib import Path
+
+import msgspec
+
+from faintfield.pipelines.choices import SceneKind
+from faintfield.pipelines.console import inform, working
+from faintfield.pipelines.errors import WrongUsage
+from faintfield.pipelines.formats.files import exclusive
+from faintfield.pipelines.formats.results.records import REPORT_FILE
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set, with_measured_geometry
+from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, load_session
+from faintfield.pipelines.pages.report import write_report
+from faintfield.pipelines.reconstruction.channels import keeping_frames
+from faintfield.pipelines.reconstruction.options import OF_PLANES, Options
+from faintfield.pipelines.reconstruction.planes.cluster import make_runner
+from faintfield.pipelines.reconstruction.planes.sweep import Runner, run_serially
+from faintfield.pipelines.reconstruction.request import Request, resolve, select_planes
+from faintfield.pipelines.reconstruction.run import Outcome, reconstruct_set
+from faintfield.pipelines.reconstruction.surface.reconstruct import reconstruct_surface
+from faintfield.pipelines.reconstruction.surface.request import SURFACE_FOLDER, SurfaceRequest, select_surface
+from faintfield.rig.session.session import has_session
+
+
+def reconstruct_folder(
+    folder: Path, out: Path | None, options: Options, geometry: Path | None = None, scene: SceneKind = "dark_scene"
+) -> Outcome:
+    """Reconstruct what the options ask of a set or session, and write the report.
+
+    Raises
+    ------
+    WrongUsage
+        Options contradict one another, or no folder for the results is known.
+    """
+    if options.surface and (of_planes := options.given(OF_PLANES)):
+        raise WrongUsage(
+            f"--surface makes one picture at all depths, and {' and '.join(of_planes)} would have no effect; leave it "
+            "out, or reconstruct planes in a call of their own"
+        )
+    surface = select_surface(options)
+    if surface is not None:
+        elemental_set, page_in = open_set(folder, out, scene, geometry)
+        out = out or page_in / SURFACE_FOLDER
+        return surface_and_report(elemental_set, out, surface.resolve(elemental_set), page_in=page_in)
+    runner = make_runner(options.workers, options.scheduler)
+    planes = select_planes(options)
+    elemental_set, out = open_set(folder, out, scene, geometry)
+    return reconstruct_and_report(elemental_set, out, resolve(planes, elemental_set, out), runner)
+
+
+def reconstruct_and_report(
+    elemental_set: ElementalSet, out: Path, request: Request, runner: Runner | None = None
+) -> Outcome:
+    """Reconstruct planes of a set into `out`, and write the report of them.
+
+    Raises
+    ------
+    OutputBusy
+        Another command is writing to `out`.
+    """
+    started = time.monotonic()
+    with exclusive(out):
+        outcome = reconstruct_set(elemental_set, out, request, runner or run_serially)
+        with working("writing the report"):
+            report = write_report(out)
+    planes = len({record.file for record in outcome.planes})
+    inform(f"{planes} plane(s) in {time.monotonic() - started:.1f} s: {report}")
+    return msgspec.structs.replace(outcome, report=str(report))
+
+
+def surface_and_report(elemental_set: ElementalSet, out: Path, request: SurfaceRequest, *, page_in: Path) -> Outcome:
+    """Reconstruct the surface of a set into `out`, and write the report of all that is in `page_in`, the same or above.
+
+    Raises
+    ------
+    OutputBusy
+        Another command is writing to one of the two.
+    """
+    started = time.monotonic()
+    with ExitStack() as locks:
+        for folder in dict.fromkeys((page_in, out)):
+            locks.enter_context(exclusive(folder))
+        record = reconstruct_surface(elemental_set, out, request, pages=(page_in / REPORT_FILE, out / REPORT_FILE))
+        with working("writing the report"):
+            report = write_report(page_in)
+    sure = f"{record.known_share:.0%} of its depths known, {record.sure_share:.0%} sure"
+    inform(f"a surface in {time.monotonic() - started:.1f} s, {sure}: {report}")
+    return Outcome(
+        out=str(out), report=str(report), planes=[], focus=None, best_focus=None, depth_map=None, metrics=None,
+        surface=record, units=elemental_set.units,
+    )  # fmt: skip
+
+
+def open_set(
+    folder: Path, out: Path | None = None, scene: SceneKind = "dark_scene", geometry: Path | None = None
+) -> tuple[ElementalSet, Path]:
+    """Return a set, or that of a session, and the folder of its results: for a session by default that of the scene."""
+    if has_session(folder):
+        elemental_set = load_session(folder, scene, geometry)
+        out = out or folder / RECONSTRUCTIONS / ("" if scene == "dark_scene" else scene)
+    elif out is None:
+        raise WrongUsage("no folder for the results is named; give --out")
+    else:
+        elemental_set = load_set(folder)
+        elemental_set = elemental_set if geometry is None else with_measured_geometry(elemental_set, geometry)
+    return keeping_frames(elemental_set, out), out

@@ -1,1 +1,0 @@
-"""XY stages for which Micro-Manager has a device adapter."""
