@@ -87,11 +87,10 @@ def _live_order(
     if len(depths) > MAX_DEPTHS:
         raise WrongUsage(f"{len(depths)} live planes are asked for, at most {MAX_DEPTHS} are computed; give fewer")
     return LiveOrder(
-        out="",
-        session=str(session.absolute()),
-        rig=str(rig.absolute()),
+        session=session.absolute(),
+        rig=rig.absolute(),
         depths_mm=tuple(sorted(set(depths))),
-        noise=None if noise is None else str(noise.absolute()),
-        geometry=None if geometry is None else str(geometry.absolute()),
+        noise=None if noise is None else noise.absolute(),
+        geometry=None if geometry is None else geometry.absolute(),
         fx_px=fx_px,
     )

@@ -102,23 +102,30 @@ def plan(
     rose_k
         Standard deviations by which a visible feature stands out of its surroundings (Rose's criterion).
     """
+    from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE
+    from faintfield.pipelines.formats.results.noise import NOISE_FILE
     from faintfield.pipelines.formats.rig_file import read_rig
-    from faintfield.pipelines.planning.known import StatedNoise, known_lens, known_pace, known_sensor
-    from faintfield.pipelines.planning.light import GivenLight
-    from faintfield.pipelines.planning.predict import Predictor, Question, grids_of, scene_view
+    from faintfield.pipelines.planning.known import calibration_file, known_lens, known_pace, known_sensor
+    from faintfield.pipelines.planning.light import LightOptions
+    from faintfield.pipelines.planning.predict import Predictor, Question, parse_grids, scene_view
 
     settings = read_rig(rig)
-    stated = StatedNoise(read_noise_e, dark_current_e_per_s, quantum_efficiency)
-    sensor = known_sensor(settings, rig, noise, stated)
-    lens = known_lens(settings, rig, sensor, geometry, fx_px)
+    sensor = known_sensor(
+        settings,
+        calibration_file(noise, NOISE_FILE, rig.parent),
+        read_noise_e=read_noise_e,
+        dark_current_e_per_s=dark_current_e_per_s,
+        quantum_efficiency=quantum_efficiency,
+    )
+    lens = known_lens(settings, sensor, calibration_file(geometry, GEOMETRY_FILE, rig.parent), fx_px)
     exposures_s = [1e-3 * exposure_ms for exposure_ms in exposures_ms or []]
     exposure_s, view = scene_view(settings, exposures_s)
     frame_exposure_s = None if frame_exposure_ms is None else 1e-3 * frame_exposure_ms
-    given = GivenLight(light_e, light_e_per_s, flat, test_frame, frame_exposure_s, region_px)
+    given = LightOptions(light_e, light_e_per_s, flat, test_frame, frame_exposure_s, region_px)
     depths_mm = depth_mm or settings.scene.depth_mm
     sides_px = [*(feature_px or []), *_in_px(feature_mm or [], depths_mm, lens.f_px)]
     question = Question(
-        depths_mm, sides_px or [10.0], blur_px, rose_k, exposures_s, grids_of(grids or []), frames or [], sigma_e
+        depths_mm, sides_px or [10.0], blur_px, rose_k, exposures_s, parse_grids(grids or []), frames or [], sigma_e
     )
     light = given.resolve(exposure_s, sensor)
     predictor = Predictor(settings, sensor, lens, known_pace(settings), light, question)

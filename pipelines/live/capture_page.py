@@ -9,8 +9,9 @@ import asyncio
 import secrets
 import socket
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from importlib.resources import files
 from json import dumps
 from typing import Any
@@ -20,18 +21,17 @@ import numpy as np
 import uvicorn
 from starlette.datastructures import Headers
 from starlette.requests import Request
-from starlette.responses import HTMLResponse, JSONResponse, Response
+from starlette.responses import HTMLResponse, Response
 from starlette.routing import Route, Router
 from starlette.types import Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from faintfield.pipelines.console import conceal, inform
 from faintfield.pipelines.formats.image_files import encoded
-from faintfield.pipelines.live.panel import REQUESTS, CapturePanel, ShownFrame
+from faintfield.pipelines.live.panel import REQUESTS, CapturePanel, SessionFrames, ShownFrame
 from faintfield.pipelines.live.planes_client import PlanesClient
-from faintfield.pipelines.live.taken import TakenFrames
 from faintfield.pipelines.live.terminal import LABELS, display_levels
-from faintfield.rig.capture.guide import format_duration
+from faintfield.rig.capture.guide import Answer, OperatorRequest, format_duration
 
 _HOST = "127.0.0.1"
 # Width of the frame's picture in pixels.
@@ -56,24 +56,22 @@ _HEADERS = {
 
 
 class _PressRequest(msgspec.Struct, forbid_unknown_fields=True):
-    """Message from the page when a button is pressed."""
-
-    word: str
+    word: Answer | OperatorRequest
     prompt: int | None = None
 
 
 @contextmanager
 def serve_page(
-    panel: CapturePanel, taken: TakenFrames | None = None, planes: PlanesClient | None = None
+    panel: CapturePanel, frames: SessionFrames | None = None, planes: PlanesClient | None = None
 ) -> Iterator[str]:
     """Serve the page of a capture while the block runs; yield its address, which no log records.
 
     Parameters
     ----------
     panel : CapturePanel
-        What the capture asks and shows.
-    taken : TakenFrames, optional
-        The frames of its session, shown when a node is clicked.
+        Prompts and state of the capture.
+    frames : SessionFrames, optional
+        Frames of its session, shown when a node is clicked.
     planes : PlanesClient, optional
         Its live planes.
     """
@@ -82,7 +80,7 @@ def serve_page(
     listener = socket.create_server((_HOST, 0))
     server = uvicorn.Server(
         uvicorn.Config(
-            _Door(_pages(panel, taken, planes), token),
+            _TokenMiddleware(_pages(panel, frames, planes), token),
             http=_BoundedConnection,
             h11_max_incomplete_event_size=_MAX_HEADER_BYTES,
             backlog=_MAX_ARRIVALS,
@@ -107,7 +105,7 @@ def serve_page(
 
 
 def _run(server: uvicorn.Server, listener: socket.socket) -> None:
-    """Run the server; its failure is told, and does not end the capture."""
+    """Run the server; its failure is printed, and does not end the capture."""
 
     async def serve() -> None:
         # What fails in a connection concerns nobody else, and asyncio would print its traceback
@@ -142,7 +140,7 @@ class _BoundedConnection(H11Protocol):
         super().connection_lost(exc)
 
 
-class _Door:
+class _TokenMiddleware:
     """Passes a request on if it gives the token, and comes from this page; tells others nothing.
 
     Attributes
@@ -175,45 +173,36 @@ def _is_own(headers: Headers) -> bool:
     return host.partition(":")[0] == _HOST and headers.get("origin") in (None, f"http://{host}")
 
 
-def _pages(panel: CapturePanel, taken: TakenFrames | None, planes: PlanesClient | None) -> Router:
-    """Return what is served behind the token."""
+def _pages(panel: CapturePanel, frames: SessionFrames | None, planes: PlanesClient | None) -> Router:
+    """Return the addresses behind the token."""
     html = files("faintfield.pipelines.live").joinpath("capture.html").read_text(encoding="utf-8")
 
     async def index(_: Request) -> Response:
         return HTMLResponse(html)
 
     async def state(_: Request) -> Response:
-        # Escaped, because the name of a file may not be UTF-8
-        content = _state(panel) | {"planes": None if planes is None else _planes(planes)}
-        return Response(dumps(content), media_type="application/json")
+        return _json(_state(panel) | {"planes": None if planes is None else _planes(planes)})
 
     async def picture(_: Request) -> Response:
         shown = panel.shown
-        if shown is None:
-            return Response(status_code=404)
-        return Response(_png(shown), media_type="image/png")
+        return _image(None if shown is None else _png(shown))
 
     async def live_picture(request: Request) -> Response:
-        content = None if planes is None else planes.picture(request.path_params["name"])
-        return Response(status_code=404) if content is None else Response(content, media_type="image/png")
+        return _image(None if planes is None else planes.picture(request.path_params["name"]))
 
     async def node(request: Request) -> Response:
         status, row, column = panel.status, request.path_params["row"], request.path_params["column"]
-        if taken is None or status is None:
+        if frames is None or status is None:
             return Response(status_code=404)
-        return Response(
-            dumps(msgspec.to_builtins(taken.at(status.step - 1, (row, column)))), media_type="application/json"
-        )
+        return _json(msgspec.to_builtins(frames.at(status.step - 1, (row, column))))
 
     async def press(request: Request) -> Response:
         try:
             pressed = msgspec.json.decode(await _body(request), type=_PressRequest)
         except (msgspec.DecodeError, UnicodeDecodeError):
-            return JSONResponse({"error": "not a press of a button"}, status_code=400)
-        if pressed.word not in LABELS:
-            return JSONResponse({"error": "no such button"}, status_code=400)
+            return _json({"error": "not a press of a button"}, status_code=400)
         panel.press(pressed.word, pressed.prompt)
-        return JSONResponse({})
+        return _json({})
 
     return Router(
         [
@@ -228,6 +217,15 @@ def _pages(panel: CapturePanel, taken: TakenFrames | None, planes: PlanesClient 
     )
 
 
+def _json(content: object, status_code: int = 200) -> Response:
+    # Escaped, because the name of a file may not be UTF-8
+    return Response(dumps(content), status_code, media_type="application/json")
+
+
+def _image(png: bytes | None) -> Response:
+    return Response(status_code=404) if png is None else Response(png, media_type="image/png")
+
+
 async def _body(request: Request) -> bytes:
     """Return the body of a request; nothing, and without reading on, if it is too long for a press."""
     if int(request.headers.get("content-length", 0)) > _MAX_PRESS_BYTES:
@@ -240,21 +238,8 @@ async def _body(request: Request) -> bytes:
     return body
 
 
-def _kept[T](make: Callable[[ShownFrame], T]) -> Callable[[ShownFrame], T]:
-    """Let `make` keep what it made of the last frame: the page asks several times a second."""
-    last: tuple[ShownFrame, T] | None = None
-
-    def make_once(shown: ShownFrame) -> T:
-        nonlocal last
-        present = last
-        if present is None or present[0] is not shown:
-            present = last = (shown, make(shown))
-        return present[1]
-
-    return make_once
-
-
-@_kept
+# Picture and numbers of the last frame are kept: the page asks for them several times a second.
+@lru_cache(maxsize=1)
 def _png(shown: ShownFrame) -> bytes:
     """Return the picture of a frame in red, as a PNG file."""
     grey = display_levels(shown.pixels, _PICTURE_PX)
@@ -262,7 +247,7 @@ def _png(shown: ShownFrame) -> bytes:
     return encoded(np.dstack([grey, zero, zero]), ".png")
 
 
-@_kept
+@lru_cache(maxsize=1)
 def _frame(shown: ShownFrame) -> dict[str, Any]:
     """Return name, values and histogram of a frame as a JSON object."""
     counts, edges = np.histogram(shown.pixels, bins=_HISTOGRAM_BINS)
@@ -276,17 +261,16 @@ def _frame(shown: ShownFrame) -> dict[str, Any]:
 
 def _planes(planes: PlanesClient) -> dict[str, Any]:
     """Return the state of live planes as a JSON object."""
-    status = planes.status()
     return {
-        "ended": planes.ended(),
-        "offered": planes.offered(),
+        "ended": planes.failure(),
+        "offered": planes.frame_count(),
         "silence_s": round(planes.silence_s()),
-        "status": None if status is None else msgspec.to_builtins(status),
+        "status": msgspec.to_builtins(planes.status),
     }
 
 
 def _state(panel: CapturePanel) -> dict[str, Any]:
-    """Return what the page shows, except the picture, as a JSON object."""
+    """Return the content of the page, except the picture, as a JSON object."""
     asked, status, shown = panel.asked, panel.status, panel.shown
     words = REQUESTS if asked is None else asked.prompt.answers
     return {

@@ -13,10 +13,9 @@ from faintfield.pipelines.console import console, inform, progress
 from faintfield.pipelines.errors import InputError, UnknownFormat
 from faintfield.pipelines.formats.files import require_room
 from faintfield.pipelines.formats.frames import read_frame
-from faintfield.pipelines.live.panel import CapturePanel
-from faintfield.pipelines.live.planes_client import PlanesClient, live_planes
+from faintfield.pipelines.live.panel import CapturePanel, SessionFrames
+from faintfield.pipelines.live.planes_client import live_planes
 from faintfield.pipelines.live.planes_messages import LiveOrder
-from faintfield.pipelines.live.taken import TakenFrames
 from faintfield.pipelines.live.terminal import TerminalView
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.capture.guide import format_duration
@@ -71,8 +70,7 @@ def capture_session(
         if before:
             inform(f"{folder}: {before} of {len(session.frames)} frames are there; going on")
         if page:
-            taken = TakenFrames(session)
-            _open_page(panel, stack, taken, None if planes is None else _begin_planes(planes, panel, taken, stack))
+            _open_page(panel, stack, SessionFrames(session), planes)
         stack.enter_context(TerminalView(panel).show())
         stack.enter_context(_stop_on_interrupt(panel))
         Capture(session, open_rig(settings, session.journal, read_pixels), panel, read_pixels).run()
@@ -82,33 +80,28 @@ def capture_session(
 
 
 def _plan_session(settings: RigSettings, folder: Path) -> FrozenPlan:
-    """Return the plan of the session in `folder`, or make one after a survey of the rig."""
+    """Read the plan of the session in `folder`, or make one after a survey of the rig."""
     if has_session(folder):
         frozen = read_plan(folder)
         check_same_rig(frozen, settings)
         return frozen
-    found = survey(open_rig(settings), settings)
-    for warning in found.stage.warnings:
+    rig = survey(open_rig(settings), settings)
+    for warning in rig.stage.warnings:
         inform(f"warning: {warning}")
-    require_room(folder, needed_bytes(found.plan))
-    inform(f"{found.plan.frame_count()} frames, {duration_words(found.duration_s, settings.stage)}")
-    return FrozenPlan(found.plan, settings)
+    require_room(folder, needed_bytes(rig.plan))
+    inform(f"{rig.plan.frame_count()} frames, {_format_duration(rig.duration_s, settings.stage)}")
+    return FrozenPlan(rig.plan, settings)
 
 
-def _begin_planes(order: LiveOrder, panel: CapturePanel, taken: TakenFrames, stack: ExitStack) -> PlanesClient | None:
-    """Start live planes, which end with the stack; None if they cannot be started."""
-    client = stack.enter_context(live_planes(order, taken.of_dark_scene))
-    if client is not None:
-        panel.on_change.append(client.note_change)
-    return client
-
-
-def _open_page(panel: CapturePanel, stack: ExitStack, taken: TakenFrames, planes: PlanesClient | None) -> None:
+def _open_page(panel: CapturePanel, stack: ExitStack, frames: SessionFrames, order: LiveOrder | None) -> None:
     """Serve the page until the stack is closed; if that fails, go on where prompts can be answered otherwise."""
+    planes = None if order is None else stack.enter_context(live_planes(order, frames.of_dark_scene))
+    if planes is not None:
+        panel.on_change.append(planes.note_change)
     try:
         from faintfield.pipelines.live.capture_page import serve_page  # slow: imports a web server
 
-        address = stack.enter_context(serve_page(panel, taken, planes))
+        address = stack.enter_context(serve_page(panel, frames, planes))
     except (OSError, RuntimeError) as failure:
         if not (panel.unattended or console.is_terminal):
             raise CaptureStopped(
@@ -158,21 +151,20 @@ def needed_bytes(plan: CapturePlan) -> int:
     return round(_ROOM_FACTOR * plan.disk_bytes())
 
 
-def duration_words(duration_s: float, stage: StageSettings) -> str:
-    """Return the duration of a capture in words, and by which clock if the stage is simulated."""
-    words = f"{format_duration(duration_s)} without prompts"
-    return f"{words} by the simulated stage's clock, far less by yours" if stage.simulated else words
+def _format_duration(duration_s: float, stage: StageSettings) -> str:
+    clock = " by the simulated stage's clock, far less by yours" if stage.simulated else ""
+    return f"{format_duration(duration_s)} without prompts{clock}"
 
 
-def survey_lines(found: Survey, stage: StageSettings, rig: Path) -> list[str]:
+def survey_lines(rig: Survey, stage: StageSettings, rig_file: Path) -> list[str]:
     """Return a line each about stage, camera, plan and the disk of the rig.toml."""
-    plan, travel = found.plan, found.stage.travel_mm
+    plan, travel = rig.plan, rig.stage.travel_mm
     size_mb, need_mb = plan.disk_bytes() / 1e6, needed_bytes(plan) / 1e6
-    free_mb = shutil.disk_usage(rig.absolute().parent).free / 1e6
+    free_mb = shutil.disk_usage(rig_file.absolute().parent).free / 1e6
     return [
-        f"stage: {found.stage.firmware}, travel {travel}; all {len(plan.path())} points of the path are allowed",
-        f"camera: {found.camera.name}; all exposure times are offered",
-        f"plan: {plan.frame_count()} frames in {len(plan.steps)} steps, {duration_words(found.duration_s, stage)}",
+        f"stage: {rig.stage.firmware}, travel {travel}; all {len(plan.path())} points of the path are allowed",
+        f"camera: {rig.camera.name}; all exposure times are offered",
+        f"plan: {plan.frame_count()} frames in {len(plan.steps)} steps, {_format_duration(rig.duration_s, stage)}",
         f"disk: {size_mb:.0f} MB of frames; {need_mb:.0f} MB are wanted, {free_mb:.0f} MB are free",
     ]
 

@@ -1,4 +1,4 @@
-"""State that terminal and page share: one prompt, one status, one queue of pressed buttons.
+"""State that terminal and page share: one prompt, one status, one queue of pressed buttons; and the frames so far.
 
 Both show the same state, and the first answer from either counts. The capture runs in the main thread and reads the
 queue; keys, clicks and Ctrl-C all write to it.
@@ -6,23 +6,20 @@ queue; keys, clicks and Ctrl-C all write to it.
 
 import itertools
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from queue import Empty, SimpleQueue
-from typing import NamedTuple, get_args
+from typing import get_args
 
 from msgspec import Struct
 
+from faintfield.pipelines.live.planes_messages import LiveFrame
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.capture.guide import Answer, OperatorRequest, Prompt, Status
 from faintfield.rig.plan import PlannedFrame
+from faintfield.rig.session.journal import CommittedFrame
+from faintfield.rig.session.session import Session
 
 REQUESTS: tuple[OperatorRequest, ...] = get_args(OperatorRequest.__value__)
-
-
-class ButtonPress(NamedTuple):
-    """A pressed button or key: its word, and the number of the prompt that it answers, if any."""
-
-    word: str
-    prompt: int | None
 
 
 class OpenPrompt(Struct, frozen=True):
@@ -32,8 +29,8 @@ class OpenPrompt(Struct, frozen=True):
     prompt: Prompt
 
 
-class ShownFrame(Struct, frozen=True):
-    """The frame on display, with its measured values by name."""
+class ShownFrame(Struct, frozen=True, eq=False):
+    """The frame on display, with its measured values by name; each is equal to itself alone."""
 
     frame: PlannedFrame
     pixels: Pixels
@@ -62,12 +59,13 @@ class CapturePanel:
         self.shown: ShownFrame | None = None
         self.on_change: list[Callable[[], None]] = []
         self.unattended = unattended
-        self._pressed: SimpleQueue[ButtonPress] = SimpleQueue()
+        # The word of each button or key, and the number of the prompt that it answers, if any
+        self._pressed: SimpleQueue[tuple[str, int | None]] = SimpleQueue()
         self._numbers = itertools.count(1)
 
     def press(self, word: str, prompt: int | None = None) -> None:
         """Press a button, from any thread or a signal handler."""
-        self._pressed.put(ButtonPress(word, prompt))
+        self._pressed.put((word, prompt))
 
     def ask(self, prompt: Prompt) -> Answer:
         """Show `prompt` and return the first answer to it."""
@@ -76,22 +74,21 @@ class CapturePanel:
         self.asked = OpenPrompt(next(self._numbers), prompt)
         self._changed()
         while True:
-            pressed = self._pressed.get()
-            if pressed.word in prompt.answers and pressed.prompt in (None, self.asked.number):
+            word, number = self._pressed.get()
+            if word in prompt.answers and number in (None, self.asked.number):
                 self.asked = None
                 self._changed()
-                return pressed.word
+                return word
 
     def take_request(self) -> OperatorRequest | None:
         """Return the latest request since the last call, None if there is none."""
         latest: OperatorRequest | None = None
-        while True:
-            try:
-                pressed = self._pressed.get_nowait()
-            except Empty:
-                return latest
-            if pressed.word in REQUESTS and pressed.prompt is None:
-                latest = pressed.word
+        with suppress(Empty):
+            while True:
+                word, number = self._pressed.get_nowait()
+                if word in REQUESTS and number is None:
+                    latest = word
+        return latest
 
     def show_status(self, status: Status) -> None:
         """Show the state of the capture."""
@@ -104,6 +101,51 @@ class CapturePanel:
         self._changed()
 
     def _changed(self) -> None:
-        """Inform the views."""
         for callback in self.on_change:
             callback()
+
+
+class FrameSummary(Struct, frozen=True):
+    """A frame that was taken: its name, position of the stage in mm, and time of writing in s since 1970."""
+
+    name: str
+    position_mm: tuple[float, float]
+    exposure_s: float
+    written_s: float | None
+    values: dict[str, float]
+
+
+class SessionFrames:
+    """The valid frames of an open session, whose capture goes on in another thread."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+
+    def at(self, step: int, node: tuple[int, int]) -> list[FrameSummary]:
+        """Return the frames of a step at a node, in the order of the plan."""
+        return [
+            self._record(frame, planned)
+            for frame, planned in self._valid()
+            if planned.step == step and planned.stop.node == node
+        ]
+
+    def of_dark_scene(self) -> tuple[LiveFrame, ...]:
+        """Return the frames of the dark scene, in the order of the plan."""
+        return tuple(
+            LiveFrame(frame.intent, frame.file, planned.stop.node, planned.exposure_s)
+            for frame, planned in self._valid()
+            if planned.kind == "dark_scene"
+        )
+
+    def _valid(self) -> list[tuple[CommittedFrame, PlannedFrame]]:
+        """Return the valid frames in the order of the plan."""
+        # Sorting copies them in one step: the capture changes them meanwhile
+        frames = sorted(self._session.valid().values(), key=lambda frame: frame.frame)
+        return [(frame, self._session.frames[frame.frame]) for frame in frames]
+
+    def _record(self, frame: CommittedFrame, planned: PlannedFrame) -> FrameSummary:
+        x_mm, y_mm = frame.record.position_mm
+        written_s = None
+        with suppress(OSError):
+            written_s = self._session.path_of(frame).stat().st_mtime
+        return FrameSummary(planned.name, (x_mm, y_mm), frame.record.exposure_s, written_s, dict(frame.record.checks))

@@ -1,4 +1,4 @@
-"""Scene of live planes before it is complete: nodes, lens, poses and noise, and where these are from."""
+"""Scene of live planes before it is complete: nodes, lens, poses and noise, with their sources."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,14 +9,13 @@ from faintfield.calib.lens import Lens
 from faintfield.calib.noise_model import NoiseModel
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.frames import Frame, Lattice, mosaic_period
-from faintfield.pipelines.formats.reading import is_file, is_folder
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, CameraPoses, read_geometry
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, FittedNoise, read_fitted_noise
 from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSetFile
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, with_measured_geometry
 from faintfield.pipelines.formats.sets.session_set import nominal_view, relative_to_axis
 from faintfield.pipelines.live.planes_messages import LiveOrder
-from faintfield.pipelines.planning.known import KnownLens, Sensor, StatedNoise, known_lens, known_sensor
+from faintfield.pipelines.planning.known import KnownLens, Sensor, calibration_file, known_lens, known_sensor
 from faintfield.pipelines.reconstruction.channels import ChannelLayout
 from faintfield.rig.plan import CapturePlan, PlannedFrame, planned_frames
 from faintfield.rig.session.session import FrozenPlan
@@ -36,18 +35,14 @@ class LiveScene:
     ----------
     elemental_set : ElementalSet
         A view per node; the names of its images mean nothing.
-    layout : ChannelLayout
-        The pixels that count: all of them, or the green ones of frames in RGB.
-    bins : int
-        Width in pixels of the bins that are added up.
+    layout, bins : ChannelLayout, int
+        The pixels that count, of RGB the green ones, and the width in pixels of the bins that are added up.
     view_of : dict of (int, int) to int
         Index of each node's view.
     poses, noise : str
-        Where they are from, in words.
-    unit : str
-        Unit of the light: electrons, or DN where the noise is not known.
+        Their sources, in words.
     knows_noise : bool
-        Whether there is a noise model, without which PMLEM has no likelihood.
+        True if there is a noise model, without which light is in DN and PMLEM has no likelihood.
     """
 
     elemental_set: ElementalSet
@@ -56,7 +51,6 @@ class LiveScene:
     view_of: dict[Node, int]
     poses: str
     noise: str
-    unit: str
     knows_noise: bool
 
 
@@ -72,16 +66,15 @@ def live_scene(order: LiveOrder, frozen: FrozenPlan, frame: Frame) -> LiveScene:
     """
     height, width = frame.pixels_dn.shape[:2]
     size_px = (width, height)
-    session, beside = Path(order.session), Path(order.rig).parent
-    noise_path = _found(order.noise, NOISE_FILE, session, beside)
-    geometry_path = _found(order.geometry, GEOMETRY_FILE, session, beside)
-    sensor = known_sensor(frozen.rig, Path(order.rig), noise_path, StatedNoise())
-    guess = known_lens(frozen.rig, Path(order.rig), sensor, geometry_path, order.fx_px)
-    lens, lens_words = _lens(geometry_path, guess, size_px, stated=order.fx_px is not None)
-    fitted = _noise(noise_path, sensor, guess, size_px)
+    folders = order.session, order.rig.parent
+    geometry = calibration_file(order.geometry, GEOMETRY_FILE, *folders)
+    sensor = known_sensor(frozen.rig, calibration_file(order.noise, NOISE_FILE, *folders))
+    known = known_lens(frozen.rig, sensor, geometry, order.fx_px)
+    lens, lens_source = _lens(geometry, known, size_px, "as given" if order.fx_px else "of the simulated camera")
+    fitted = _noise(sensor, known, size_px)
     mosaic = fitted.mosaic or frozen.rig.mosaic or frame.mosaic
-    planned = _planned_set(session, frozen.plan, lens, fitted)
-    elemental_set, poses = _with_poses(planned, geometry_path, lens_words)
+    planned = _planned_set(order.session, frozen.plan, lens, fitted)
+    elemental_set, poses = _with_poses(planned, geometry, lens_source)
     plane_of_colour = 1 if frame.pixels_dn.ndim == 3 else None
     return LiveScene(
         elemental_set,
@@ -90,7 +83,7 @@ def live_scene(order: LiveOrder, frozen: FrozenPlan, frame: Frame) -> LiveScene:
         {view.node: index for index, view in enumerate(elemental_set.settings.view) if view.node is not None},
         poses,
         sensor.source,
-        *(("e⁻/px", True) if _is_known(sensor) else ("DN/px", False)),
+        sensor.path is not None or sensor.model is not None,
     )
 
 
@@ -105,43 +98,31 @@ def dark_frames(plan: CapturePlan) -> list[PlannedFrame]:
     return [frame for frame in planned_frames(plan) if frame.kind == "dark_scene"]
 
 
-def _found(given: str | None, name: str, *folders: Path) -> Path | None:
-    """Return the file of a calibration: as given, or the first that lies in one of the folders."""
-    if given is not None:
-        return Path(given) / name if is_folder(Path(given)) else Path(given)
-    return next((folder / name for folder in folders if is_file(folder / name)), None)
-
-
-def _is_known(sensor: Sensor) -> bool:
-    """Return whether there is a noise model."""
-    return sensor.path is not None or sensor.model is not None
-
-
-def _lens(path: Path | None, guess: KnownLens, size_px: tuple[int, int], *, stated: bool) -> tuple[Lens, str]:
-    """Return the lens, and where it is from."""
+def _lens(path: Path | None, known: KnownLens, size_px: tuple[int, int], origin: str) -> tuple[Lens, str]:
+    """Return the lens, and its source in words."""
     if path is not None:
         return read_geometry(path, CameraPoses).camera_lens(), f"lens of {path}"
-    if guess.f_px.value is None:
+    f_px = known.f_px.value
+    if f_px is None:
         raise MissingFile(
             "no lens is known, and live planes need one; run `faintfield geometry` on the boards of this session, or "
             "give --geometry or --fx-px"
         )
-    centre_px = guess.centre_px if guess.centre_px is not None and guess.size_px == size_px else None
+    centre_px = known.centre_px if known.size_px == size_px else None
     cx_px, cy_px = centre_px or ((size_px[0] - 1) / 2, (size_px[1] - 1) / 2)
-    words = f"focal length of {guess.f_px.value:g} px " + ("as given" if stated else "of the simulated camera")
-    return Lens(size_px, guess.f_px.value, guess.f_px.value, cx_px, cy_px, ()), f"{words}, no distortion"
+    return Lens(size_px, f_px, f_px, cx_px, cy_px, ()), f"focal length of {f_px:g} px {origin}, no distortion"
 
 
-def _noise(path: Path | None, sensor: Sensor, guess: KnownLens, size_px: tuple[int, int]) -> FittedNoise:
-    """Return the noise of the sensor; numbers as they are where nothing is known."""
-    if path is not None:
-        return read_fitted_noise(path, size_px)
-    usable = np.zeros(size_px[::-1], bool)
+def _noise(sensor: Sensor, lens: KnownLens, size_px: tuple[int, int]) -> FittedNoise:
+    """Return the noise of the sensor; DN are taken for electrons where it is not known."""
+    if sensor.path is not None:
+        return read_fitted_noise(sensor.path, size_px)
+    unusable = np.zeros(size_px[::-1], bool)
     if sensor.model is None:
-        return FittedNoise(NoiseModel(0.0, 1.0, 0.0), usable, None)
-    response = guess.response
-    known = response is not None and response.shape == usable.shape
-    return FittedNoise(sensor.model, usable, np.asarray(response, np.float32) if known else None)
+        return FittedNoise(NoiseModel(0.0, 1.0, 0.0), unusable, None)
+    response = lens.response
+    known = response is not None and response.shape == unusable.shape
+    return FittedNoise(sensor.model, unusable, np.asarray(response, np.float32) if known else None)
 
 
 def _planned_set(session: Path, plan: CapturePlan, lens: Lens, fitted: FittedNoise) -> ElementalSet:
@@ -178,10 +159,10 @@ def _planned_set(session: Path, plan: CapturePlan, lens: Lens, fitted: FittedNoi
     )
 
 
-def _with_poses(planned: ElementalSet, path: Path | None, lens_words: str) -> tuple[ElementalSet, str]:
+def _with_poses(planned: ElementalSet, path: Path | None, lens_source: str) -> tuple[ElementalSet, str]:
     """Return the set at measured poses if there are any for all of its nodes, and which poses it has."""
     if path is None:
-        return planned, f"nominal, as the stage is told; {lens_words}"
+        return planned, f"nominal, as the stage is told; {lens_source}"
     try:
         return with_measured_geometry(planned, path), f"measured, of {path}"
     except BadValue as failure:

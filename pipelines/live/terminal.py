@@ -18,7 +18,7 @@ from rich.text import Text
 from faintfield.pipelines.console import console, inform, visible
 from faintfield.pipelines.live.panel import CapturePanel, ShownFrame
 from faintfield.rig.cameras.protocol import Pixels
-from faintfield.rig.capture.guide import Prompt, Status, format_duration
+from faintfield.rig.capture.guide import Status, format_duration
 
 LABELS = {
     "go": "go on",
@@ -30,19 +30,13 @@ LABELS = {
     "pause": "pause",
 }
 _KEYS = {"go": "g", "again": "a", "keep": "k", "retake": "r", "skip": "s", "stop": "q", "pause": "p"}
-# Width of the frame's picture in characters.
-_PICTURE_COLUMNS = 48
+# Widths of the frame's picture and histogram in characters.
+_PICTURE_COLUMNS, _HISTOGRAM_COLUMNS = 48, 24
 _BARS = " ▁▂▃▄▅▆▇█"
 
 
 class TerminalView:
-    """Shows a panel in the terminal; without a terminal, prints a line for each step and warning.
-
-    Parameters
-    ----------
-    panel : CapturePanel
-        The panel to show.
-    """
+    """View of a panel in the terminal; without a terminal, a line for each step and warning."""
 
     def __init__(self, panel: CapturePanel) -> None:
         self._panel = panel
@@ -65,7 +59,9 @@ class TerminalView:
         status, asked = self._panel.status, self._panel.asked
         if asked is not None and asked.number != self._prompt_number:
             self._prompt_number = asked.number
-            for line in prompt_lines(asked.prompt):
+            prompt = asked.prompt
+            answers = f"{_key_line(prompt.answers, '   ')}   (Enter: {LABELS[prompt.answers[0]]})"
+            for line in ("", prompt.title, *(f"  {line}" for line in (*prompt.lines, answers))):
                 inform(line)
         if status is not None:
             title = [status.title] if self._panel.unattended else []
@@ -80,43 +76,30 @@ class TerminalView:
         """Return the part of the screen that is redrawn."""
         parts: list[RenderableType] = []
         if self._panel.shown is not None:
-            parts += [frame_picture(self._panel.shown.pixels), Text(values_line(self._panel.shown), style="dim")]
+            parts += [_frame_picture(self._panel.shown.pixels), Text(_describe_frame(self._panel.shown), style="dim")]
         if self._panel.status is not None:
-            parts.append(Text(status_line(self._panel.status)))
+            parts.append(Text(_describe_status(self._panel.status)))
         if self._panel.asked is None:
             parts.append(Text(_key_line(("pause", "retake", "skip", "stop"), "  "), style="dim"))
         return Group(*parts)
 
 
-def prompt_lines(prompt: Prompt) -> list[str]:
-    """Return a prompt as lines of text."""
-    answers = f"{_key_line(prompt.answers, '   ')}   (Enter: {LABELS[prompt.answers[0]]})"
-    return ["", prompt.title, *(f"  {line}" for line in (*prompt.lines, answers))]
+def _key_line(answers: Iterable[str], gap: str) -> str:
+    return gap.join(f"[{_KEYS[answer]}] {LABELS[answer]}" for answer in answers)
 
 
-def _key_line(words: Iterable[str], gap: str) -> str:
-    """Return each key with its label."""
-    return gap.join(f"[{_KEYS[word]}] {LABELS[word]}" for word in words)
-
-
-def status_line(status: Status) -> str:
-    """Return a status as one line."""
+def _describe_status(status: Status) -> str:
     node = "" if status.node is None else f" node {status.node[0]},{status.node[1]}"
     line = f"{status.done} of {status.total} frames, {format_duration(status.to_go_s)} to go;{node}: {status.doing}"
     return visible(line)
 
 
-def values_line(shown: ShownFrame) -> str:
-    """Return a line with name and histogram of a frame, and a second one with its measured values."""
+def _describe_frame(shown: ShownFrame) -> str:
+    """Return a line with name and histogram of a frame, of logarithmic height, and a second one with its values."""
     values = visible("  ".join(f"{name} {value:g}" for name, value in shown.values.items()))
-    return f"{visible(shown.frame.name)}  {histogram_bars(shown.pixels)}\n{values}"
-
-
-def histogram_bars(pixels: Pixels, bins: int = 24) -> str:
-    """Return a histogram in block characters of logarithmic height, from the darkest to the brightest pixel."""
-    counts, _ = np.histogram(pixels, bins=bins)
-    heights = np.log1p(counts) / max(float(np.log1p(counts).max()), 1.0)
-    return "".join(_BARS[round(height * (len(_BARS) - 1))] for height in heights)
+    heights = np.log1p(np.histogram(shown.pixels, bins=_HISTOGRAM_COLUMNS)[0])
+    bars = "".join(_BARS[round(height / max(heights.max(), 1.0) * (len(_BARS) - 1))] for height in heights)
+    return f"{visible(shown.frame.name)}  {bars}\n{values}"
 
 
 def display_levels(pixels: Pixels, width_px: int) -> Pixels:
@@ -128,7 +111,7 @@ def display_levels(pixels: Pixels, width_px: int) -> Pixels:
     return np.asarray(np.clip((small - low) * (255.0 / max(float(high - low), 1.0)), 0, 255), np.uint8)
 
 
-def frame_picture(pixels: Pixels) -> Text:
+def _frame_picture(pixels: Pixels) -> Text:
     """Return a frame in half blocks, red on black, which preserves dark adaptation."""
     picture = display_levels(pixels, _PICTURE_COLUMNS)
     text = Text()

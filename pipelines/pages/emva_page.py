@@ -9,78 +9,52 @@ from faintfield.calib.noise import Estimate
 from faintfield.calib.noise.likelihood.rounding import ROUNDING_DN2
 from faintfield.pipelines.calibration.noise_emva import EmvaMeasurement
 from faintfield.pipelines.formats.results.noise import STANDARD, NoiseRecord
-from faintfield.pipelines.pages import symbols
-from faintfield.pipelines.pages.emva_drawing import Drawing
-from faintfield.pipelines.pages.emva_plots import drawings
-from faintfield.pipelines.pages.page import template
+from faintfield.pipelines.pages.emva_plots import Drawing, drawings
+from faintfield.pipelines.pages.page import html_symbols, template
 
 EMVA_PAGE = "emva1288_report.html"
 
-# Groups of rows: name, symbol, words, unit, factor to it.
-_TABLE: tuple[tuple[str, tuple[tuple[str, str, str, str, float], ...]], ...] = (
-    (
-        "Sensitivity",
-        (
-            ("quantum_efficiency", "η", "quantum efficiency", "%", 100.0),
-            ("gain_dn_per_e", "K", "system gain", "DN/e⁻", 1.0),
-            ("gain_e_per_dn", "1/K", "inverse of it", "e⁻/DN", 1.0),
-            ("responsivity_dn_per_photon", "R", "responsivity", "DN/photon", 1.0),
-        ),
+_LINEARITY = "mean absolute deviation of the fitted response, 5 to 95 % of saturation"
+
+# Groups of rows by title: name, symbol, words, unit, factor to it.
+_TABLE: dict[str, tuple[tuple[str, str, str, str, float], ...]] = {
+    "Sensitivity": (
+        ("quantum_efficiency", "η", "quantum efficiency", "%", 100.0),
+        ("gain_dn_per_e", "K", "system gain", "DN/e⁻", 1.0),
+        ("gain_e_per_dn", "1/K", "inverse of it", "e⁻/DN", 1.0),
+        ("responsivity_dn_per_photon", "R", "responsivity", "DN/photon", 1.0),
     ),
-    (
-        "Temporal dark noise",
-        (
-            ("read_noise_e", "σ_d(0)", "at zero exposure", "e⁻", 1.0),
-            ("dark_noise_e", "σ_d", "at the exposure stated above", "e⁻", 1.0),
-            ("read_noise_dn", "K σ_d(0)", "at zero exposure, without rounding", "DN", 1.0),
-            ("dark_noise_dn", "σ_y.dark(0)", "at zero exposure, with rounding", "DN", 1.0),
-        ),
+    "Temporal dark noise": (
+        ("read_noise_e", "σ_d(0)", "at zero exposure", "e⁻", 1.0),
+        ("dark_noise_e", "σ_d", "at the exposure stated above", "e⁻", 1.0),
+        ("read_noise_dn", "K σ_d(0)", "at zero exposure, without rounding", "DN", 1.0),
+        ("dark_noise_dn", "σ_y.dark(0)", "at zero exposure, with rounding", "DN", 1.0),
     ),
-    (
-        "Range",
-        (
-            ("threshold_photons", "μ_p.min", "absolute sensitivity threshold", "photons", 1.0),
-            ("threshold_e", "μ_e.min", "absolute sensitivity threshold", "e⁻", 1.0),
-            ("saturation_photons", "μ_p.sat", "saturation capacity", "photons", 1.0),
-            ("saturation_e", "μ_e.sat", "saturation capacity", "e⁻", 1.0),
-            ("snr_max", "SNR_max", "largest signal-to-noise ratio", "", 1.0),
-            ("dynamic_range", "DR", "dynamic range", "", 1.0),
-        ),
+    "Range": (
+        ("threshold_photons", "μ_p.min", "absolute sensitivity threshold", "photons", 1.0),
+        ("threshold_e", "μ_e.min", "absolute sensitivity threshold", "e⁻", 1.0),
+        ("saturation_photons", "μ_p.sat", "saturation capacity", "photons", 1.0),
+        ("saturation_e", "μ_e.sat", "saturation capacity", "e⁻", 1.0),
+        ("snr_max", "SNR_max", "largest signal-to-noise ratio", "", 1.0),
+        ("dynamic_range", "DR", "dynamic range", "", 1.0),
     ),
-    (
-        "Nonuniformity",
-        (
-            ("dsnu_total_e", "DSNU", "dark signal, all", "e⁻", 1.0),
-            ("dsnu_total_dn", "DSNU", "dark signal, all", "DN", 1.0),
-            ("dsnu_row_e", "DSNU.row", "its row part", "e⁻", 1.0),
-            ("dsnu_column_e", "DSNU.col", "its column part", "e⁻", 1.0),
-            ("dsnu_pixel_e", "DSNU.pixel", "its pixel part", "e⁻", 1.0),
-            ("prnu_total", "PRNU", "response to light, all", "%", 100.0),
-            ("prnu_row", "PRNU.row", "its row part", "%", 100.0),
-            ("prnu_column", "PRNU.col", "its column part", "%", 100.0),
-            ("prnu_pixel", "PRNU.pixel", "its pixel part", "%", 100.0),
-        ),
+    "Nonuniformity": (
+        ("dsnu_total_e", "DSNU", "dark signal, all", "e⁻", 1.0),
+        ("dsnu_total_dn", "DSNU", "dark signal, all", "DN", 1.0),
+        ("dsnu_row_e", "DSNU.row", "its row part", "e⁻", 1.0),
+        ("dsnu_column_e", "DSNU.col", "its column part", "e⁻", 1.0),
+        ("dsnu_pixel_e", "DSNU.pixel", "its pixel part", "e⁻", 1.0),
+        ("prnu_total", "PRNU", "response to light, all", "%", 100.0),
+        ("prnu_row", "PRNU.row", "its row part", "%", 100.0),
+        ("prnu_column", "PRNU.col", "its column part", "%", 100.0),
+        ("prnu_pixel", "PRNU.pixel", "its pixel part", "%", 100.0),
     ),
-    (
-        "Linearity",
-        (
-            (
-                "linearity_error",
-                "LE",
-                "mean absolute deviation of the fitted response, 5 to 95 % of saturation",
-                "%",
-                100.0,
-            ),
-        ),
+    "Linearity": (("linearity_error", "LE", _LINEARITY, "%", 100.0),),
+    "Dark current": (
+        ("dark_current_e_per_s", "μ_I", "dark current", "e⁻/s", 1.0),
+        ("dark_current_doubling_k", "T_d", "temperature difference that doubles it", "K", 1.0),
     ),
-    (
-        "Dark current",
-        (
-            ("dark_current_e_per_s", "μ_I", "dark current", "e⁻/s", 1.0),
-            ("dark_current_doubling_k", "T_d", "temperature difference that doubles it", "K", 1.0),
-        ),
-    ),
-)
+}
 
 # Ratios that are given in decibels and bits too.
 _RATIOS = ("snr_max", "dynamic_range")
@@ -111,20 +85,21 @@ class Part:
 def emva_page(name: str, record: NoiseRecord, measured: Sequence[EmvaMeasurement]) -> str:
     """Return the page about a sensor, with one part for each phase of its mosaic."""
     parts = [Part(plane.name, plane, table_of(plane), drawings(plane)) for plane in measured]
-    return template("emva1288.html").render(name=name, record=record, parts=parts, standard=STANDARD, sub=symbols.html)
+    return template("emva1288.html").render(name=name, record=record, parts=parts, standard=STANDARD, sub=html_symbols)
 
 
 def table_of(measured: EmvaMeasurement) -> list[tuple[str, list[Line]]]:
     """Return the table in groups; a reason that holds for several quantities is given once."""
     known = {**measured.calibration.estimates, **measured.estimates}
     known |= _in_other_units(known)
-    told: dict[str, str] = {}
+    explained: dict[str, str] = {}
     groups = []
-    for title, rows in _TABLE:
-        lines = [_line(known[key], symbol, words, unit, factor, told) for key, symbol, words, unit, factor in rows]
+    for title, rows in _TABLE.items():
+        lines = [_line(known[key], row, factor, explained) for key, *row, factor in rows]
         for key, symbol, words, _, _ in rows:
             if key in _RATIOS and known[key].value is not None:
-                lines += [_ratio_line(known[key], symbol, words, *way) for way in _WAYS]
+                for unit, scale in (("dB", lambda ratio: 20 * np.log10(ratio)), ("bit", np.log2)):
+                    lines.append(_line(_mapped(known[key], scale), (symbol, words, unit), 1.0, explained))
         groups.append((title, lines))
     return groups
 
@@ -134,47 +109,26 @@ def _in_other_units(known: Mapping[str, Estimate]) -> dict[str, Estimate]:
     gain = known["gain_dn_per_e"].value or 0.0
     return {
         "gain_e_per_dn": _mapped(known["gain_dn_per_e"], lambda value: 1 / value),
-        "dark_noise_dn": _mapped(known["read_noise_dn"], lambda noise_dn: float(np.sqrt(noise_dn**2 + ROUNDING_DN2))),
+        "dark_noise_dn": _mapped(known["read_noise_dn"], lambda noise_dn: np.sqrt(noise_dn**2 + ROUNDING_DN2)),
         # DSNU in electrons is that in DN over K, whose own error is not in its interval
         "dsnu_total_dn": _mapped(known["dsnu_total_e"], lambda electrons: electrons * gain),
     }
 
 
-def _mapped(known: Estimate, of: Callable[[float], float]) -> Estimate:
+def _mapped(known: Estimate, function: Callable[[float], float]) -> Estimate:
     """Return a monotonic function of an estimate."""
     if known.value is None or known.ci95 is None:
         return known
-    low, high = sorted(of(end) for end in known.ci95)
-    return Estimate(of(known.value), None, (low, high))
+    low, high = sorted(float(function(end)) for end in known.ci95)
+    return Estimate(float(function(known.value)), None, (low, high))
 
 
-def _decibels(ratio: float) -> float:
-    """Return a ratio in decibels."""
-    return float(20 * np.log10(ratio))
-
-
-def _bits(ratio: float) -> float:
-    """Return a ratio in bits."""
-    return float(np.log2(ratio))
-
-
-_WAYS: tuple[tuple[str, Callable[[float], float]], ...] = (("dB", _decibels), ("bit", _bits))
-
-
-def _ratio_line(known: Estimate, symbol: str, words: str, unit: str, of: Callable[[float], float]) -> Line:
-    """Return a line of a ratio on a logarithmic scale."""
-    assert known.value is not None
-    assert known.ci95 is not None
-    low, high = (of(end) for end in known.ci95)
-    value, interval = rounded(of(known.value), (low, high))
-    return Line(symbol, words, value, interval, unit)
-
-
-def _line(known: Estimate, symbol: str, words: str, unit: str, factor: float, told: dict[str, str]) -> Line:
-    """Return a line of the table."""
+def _line(known: Estimate, row: Sequence[str], factor: float, explained: dict[str, str]) -> Line:
+    """Return a line of the table; `explained` holds the symbol that each reason was given for."""
+    symbol, words, unit = row
     if known.value is None:
         why = known.why or "no reason stated"
-        first = told.setdefault(why, symbol)
+        first = explained.setdefault(why, symbol)
         return Line(symbol, words, why=why if first == symbol else f"as for {first}")
     ends = None if known.ci95 is None else (known.ci95[0] * factor, known.ci95[1] * factor)
     value, interval = rounded(known.value * factor, ends)
@@ -188,7 +142,7 @@ def rounded(value: float, ends: tuple[float, float] | None) -> tuple[str, str]:
     half = (ends[1] - ends[0]) / 2
     scale = half if half > 0 else 1e-4 * abs(value) or 1.0
     digits = int(np.clip(1 - np.floor(np.log10(scale)), -8, 8))
-    low, at, high = (
+    low, middle, high = (
         f"{round(number, digits):.{max(digits, 0)}f}".replace("-", "−") for number in (ends[0], value, ends[1])
     )
-    return at, f"{low} … {high}"
+    return middle, f"{low} … {high}"

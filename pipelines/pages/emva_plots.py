@@ -1,32 +1,78 @@
-"""The drawings of the report by EMVA 1288: transfer of light, SNR, dark current, and how pixels differ."""
+"""The drawings of the report by EMVA 1288: transfer of light, SNR, dark current, and differences of pixels."""
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.calib.noise import Series
+from faintfield.calib.noise.emva.nonuniformity import accumulated_histogram, high_pass, spectrogram
 from faintfield.calib.noise.emva.quantities import snr
 from faintfield.calib.noise.likelihood.response import known_light
 from faintfield.calib.noise.likelihood.rounding import ROUNDING_DN2
-from faintfield.pipelines.calibration.noise_emva import EmvaMeasurement
-from faintfield.pipelines.pages.emva_drawing import MEASURED, MODEL, SECOND, Drawing, drawn
-from faintfield.pipelines.pages.emva_images import image_drawings
-from faintfield.pipelines.pages.page import INK
-from faintfield.pipelines.pages.symbols import mathtext
+from faintfield.pipelines.calibration.noise_emva import EmvaMeasurement, MeanImage
+from faintfield.pipelines.pages.page import INK, blank_drawing, ink, math_symbols, svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+# Measured, model, and a second series; distinct without colour vision, and on black as on white.
+MEASURED, MODEL, SECOND = "#0072b2", "#d55e00", "#009e73"
+
+# Logarithmic axes over less than this factor have even ticks, not powers of ten.
+_FINE_RANGE = 10.0
+
 _NO_FLATS = "there are no flats"
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """One drawing as SVG, or, in `missing`, the reason why there is none."""
+
+    title: str
+    caption: str
+    picture: str = ""
+    missing: str | None = None
+
+
+def drawings(measured: EmvaMeasurement) -> list[Drawing]:
+    """Return the drawings of one phase, in the order of the standard's report."""
+    flats = levels_of(measured, "flat")
+    by_light = [draw(measured, flats) for draw in (_photon_transfer, _sensitivity, _linearity, _snr)]
+    return [*by_light, _dark_signal(measured), *_image_drawings(measured)]
+
+
+def _draw(title: str, caption: str, draw: "Callable[[Axes], None]") -> Drawing:
+    """Return a drawing of one pair of axes."""
+    figure, axes = blank_drawing(5.6, 3.4)
+    draw(axes)
+    _reduce_ticks(axes)
+    ink(axes)
+    axes.set(xlabel=math_symbols(axes.get_xlabel()), ylabel=math_symbols(axes.get_ylabel()))
+    if axes.get_legend_handles_labels()[0]:
+        legend = axes.legend(frameon=False, labelcolor=INK, fontsize=9)
+        for text in legend.get_texts():
+            text.set_text(math_symbols(text.get_text()))
+    return Drawing(title, caption, svg(figure))
+
+
+def _reduce_ticks(axes: "Axes") -> None:
+    """Give logarithmic axes few ticks, with plain numbers: ticks are what takes time in a drawing."""
+    from matplotlib.ticker import LogLocator, MaxNLocator
+
+    axes.minorticks_off()
+    for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
+        if axis.get_scale() == "log":
+            axis.set_major_locator(MaxNLocator(6) if high < _FINE_RANGE * low else LogLocator())
+            axis.set_major_formatter("{x:g}")
 
 
 @dataclass(frozen=True)
 class Levels:
     """Mean and variance of the flats or darks of a measurement, arrays (series,), dark ones first by brightness.
 
-    `signal_dn` is above the dark of zero exposure; `kept` tells which series are within the range of the sensor.
+    `signal_dn` is above the dark of zero exposure; `kept` marks the series within the range of the sensor.
     """
 
     signal_dn: NDArray[np.float64]
@@ -48,7 +94,12 @@ def levels_of(measured: EmvaMeasurement, kind: str) -> Levels:
     pixels = int(used.sum())
     share = max(pixels - sum(used.shape) + 1, 1) / max(pixels, 1)
     freedom = np.array([max((item.frames - 1) * pixels * share, 1) for item in series])
-    variance = np.array([_variance(item, used, share) for item in series])
+    variance = np.array(
+        [
+            float(item.within_dn2.mean(where=used)) / ((item.frames - 1) * share) if item.frames > 1 else np.nan
+            for item in series
+        ]
+    )
     return Levels(
         signal_dn=np.array([item.levels_dn.mean() - offset for item in series]),
         variance_dn2=variance,
@@ -59,56 +110,33 @@ def levels_of(measured: EmvaMeasurement, kind: str) -> Levels:
     )
 
 
-def _variance(one: Series, used: NDArray[np.bool_], share: float) -> float:
-    """Return the temporal variance of a pixel."""
-    return float(one.within_dn2.mean(where=used)) / ((one.frames - 1) * share) if one.frames > 1 else float("nan")
-
-
-def drawings(measured: EmvaMeasurement) -> list[Drawing]:
-    """Return the drawings of one phase, in the order of the standard's report."""
-    return [
-        _photon_transfer(measured),
-        _sensitivity(measured),
-        _linearity(measured),
-        _snr(measured),
-        _dark_signal(measured),
-        *image_drawings(measured),
-    ]
-
-
-def _photon_transfer(measured: EmvaMeasurement) -> Drawing:
+def _photon_transfer(measured: EmvaMeasurement, flats: Levels) -> Drawing:
     """Draw the variance less that of the dark against the signal, with the line of the gain."""
-    title, flats = "Photon transfer", levels_of(measured, "flat")
+    title = "Photon transfer"
     if not flats.signal_dn.size:
         return Drawing(title, "", missing=_NO_FLATS)
     estimates = measured.calibration.estimates
     gain, read_dn = estimates["gain_dn_per_e"].value, estimates["read_noise_dn"].value or 0.0
 
     def draw(axes: "Axes") -> None:
-        for these, colour, mark, label in (
-            (flats.kept, MEASURED, "o", "flats, ± 2 s.e."),
-            (~flats.kept, SECOND, "x", "left out"),
-        ):
-            if these.any():
-                excess = flats.variance_dn2[these] - read_dn**2 - ROUNDING_DN2
-                error = 2 * flats.error_dn2[these]
-                axes.errorbar(flats.signal_dn[these], excess, error, fmt=mark, ms=4, color=colour, label=label)
-        if gain is not None:
-            _draw_model_variance(axes, measured, float(np.max(flats.signal_dn, initial=1.0)), gain)
+        series = (flats.kept, MEASURED, "o", "flats, ± 2 s.e."), (~flats.kept, SECOND, "x", "left out")
+        for mask, colour, mark, label in series:
+            if mask.any():
+                excess = flats.variance_dn2[mask] - read_dn**2 - ROUNDING_DN2
+                error = 2 * flats.error_dn2[mask]
+                axes.errorbar(flats.signal_dn[mask], excess, error, fmt=mark, ms=4, color=colour, label=label)
+        if gain is not None:  # the variance that the gain and the bend of the response predict
+            level, offset = measured.calibration.saturation.level_dn, estimates["offset_dn"].value or 0.0
+            brightest = float(np.max(flats.signal_dn, initial=1.0))
+            signal = np.linspace(0, brightest if level is None else min(brightest, level - offset), 200)
+            variance = gain * _charge_dn(measured, signal) * _slope(measured, signal) ** 2
+            axes.plot(signal, variance, color=MODEL, label="model")
         axes.set(xlabel="μ_y − μ_y.dark (DN)", ylabel="σ_y² − σ_y.dark² (DN²)")
         axes.set_xlim(left=0)
         axes.set_ylim(bottom=0)
 
     caption = "Its slope at the origin is the gain K. The dark is that of zero exposure."
-    return drawn(title, caption, draw)
-
-
-def _draw_model_variance(axes: "Axes", measured: EmvaMeasurement, brightest_dn: float, gain: float) -> None:
-    """Draw the variance that the gain and the bend of the response predict."""
-    level = measured.calibration.saturation.level_dn
-    offset = measured.calibration.estimates["offset_dn"].value or 0.0
-    signal = np.linspace(0, brightest_dn if level is None else min(brightest_dn, level - offset), 200)
-    axes.plot(signal, gain * _charge_dn(measured, signal) * _slope(measured, signal) ** 2, color=MODEL, label="model")
+    return _draw(title, caption, draw)
 
 
 def _charge_dn(measured: EmvaMeasurement, signal_dn: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -134,9 +162,8 @@ def _light(measured: EmvaMeasurement, flats: Levels) -> tuple[NDArray[np.float64
     return None
 
 
-def _sensitivity(measured: EmvaMeasurement) -> Drawing:
-    """Draw the signal against photons or exposure."""
-    title, flats = "Sensitivity", levels_of(measured, "flat")
+def _sensitivity(measured: EmvaMeasurement, flats: Levels) -> Drawing:
+    title = "Sensitivity"
     light = _light(measured, flats)
     if light is None:
         why = "neither photons nor several exposures of one light are stated" if flats.signal_dn.size else _NO_FLATS
@@ -155,13 +182,12 @@ def _sensitivity(measured: EmvaMeasurement) -> Drawing:
         axes.set_xlim(left=0)
         axes.set_ylim(bottom=0)
 
-    return drawn(title, "The slope at the origin is the responsivity R.", draw)
+    return _draw(title, "The slope at the origin is the responsivity R.", draw)
 
 
-def _linearity(measured: EmvaMeasurement) -> Drawing:
+def _linearity(measured: EmvaMeasurement, flats: Levels) -> Drawing:
     """Draw the relative deviation of the signal from the straight line of EMVA 1288."""
-    title, flats = "Deviation from linearity", levels_of(measured, "flat")
-    light = _light(measured, flats)
+    title, light = "Deviation from linearity", _light(measured, flats)
     level = measured.calibration.saturation.level_dn
     if light is None or not flats.kept.any():
         return Drawing(title, "", missing="the light of the flats is not known" if flats.signal_dn.size else _NO_FLATS)
@@ -185,12 +211,12 @@ def _linearity(measured: EmvaMeasurement) -> Drawing:
         "of relative deviations, within 5 to 95 % of saturation (of the brightest flat, if none is saturated). LE in "
         "the table is the mean of those of the fitted response, which has no errors of single levels."
     )
-    return drawn(title, caption, draw)
+    return _draw(title, caption, draw)
 
 
-def _snr(measured: EmvaMeasurement) -> Drawing:
+def _snr(measured: EmvaMeasurement, flats: Levels) -> Drawing:
     """Draw the SNR against photons, or electrons where the photons are not known."""
-    title, flats = "Signal-to-noise ratio", levels_of(measured, "flat")
+    title = "Signal-to-noise ratio"
     gain, noise = measured.calibration.estimates["gain_dn_per_e"], measured.estimates["dark_noise_e"]
     if gain.value is None or noise.value is None:
         return Drawing(title, "", missing=gain.why)
@@ -198,39 +224,36 @@ def _snr(measured: EmvaMeasurement) -> Drawing:
     efficiency = measured.calibration.estimates["quantum_efficiency"].value
     name, per_e = ("μ_p (photons/pixel)", 1 / efficiency) if efficiency else ("μ_e (e⁻/pixel)", 1.0)
     capacity = measured.calibration.estimates["saturation_e"].value
-    seen = flats.kept & np.isfinite(flats.variance_dn2) & (flats.signal_dn > 0)
-    signal = flats.signal_dn[seen]
+    measurable = flats.kept & np.isfinite(flats.variance_dn2) & (flats.signal_dn > 0)
+    signal = flats.signal_dn[measurable]
     charge = _charge_dn(measured, signal) / k
     top = capacity or 2 * float(charge.max(initial=1e3))
 
     def draw(axes: "Axes") -> None:
         grid = np.geomspace(0.5, top, 300)
-        dsnu, prnu = (measured.estimates[f"{name}"].value for name in ("dsnu_total_e", "prnu_total"))
+        dsnu, prnu = (measured.estimates[key].value for key in ("dsnu_total_e", "prnu_total"))
         axes.plot(grid * per_e, snr(grid, k, sigma_e), color=MODEL, label="linear model")
         if dsnu is not None and prnu is not None:
             total = snr(grid, k, sigma_e, dsnu, prnu)
             axes.plot(grid * per_e, total, color=MODEL, ls="--", label="total, DSNU and PRNU included")
         axes.plot(grid * per_e, np.sqrt(grid * per_e), color=SECOND, ls=":", label="ideal sensor")
         # Errors of the signal are those of the light behind it: the slope of the response carries them over.
-        ratio = charge * k * _slope(measured, signal) / np.sqrt(flats.variance_dn2[seen])
+        ratio = charge * k * _slope(measured, signal) / np.sqrt(flats.variance_dn2[measurable])
         axes.plot(charge * per_e, ratio, "o", ms=4, color=MEASURED, label="flats")
         axes.axhline(1, color=INK, lw=0.6)
-        for at, label in ((measured.estimates["threshold_e"].value, "min"), (capacity, "sat")):
-            if at is not None:
-                axes.axvline(at * per_e, color=INK, lw=0.6, ls="-.")
+        for limit_e, label in ((measured.estimates["threshold_e"].value, "min"), (capacity, "sat")):
+            if limit_e is not None:
+                axes.axvline(limit_e * per_e, color=INK, lw=0.6, ls="-.")
                 side = {"ha": "right", "xytext": (-3, 3)} if label == "sat" else {"ha": "left", "xytext": (3, 3)}
-                place = (at * per_e, 0.3)
-                axes.annotate(
-                    mathtext(f"{name[:3]}.{label}"), place, textcoords="offset points", color=INK, fontsize=9, **side
-                )
+                text, place = math_symbols(f"{name[:3]}.{label}"), (limit_e * per_e, 0.3)
+                axes.annotate(text, place, textcoords="offset points", color=INK, fontsize=9, **side)
         axes.set(xscale="log", yscale="log", xlabel=name, ylabel="SNR")
         axes.set_ylim(bottom=0.3)
 
-    return drawn(title, "Where SNR = 1 is the absolute sensitivity threshold μ_p.min.", draw)
+    return _draw(title, "Where SNR = 1 is the absolute sensitivity threshold μ_p.min.", draw)
 
 
 def _dark_signal(measured: EmvaMeasurement) -> Drawing:
-    """Draw the dark signal against the exposure."""
     title, darks = "Dark current", levels_of(measured, "dark")
     if np.unique(darks.exposure_s).size < 2:
         return Drawing(title, "", missing="all darks have one exposure")
@@ -243,4 +266,61 @@ def _dark_signal(measured: EmvaMeasurement) -> Drawing:
             axes.plot(ends, slope * ends, color=MODEL, label="K μ_I t")
         axes.set(xlabel="exposure (s)", ylabel="μ_y.dark − μ_y.dark(0) (DN)")
 
-    return drawn(title, "The slope over K is the dark current μ_I.", draw)
+    return _draw(title, "The slope over K is the dark current μ_I.", draw)
+
+
+def _image_drawings(measured: EmvaMeasurement) -> Iterator[Drawing]:
+    """Yield the spectrograms and histograms of one phase of the mosaic."""
+    images = ((measured.dark, "DSNU", "dsnu_total_e", "DN", 1.0), (measured.bright, "PRNU", "prnu_total", "%", 100.0))
+    for kind, draw in (("spectrograms", _spectrograms), ("accumulated histogram", _histogram)):
+        for image, quantity, name, unit, factor in images:
+            title = f"{quantity} {kind}"
+            if image:
+                yield draw(measured, title, image, unit, factor)
+            else:
+                yield Drawing(title, "", missing=measured.estimates[name].why or "there is no image")
+
+
+def _spectrograms(measured: EmvaMeasurement, title: str, image: MeanImage, unit: str, factor: float) -> Drawing:
+    """Draw the horizontal and the vertical spectrogram, as amplitudes."""
+    spectra = [spectrogram(image.values, measured.used, axis) for axis in (1, 0)]
+
+    def draw(axes: "Axes") -> None:
+        for spectrum, colour, label in zip(spectra, (MEASURED, SECOND), ("horizontal", "vertical"), strict=True):
+            axes.semilogy(spectrum.frequency, factor * np.sqrt(spectrum.power), lw=0.9, color=colour, label=label)
+        white = factor * float(np.sqrt(np.mean([spectrum.white for spectrum in spectra])))
+        axes.axhline(white, color=MODEL, lw=1, label="white part")
+        left = factor * np.sqrt(image.noise.variances[0])
+        axes.axhline(left, color=MODEL, lw=1, ls="--", label="temporal noise left in the mean")
+        axes.set(xlabel="spatial frequency (cycles/pixel)", ylabel=f"amplitude ({unit})", xlim=(0, 0.5))
+        low, high = axes.get_ylim()
+        axes.set_ylim(low, high * (high / low) ** 0.5)  # room for the legend
+
+    return _draw(title, _caption(image) + " White noise is level at its standard deviation; a peak is a pattern.", draw)
+
+
+def _histogram(measured: EmvaMeasurement, title: str, image: MeanImage, unit: str, factor: float) -> Drawing:
+    """Draw one accumulated histogram, of all pixels: here outliers are what counts."""
+    from scipy.special import erfc
+
+    every, is_flat = np.ones_like(measured.used), image.series.conditions.kind == "flat"
+    histogram = accumulated_histogram(high_pass(image.values, every) if is_flat else image.values, every)
+
+    def draw(axes: "Axes") -> None:
+        deviation = factor * histogram.deviation
+        percent = 100 * erfc(histogram.deviation / (np.sqrt(2) * max(histogram.sigma, 1e-12)))
+        axes.semilogy(deviation, histogram.percent, color=MEASURED, drawstyle="steps-pre", label="all pixels")
+        axes.semilogy(deviation, percent, color=MODEL, ls="--", label="normal law")
+        axes.set(xlabel=f"absolute deviation from the mean ({unit})", ylabel="pixels beyond (%)")
+        axes.set_ylim(50 / measured.used.size, 200)
+        axes.set_xlim(left=0)
+
+    filtered = " Less its mean over 5 × 5 pixels." if is_flat else ""
+    return _draw(title, _caption(image) + filtered + " Unusable pixels are included: they are its tail.", draw)
+
+
+def _caption(image: MeanImage) -> str:
+    conditions = image.series.conditions
+    if conditions.kind == "dark":
+        return f"Mean of {image.series.frames} darks of {conditions.exposure_s:g} s."
+    return f"Mean of {image.series.frames} flats of {image.signal_dn:.4g} DN, dark and vignetting taken out."

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from faintfield.calib.geometry import GeometrySettings
 from faintfield.pipelines.formats.results.geometry import GeometryRecord, LensRecord, StageFigure, StageRecord
-from faintfield.pipelines.pages.page import INK, figure, ink, svg, template
+from faintfield.pipelines.pages.page import INK, blank_drawing, figure, ink, svg, template
 
 _FIGURES: tuple[tuple[str, str, str, float], ...] = (
     ("pitch_x_mm", "pitch along rows", "mm", 1.0),
@@ -23,9 +23,11 @@ _FIGURES: tuple[tuple[str, str, str, float], ...] = (
     ("node_residual_rms_mm", "nodes off the regular grid, rms", "µm", 1e3),
 )
 
-# In OpenCV's order.
-_DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-
+# In the order of `LensRecord.sigma`, whose distortion is in that of OpenCV.
+_LENS = (
+    *((name, "px") for name in ("focal length fx", "focal length fy", "principal point cx", "principal point cy")),
+    *((f"distortion {name}", "") for name in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
+)
 
 # The largest deviation is drawn at most this long, as a share of the pitch, so that it stays within its cell.
 _MAX_DRAWN_SHARE = 0.35
@@ -67,47 +69,42 @@ def stage_rows(stage: StageRecord) -> list[Row]:
 
 def holdout_rows(geometry: GeometryRecord) -> list[Row]:
     """Return the table of boards left out of the fit: the ratio and what it adds, each beside its limit, or why not."""
-    words = "residual of boards left out, over that of the fit"
+    name = "residual of boards left out, over that of the fit"
     ratio, limits = geometry.holdout_ratio, GeometrySettings()
     if ratio is None:
         why = "there is one only" if len(geometry.boards) < 2 else "some node would see no other board"
-        return [Row(words, "–", why=f"none can be left out: {why}")]
+        return [Row(name, "–", why=f"none can be left out: {why}")]
     added_px = geometry.rms_inlier_px * np.sqrt(max(ratio**2 - 1, 0))
     limit = f"limit {limits.max_holdout_ratio:g}"
     if ratio > limits.max_holdout_ratio:
         limit += ", waived: what it adds to so small a residual is negligible"
     never = f"px; up to {limits.negligible_holdout_px:g} px is never refused"
     return [
-        Row(words, figure(ratio), why=limit),
+        Row(name, figure(ratio), why=limit),
         Row("what leaving them out adds, rms per axis", figure(added_px), why=never),
     ]
 
 
 def _lens_rows(lens: LensRecord) -> list[Row]:
-    """Return the table of the lens."""
-    in_px = ("focal length fx", "focal length fy", "principal point cx", "principal point cy")
-    words = [*((name, "px") for name in in_px), *((f"distortion {name}", "") for name in _DISTORTION)]
     values = [lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, *lens.distortion]
     return [
-        _row(StageFigure(value, sigma), *name, 1.0)
-        for value, sigma, name in zip(values, lens.sigma, words, strict=False)
+        _row(StageFigure(value, sigma), name, unit, 1.0)
+        for value, sigma, (name, unit) in zip(values, lens.sigma, _LENS, strict=False)
     ]
 
 
-def _row(estimate: StageFigure, words: str, unit: str, factor: float) -> Row:
+def _row(estimate: StageFigure, name: str, unit: str, factor: float) -> Row:
     """Return a line of the table, with as many digits as the uncertainty deserves."""
     if estimate.value is None or estimate.sigma is None:
-        return Row(words, "–", why=estimate.why or "")
+        return Row(name, "–", why=estimate.why or "")
     sigma = estimate.sigma * factor
     digits = int(np.clip(1 - np.floor(np.log10(sigma)), 0, 7)) if sigma > 0 else 3
     value = f"{estimate.value * factor:.{digits}f}".replace("-", "−")
-    return Row(words, value, f"± {sigma:.{digits}f}", unit)
+    return Row(name, value, f"± {sigma:.{digits}f}", unit)
 
 
 def node_drawing(geometry: GeometryRecord) -> str | None:
     """Return real against nominal nodes as SVG, deviations magnified; None without a regular grid to compare."""
-    from matplotlib.figure import Figure  # loading it costs most of a second
-
     stage = geometry.stage
     pitch = np.array([stage.pitch_x_mm.value, stage.pitch_y_mm.value], float)
     residuals = np.array(stage.residuals_mm, float)
@@ -119,11 +116,8 @@ def node_drawing(geometry: GeometryRecord) -> str | None:
     real = nominal + factor * residuals[:, :2]
     across_mm = np.ptp(nominal, axis=0) + 2 * pitch
     height = float(np.clip(4.9 * across_mm[1] / across_mm[0], 2.2, 7)) + 0.9
-    figure = Figure(figsize=(5.4, height), layout="constrained")
-    axes = figure.subplots()
-    axes.plot(
-        *nominal.T, "+", color=INK, markersize=10, markeredgewidth=1, alpha=0.6, label="regular grid that fits best"
-    )
+    figure, axes = blank_drawing(5.4, height, "constrained")
+    axes.plot(*nominal.T, "+", color=INK, ms=10, mew=1, alpha=0.6, label="regular grid that fits best")
     limit = 1e3 * (float(np.abs(residuals[:, 2]).max()) or 1e-6)
     look: dict[str, Any] = {"cmap": "coolwarm", "vmin": -limit, "vmax": limit, "edgecolors": INK, "linewidths": 0.6}
     dots = axes.scatter(real[:, 0], real[:, 1], s=60, zorder=3, c=1e3 * residuals[:, 2], **look)
@@ -153,19 +147,15 @@ def sigma_maps(geometry: GeometryRecord) -> list[str]:
     ]
 
 
-def _sigma_map(nodes: Sequence[tuple[int, int]], sigmas: Sequence[float], words: str) -> str:
-    """Return the map of one number of each node."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(4.8, 4.0), layout="constrained")
-    axes = figure.subplots()
+def _sigma_map(nodes: Sequence[tuple[int, int]], sigmas: Sequence[float], label: str) -> str:
+    figure, axes = blank_drawing(4.8, 4.0, "constrained")
     places = np.array(nodes)
     (top, left), (rows, columns) = places.min(axis=0), np.ptp(places, axis=0) + 1
     values = np.full((rows, columns), np.nan)  # where there is no node
     values[tuple((places - (top, left)).T)] = sigmas
     extent = (left - 0.5, left + columns - 0.5, top + rows - 0.5, top - 0.5)
     image = axes.imshow(values, cmap="cividis", vmin=0, extent=extent)
-    _colour_bar(figure, image, axes, words)
+    _colour_bar(figure, image, axes, label)
     if values.size <= _MAX_WRITTEN:
         for (row, column), sigma in zip(nodes, sigmas, strict=True):
             colour = "black" if sigma > 0.6 * max(sigmas) else "white"
@@ -177,10 +167,9 @@ def _sigma_map(nodes: Sequence[tuple[int, int]], sigmas: Sequence[float], words:
     return svg(figure)
 
 
-def _colour_bar(figure: Any, image: Any, axes: Any, words: str) -> None:
-    """Draw a colour bar in the page's ink."""
+def _colour_bar(figure: Any, image: Any, axes: Any, label: str) -> None:
     bar = figure.colorbar(image, ax=axes, shrink=0.8)
-    bar.set_label(words, color=INK)
+    bar.set_label(label, color=INK)
     bar.ax.tick_params(colors=INK)
     bar.outline.set_edgecolor(INK)
 
@@ -188,7 +177,7 @@ def _colour_bar(figure: Any, image: Any, axes: Any, words: str) -> None:
 def _magnification(residuals: NDArray[np.float64], pitch_mm: float) -> float:
     """Return the factor by which deviations are magnified: a round number that keeps the largest within its cell."""
     largest = float(np.linalg.norm(residuals[:, :2], axis=1).max())
-    if largest <= 0:
+    if largest == 0:
         return 1.0
     wanted = _MAX_DRAWN_SHARE * pitch_mm / largest
     power = 10 ** np.floor(np.log10(wanted))

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,6 @@ from faintfield.pipelines.pages.report_planes import method_title
 
 # Planes at fewer depths than this are a layer each; more, in equal steps, are one layer with a slider.
 _MIN_DEPTHS_OF_A_STACK = 3
-
 
 # Names of units of length in napari, for which one without a name is a pixel.
 _UNITS = {"mm": "mm", "px": "pixel", "": "pixel"}
@@ -62,7 +62,7 @@ def show_planes(directory: Path) -> list[str]:
     # The least noisy method sets the scale, as in the report, so that noise may be clipped and planes are not
     white = min(max(white_level(layer.data) for layer in layers) for layers in by_method)
     viewer = napari.Viewer(title=f"faintfield: {directory.resolve().name}")
-    layers = [layer for of_one_method in by_method for layer in of_one_method]
+    layers = list(chain.from_iterable(by_method))
     for index, layer in enumerate(layers):
         limits = (0.0, max(white, 1e-6))
         viewer.add_image(**vars(layer), contrast_limits=limits, colormap="gray", visible=index == 0)
@@ -71,7 +71,6 @@ def show_planes(directory: Path) -> list[str]:
 
 
 def _layers(directory: Path, folder: Path, result: ReconstructionRecord) -> list[Layer]:
-    """Return the layers of the planes in one folder."""
     planes = planes_in_order(result.planes)
     tilted = {record.file: record for record in result.planes if record.rt_ref_plane is not UNSET}.values()
     method = result.planes[0].method
@@ -89,7 +88,6 @@ def _layers(directory: Path, folder: Path, result: ReconstructionRecord) -> list
 
 
 def _plane_layer(folder: Path, plane: PlaneRecord, name: str, units: StatedUnits) -> Layer:
-    """Return one plane as a layer."""
     pixels = _pixels(folder, plane)
     (x, y), pitch = plane.origin_mm, plane.pitch_mm
     unit = _UNITS[units.length]
@@ -113,5 +111,4 @@ def _stack_layer(folder: Path, planes: Sequence[PlaneRecord], name: str, step_mm
 
 
 def _pixels(folder: Path, plane: PlaneRecord) -> NDArray[Any]:
-    """Return the pixels of a plane (row, column[, colour])."""
     return read_frame(folder / Path(plane.file).name).pixels_dn

@@ -34,7 +34,7 @@ _ROWS = (
 
 _PLOTS_PER_ROW = 3
 
-# Pixels along the longer side of a map that is drawn.
+# Largest number of pixels along the longer side of a map.
 _MAX_SHOWN_PX = 2000
 
 
@@ -134,18 +134,16 @@ def _dark_signal(axes: Axes, calibration: NoiseCalibration) -> None:
 
 
 def _table(axes: Axes, calibration: NoiseCalibration) -> None:
-    """Draw a table of the numbers with their intervals."""
     axes.axis("off")
     cells = [[label, *_value_and_interval(calibration.estimates[name]), unit] for name, label, unit in _ROWS]
-    table = axes.table(
-        cells, colWidths=[0.26, 0.18, 0.34, 0.22], loc="upper center", cellLoc="left", edges="horizontal"
-    )
+    widths = [0.26, 0.18, 0.34, 0.22]
+    table = axes.table(cells, colWidths=widths, loc="upper center", cellLoc="left", edges="horizontal")
     table.auto_set_font_size(False)
     table.set_fontsize(8.5)
     table.scale(1, 1.35)
     counts = {kind: int(getattr(calibration, kind).sum()) for kind in ("hot", "noisy", "dead")}
-    words = ", ".join(f"{count} {kind}" for kind, count in counts.items())
-    axes.text(0.5, 0.0, f"{words} pixels", ha="center", fontsize=9, transform=axes.transAxes)
+    summary = ", ".join(f"{count} {kind}" for kind, count in counts.items())
+    axes.text(0.5, 0.0, f"{summary} pixels", ha="center", fontsize=9, transform=axes.transAxes)
 
 
 def _value_and_interval(estimate: Estimate) -> tuple[str, str]:
@@ -177,26 +175,25 @@ def _map(title: str, values: NDArray[np.floating] | None, unusable: NDArray[np.b
 
 
 def _why_empty(values: NDArray[np.floating] | None, unusable: NDArray[np.bool_]) -> str | None:
-    """Return why a map has nothing to show, None if it has something."""
     if values is None:
         return "not identifiable from these frames"
     if unusable.all():
         return "no usable pixel"
-    ends = over_strips(lambda rows: _ends(values[rows][~unusable[rows]]), values.shape)
-    return None if min(low for low, _ in ends) < max(high for _, high in ends) else "the same for all pixels"
 
+    def ends(rows: slice) -> tuple[float, float]:
+        usable = values[rows][~unusable[rows]]
+        return float(usable.min(initial=np.inf)), float(usable.max(initial=-np.inf))
 
-def _ends(values: NDArray[np.floating]) -> tuple[float, float]:
-    """Return the lowest and the highest value."""
-    return float(values.min(initial=np.inf)), float(values.max(initial=-np.inf))
+    lows, highs = zip(*over_strips(ends, values.shape), strict=True)
+    return None if min(lows) < max(highs) else "the same for all pixels"
 
 
 def _histograms(axes: Axes, calibration: NoiseCalibration) -> None:
     """Draw the histograms of the shortest and the longest darks, measured and fitted."""
     for histogram, colour in zip(calibration.histograms, (_SECOND, _INK), strict=False):
-        seen = histogram.count > 0
+        counted = histogram.count > 0
         label = f"{histogram.exposure_s:g} s, {histogram.count.sum():,} values"
-        axes.plot(histogram.value_dn[seen], histogram.count[seen], ".", ms=4, color=colour, label=label)
+        axes.plot(histogram.value_dn[counted], histogram.count[counted], ".", ms=4, color=colour, label=label)
         axes.plot(histogram.value_dn, np.maximum(histogram.expected, 1e-3), color=_MODEL, lw=1)
     axes.plot([], [], color=_MODEL, lw=1, label="fitted")
     axes.set(xlabel="$y$ [DN]", ylabel="count", xlim=_value_range(calibration), yscale="log")
@@ -229,5 +226,4 @@ def _spectrogram(axes: Axes, calibration: NoiseCalibration) -> None:
 
 
 def _column(points: list[TransferPoint], name: str) -> NDArray[np.float64]:
-    """Return one attribute of each point."""
     return np.array([getattr(point, name) for point in points], np.float64)

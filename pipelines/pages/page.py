@@ -2,22 +2,30 @@
 
 import base64
 import io
+import re
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from markupsafe import Markup, escape
 
 from faintfield.pipelines.formats.units import StatedUnits
 
 if TYPE_CHECKING:
     from jinja2 import Environment, Template
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 # Colour of lines and text in drawings; in the SVG it is replaced by the page's own text colour, light or dark.
 INK = "#010203"
 
+# Symbols of EMVA 1288: a letter or an acronym with its subscript, and a square; or a part of DSNU or PRNU.
+_SYMBOL = re.compile(
+    r"\b(?:(?P<base>[A-Zμση]+)_(?P<low>[A-Za-z]+(?:\.[a-z]+)*)(?P<square>²?)|(?P<whole>DSNU|PRNU)\.(?P<part>[a-z]+))"
+)
+
 # Quality above 100, which OpenCV takes for WebP without losses.
-_LOSSLESS = 101
+LOSSLESS = 101
 
 
 def template(name: str) -> "Template":
@@ -52,9 +60,30 @@ def figure(value: float | None, digits: int = 3) -> str:
     return f"{rounded:.{digits - 1}e}".replace("-", "−")
 
 
-def words_of_depths(units: StatedUnits, *depths: float, join: str = ", ") -> str:
+def format_depths(units: StatedUnits, *depths: float, join: str = ", ") -> str:
     """Return depths in words, in their unit, with the minus sign of print."""
     return units.depths_text(depths, join).replace("-", "−")
+
+
+def html_symbols(text: str) -> Markup:
+    """Return a text with symbols such as μ_e.min set as HTML; the rest is escaped."""
+
+    def set_symbol(match: re.Match[str]) -> str:
+        return f"{match['base'] or match['whole']}<sub>{match['low'] or match['part']}</sub>{match['square'] or ''}"
+
+    return Markup(_SYMBOL.sub(set_symbol, str(escape(text))))
+
+
+def math_symbols(text: str) -> str:
+    """Return a text with symbols such as σ_y.dark² set as Matplotlib's mathtext: letters are italic, words upright."""
+
+    def set_symbol(match: re.Match[str]) -> str:
+        word = match["base"] or match["whole"]
+        base = word if len(word) == 1 else rf"\mathrm{{{word}}}"
+        square = "^2" if match["square"] else ""
+        return rf"${base}_{{\mathrm{{{match['low'] or match['part']}}}}}{square}$"
+
+    return _SYMBOL.sub(set_symbol, text)
 
 
 def data_uri(content: bytes, suffix: str) -> str:
@@ -63,7 +92,7 @@ def data_uri(content: bytes, suffix: str) -> str:
     return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
-def smaller_uri(content: bytes, quality: int = _LOSSLESS) -> str:
+def smaller_uri(content: bytes, quality: int = LOSSLESS) -> str:
     """Return a PNG as a data URI: as WebP if that is smaller, as it most often is by a third without losses.
 
     Parameters
@@ -80,6 +109,14 @@ def smaller_uri(content: bytes, quality: int = _LOSSLESS) -> str:
         return data_uri(content, ".png")
     done, packed = cv2.imencode(".webp", pixels, [cv2.IMWRITE_WEBP_QUALITY, quality])
     return data_uri(packed.tobytes(), ".webp") if done and packed.size < len(content) else data_uri(content, ".png")
+
+
+def blank_drawing(width_in: float, height_in: float, layout: Any = None) -> "tuple[Figure, Axes]":
+    """Return a figure of a size in inches with one pair of axes."""
+    from matplotlib.figure import Figure  # loading it costs most of a second
+
+    figure = Figure(figsize=(width_in, height_in), layout=layout)
+    return figure, figure.subplots()
 
 
 def svg(figure: "Figure") -> str:
@@ -100,12 +137,11 @@ def svg(figure: "Figure") -> str:
     return drawn[drawn.index("<svg") :].replace(INK, "currentColor")
 
 
-def ink(*axes: Any) -> None:
+def ink(axes: "Axes") -> None:
     """Give axes the colour `INK`, and remove the frame above and to the right."""
-    for axis in axes:
-        axis.tick_params(which="both", colors=INK)
-        axis.spines[:].set_color(INK)
-        axis.spines[["top", "right"]].set_visible(False)
-        axis.yaxis.get_offset_text().set_color(INK)
-        for label in (axis.xaxis.label, axis.yaxis.label, axis.title):
-            label.set_color(INK)
+    axes.tick_params(which="both", colors=INK)
+    axes.spines[:].set_color(INK)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.yaxis.get_offset_text().set_color(INK)
+    for label in (axes.xaxis.label, axes.yaxis.label, axes.title):
+        label.set_color(INK)

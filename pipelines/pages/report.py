@@ -1,8 +1,8 @@
 """The report: one self-contained HTML page of everything that was reconstructed in a folder."""
 
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -24,44 +24,38 @@ from faintfield.pipelines.formats.results.stacks import at_depths
 from faintfield.pipelines.formats.results.surface import SURFACE_FILE, SurfaceFileRecord, surfaces_below
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS
 from faintfield.pipelines.formats.units import StatedUnits, named_by, units_of
-from faintfield.pipelines.pages.page import figure, template, words_of_depths
+from faintfield.pipelines.pages.page import figure, format_depths, template
 from faintfield.pipelines.pages.report_calibration import (
     GeometrySection,
     NoiseSection,
-    find_beside,
+    find_calibration,
     geometry_section,
     noise_section,
 )
-from faintfield.pipelines.pages.report_depth import depth_sections
 from faintfield.pipelines.pages.report_pictures import plane_sections
 from faintfield.pipelines.pages.report_planes import error_sections, method_title, read_planes
 from faintfield.pipelines.pages.report_sets import SetSection, set_sections
-from faintfield.pipelines.pages.report_surface import surface_sections
+from faintfield.pipelines.pages.report_surface import depth_sections, surface_sections
 from faintfield.pipelines.pages.report_viewer import viewer_of
 
 
-@dataclass(frozen=True)
-class Fact:
-    """A number with its name and what it means."""
+class Fact(NamedTuple):
+    """A number with its name and meaning."""
 
     name: str
     value: str
     means: str
 
 
-@dataclass(frozen=True)
-class Origin:
-    """A reconstruction or a surface, with its folder, method, options and time of writing as the page shows them.
-
-    `search` says how the depths were found, if they were.
-    """
+class Origin(NamedTuple):
+    """A reconstruction or a surface: folder, method, time of writing, options, record, and search of its depths."""
 
     where: str
     method: str
     written: str
     options: dict[str, object]
     record: ReconstructionRecord | SurfaceFileRecord
-    search: str | None = None
+    search: str | None
 
 
 def write_report(directory: Path, *, noise: Path | None = None, geometry: Path | None = None) -> Path:
@@ -81,10 +75,11 @@ def write_report(directory: Path, *, noise: Path | None = None, geometry: Path |
     """
     surfaces = surfaces_below(directory)
     results = results_below(directory, required=not surfaces)
-    units = units_of(next(iter([*results.values(), *surfaces.values()])))
-    inputs = {digest for result in results.values() for digest in result.inputs.values()}
-    inputs |= {digest for made in surfaces.values() for digest in made.inputs.values()}
-    noise, geometry = noise or find_beside(directory, NOISE_FILE), geometry or find_beside(directory, GEOMETRY_FILE)
+    records: list[ReconstructionRecord | SurfaceFileRecord] = [*results.values(), *surfaces.values()]
+    units = units_of(records[0])
+    inputs = {digest for record in records for digest in record.inputs.values()}
+    noise = noise or find_calibration(directory, NOISE_FILE)
+    geometry = geometry or find_calibration(directory, GEOMETRY_FILE)
     of_noise = noise_section(directory, noise, inputs) if noise else None
     of_geometry = geometry_section(directory, geometry, inputs) if geometry else None
     sets = set_sections(files_below(directory, OVERVIEW_FILE))
@@ -96,7 +91,7 @@ def write_report(directory: Path, *, noise: Path | None = None, geometry: Path |
     facts += _noise(of_noise, the_set)
     if shown.best and (best := errors.of(shown.best)):
         values = ", ".join(figure(row.mse_bright) for row in best)
-        depths = words_of_depths(units, *(row.depth_mm for row in best))
+        depths = format_depths(units, *(row.depth_mm for row in best))
         facts.append(Fact("Mean square error", values, f"at {depths}; objects 0…1, truth: plenty of light"))
     page = template("report.html").render(
         title=_title(directory, results, surfaces),
@@ -111,8 +106,13 @@ def write_report(directory: Path, *, noise: Path | None = None, geometry: Path |
         geometry=of_geometry,
         **vars(errors),
         links=_links(directory),
-        results=[_origin(directory, folder, result) for folder, result in results.items()],
-        surface_origins=[_surface_origin(directory, folder, made) for folder, made in surfaces.items()],
+        results=[
+            _origin(directory, folder / RECONSTRUCTION_FILE, method_title(result.planes), result)
+            for folder, result in results.items()
+        ],
+        surface_origins=[
+            _origin(directory, folder / SURFACE_FILE, "Surface", made) for folder, made in surfaces.items()
+        ],
     )
     path = directory / REPORT_FILE
     write_whole(path, page)
@@ -121,58 +121,48 @@ def write_report(directory: Path, *, noise: Path | None = None, geometry: Path |
 
 def _links(directory: Path) -> list[tuple[str, str]]:
     """Return the other pages in this folder or in folders around it: their names and addresses."""
-    found = [("the paper's figures", "figures.html"), ("the folder above", f"../{REPORT_FILE}")]
-    found += [
+    links = [("the paper's figures", "figures.html"), ("the folder above", f"../{REPORT_FILE}")]
+    links += [
         (path.parent.relative_to(directory).as_posix(), path.relative_to(directory).as_posix())
         for path in files_below(directory, REPORT_FILE)
         if path.parent != directory
     ]
-    return [(words, address) for words, address in found if (directory / address).is_file()]
+    return [(name, address) for name, address in links if (directory / address).is_file()]
 
 
-def _origin(directory: Path, folder: Path, result: ReconstructionRecord) -> Origin:
-    """Return how and when the planes of one folder were made."""
-    where, method = folder.relative_to(directory).as_posix(), method_title(result.planes)
-    written = _written(folder / RECONSTRUCTION_FILE)
-    search = _search(result.best_focus, units_of(result)) if result.best_focus else None
-    return Origin(where, method, written, _options(result), result, search)
+def _origin(directory: Path, path: Path, method: str, record: ReconstructionRecord | SurfaceFileRecord) -> Origin:
+    """Return the origin of a result in a file; its options have the names of the file."""
+    units = units_of(record)
+    best_focus = record.best_focus if isinstance(record, ReconstructionRecord) else None
+    return Origin(
+        where=path.parent.relative_to(directory).as_posix(),
+        method=method,
+        written=f"{datetime.fromtimestamp(int(path.stat().st_mtime), UTC):%Y-%m-%d %H:%M:%S} UTC",
+        options=dict(named_by(msgspec.to_builtins(record.options), units)),
+        record=record,
+        search=_describe_search(best_focus, units) if best_focus else None,
+    )
 
 
-def _search(found: BestFocusRecord, units: StatedUnits) -> str:
+def _describe_search(search: BestFocusRecord, units: StatedUnits) -> str:
     """Return in words how depths were found, and how often shuffled views agreed as well."""
-    where = f"Depths found by comparing the views between {words_of_depths(units, *found.searched_mm[0], join=' and ')}"
-    if found.p_value is UNSET or found.shuffles is UNSET or found.z_shuffled is UNSET:
+    where = f"Depths found by comparing the views between {format_depths(units, *search.searched_mm[0], join=' and ')}"
+    if search.p_value is UNSET or search.shuffles is UNSET or search.z_shuffled is UNSET:
         return f"{where}."
-    as_well = round(found.p_value * (found.shuffles + 1)) - 1
-    times = f"views shuffled {found.shuffles} times: {as_well or 'none'} agreed as well (p = {found.p_value:.2g})"
+    as_well = round(search.p_value * (search.shuffles + 1)) - 1
+    times = f"views shuffled {search.shuffles} times: {as_well or 'none'} agreed as well (p = {search.p_value:.2g})"
     return (
-        f"{where}; {times}. The stated places are {figure(found.z_shuffled)} standard deviations of the shuffled "
+        f"{where}; {times}. The stated places are {figure(search.z_shuffled)} standard deviations of the shuffled "
         "better than their mean. This is about the set, not about each plane."
     )
 
 
-def _surface_origin(directory: Path, folder: Path, made: SurfaceFileRecord) -> Origin:
-    """Return how and when the surface of one folder was made."""
-    where, written = folder.relative_to(directory).as_posix(), _written(folder / SURFACE_FILE)
-    return Origin(where, "Surface", written, _options(made), made)
-
-
-def _options(made: ReconstructionRecord | SurfaceFileRecord) -> dict[str, object]:
-    """Return the options of a result, as its file names them."""
-    return dict(named_by(msgspec.to_builtins(made.options), units_of(made)))
-
-
-def _written(path: Path) -> str:
-    """Return when a file was written."""
-    return f"{datetime.fromtimestamp(int(path.stat().st_mtime), UTC):%Y-%m-%d %H:%M:%S} UTC"
-
-
 def _title(directory: Path, results: dict[Path, ReconstructionRecord], surfaces: dict[Path, SurfaceFileRecord]) -> str:
-    """Return the title of the page: what is reconstructed, and at which depths."""
+    """Return the title of the page: the objects of the reconstruction, and their depths."""
     records = [plane for result in results.values() for plane in result.planes]
     depths = sorted({record.depth_mm for record in at_depths(records)})
     units = units_of(next(iter(results.values()), None))
-    planes = words_of_depths(units, *depths, join=" and ")
+    planes = format_depths(units, *depths, join=" and ")
     if len(depths) > 2:
         ends = units.numbers_text([depths[0], depths[-1]], " to ").replace("-", "−")
         planes = f"{len(depths)} {'relative ' if units.depth == 'relative' else ''}{units.quantities}, {ends}"
@@ -183,36 +173,34 @@ def _title(directory: Path, results: dict[Path, ReconstructionRecord], surfaces:
 
 
 def _name(folder: Path) -> str:
-    """Return the name of what is reconstructed in a folder; for one set of a session, the names of both."""
+    """Return the name of the set reconstructed in a folder; for one set of a session, the names of both."""
     if folder.name == RECONSTRUCTIONS:
         return folder.parent.name
     return f"{folder.parent.parent.name}, {folder.name}" if folder.parent.name == RECONSTRUCTIONS else folder.name
 
 
 def _light(the_set: SetSection) -> list[Fact]:
-    """Return the SNR and the light of a view."""
     light = the_set.overview.brightness
     if light.snr is None or the_set.noise_free:
         return []
-    found = [Fact("SNR of a view", figure(light.snr), f"eq. (4): {light.region} against {light.noise_from}")]
+    facts = [Fact("SNR of a view", figure(light.snr), f"eq. (4): {light.region} against {light.noise_from}")]
     units = units_of(the_set.overview)
     if units.light != "electrons":
         value = f"{figure(light.mean_signal_e)} {units.light_per_pixel}"
-        found.append(
-            Fact("Mean light of a view", value, f"{light.region}, above the dark level; the gain is not known")
-        )
+        meaning = f"{light.region}, above the dark level; the gain is not known"
+        facts.append(Fact("Mean light of a view", value, meaning))
     elif light.photons_from_moments is not None:
         value = f"{figure(light.photons_from_moments)} photons/px"
-        found.append(Fact("Light", value, f"from moments; {figure(light.photons_linear)} by the paper’s eq. (7)"))
+        facts.append(Fact("Light", value, f"from moments; {figure(light.photons_linear)} by the paper’s eq. (7)"))
     elif light.electrons_from_moments is not None:
         value = f"{figure(light.electrons_from_moments)} e⁻/px"
         reason = "the quantum efficiency is not known, so that this is no number of photons"
-        found.append(Fact("Light", value, f"from moments; {figure(light.electrons_linear)} by eq. (7); {reason}"))
-    return found
+        facts.append(Fact("Light", value, f"from moments; {figure(light.electrons_linear)} by eq. (7); {reason}"))
+    return facts
 
 
 def _poses(geometry: GeometrySection | None, against_truth: GeometryErrors | None, units: StatedUnits) -> Fact:
-    """Return how well the camera's positions are known."""
+    """Return the uncertainty of the camera's positions."""
     if geometry is None:
         scale = "" if units.depth == "mm" else "; their scale is not known"
         return Fact("Poses", "as stated", f"by the set; not measured{scale}")
@@ -243,5 +231,4 @@ def _noise(noise: NoiseSection | None, the_set: SetSection | None) -> list[Fact]
 
 
 def _length(length_mm: float) -> str:
-    """Return a length in the unit that suits it."""
     return f"{figure(length_mm)} mm" if length_mm >= 0.1 else f"{figure(1e3 * length_mm)} µm"

@@ -1,9 +1,9 @@
 """The camera in a report: its noise and its geometry."""
 
 from collections.abc import Set
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -32,8 +32,7 @@ _NOISE_ROWS = (
 )
 
 
-@dataclass(frozen=True)
-class NoiseRow:
+class NoiseRow(NamedTuple):
     """A quantity of the sensor as the page shows it: its words, its unit, and the decimals that its error deserves."""
 
     words: str
@@ -43,19 +42,17 @@ class NoiseRow:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Section:
-    """A calibration on the page.
+class Section[Record, Line]:
+    """A calibration on the page: its record, as lines of a table and as drawings.
 
     Attributes
     ----------
-    where, sha256 : str
-        Address and hash of its file.
-    used : bool
-        The planes were made with it.
+    where, used : str, bool
+        Address of its file, and True if the planes were made with it.
     pages : list of (str, str or None)
         Addresses of its own pages, each with the page as a data URI if it is a picture.
-    made : Provenance, optional
-        How it was made, if its file says so.
+    unusable, drawing, maps
+        Number of unusable pixels by kind, of a noise calibration; drawings of the nodes, of a geometry.
     """
 
     where: str
@@ -63,35 +60,25 @@ class Section:
     used: bool
     pages: list[tuple[str, str | None]]
     made: Provenance[dict[str, object]] | None
+    record: Record
+    rows: list[Line]
+    unusable: dict[str, int] = field(default_factory=dict)
+    drawing: str | None = None
+    maps: list[str] = field(default_factory=list)
 
 
-@dataclass(frozen=True, kw_only=True)
-class NoiseSection(Section):
-    """Section of the page about the sensor's noise."""
-
-    record: NoiseRecord
-    rows: list[NoiseRow]
-    unusable: dict[str, int]
+type NoiseSection = Section[NoiseRecord, NoiseRow]
+type GeometrySection = Section[GeometryRecord, Row]
 
 
-@dataclass(frozen=True, kw_only=True)
-class GeometrySection(Section):
-    """Section of the page about the poses of the camera."""
-
-    record: GeometryRecord
-    rows: "list[Row]"
-    drawing: str | None
-    maps: list[str]
-
-
-def find_beside(directory: Path, name: str) -> Path | None:
+def find_calibration(directory: Path, name: str) -> Path | None:
     """Return a calibration's file: in the folder, else in one of the two above it, else in a folder within it."""
     folders = [directory, *list(directory.resolve().parents)[:2], *sorted(p for p in directory.glob("*") if p.is_dir())]
     return next((folder / name for folder in folders if (folder / name).is_file()), None)
 
 
 def noise_section(directory: Path, path: Path, inputs: Set[str]) -> NoiseSection:
-    """Return what the page says of the sensor's noise.
+    """Return the section about the sensor's noise.
 
     Parameters
     ----------
@@ -104,13 +91,14 @@ def noise_section(directory: Path, path: Path, inputs: Set[str]) -> NoiseSection
     """
     record = read_noise(path)
     pages = [file_within(path.parent, page.name) for page in sorted(path.parent.glob("noise_page*.png"))]
-    return NoiseSection(
+    return Section(
         **_origin(directory, path, inputs),
         pages=[(_link(directory, page), smaller_uri(read_content(page, MAX_PREVIEW_BYTES))) for page in pages],
         made=record.provenance,
         record=record,
         rows=[
-            NoiseRow(words, unit, _decimals(measured.se), measured)
+            # As many decimals as the standard error deserves
+            NoiseRow(words, unit, int(np.clip(np.ceil(1 - np.log10(se)), 0, 6)) if (se := measured.se) else 4, measured)
             for name, words, unit in _NOISE_ROWS
             if isinstance(measured := getattr(record, name), Measured)
         ],
@@ -118,20 +106,15 @@ def noise_section(directory: Path, path: Path, inputs: Set[str]) -> NoiseSection
     )
 
 
-def _decimals(error: float | None) -> int:
-    """Return the decimals that a number with a standard error deserves."""
-    return int(np.clip(np.ceil(1 - np.log10(error)), 0, 6)) if error else 4
-
-
 def geometry_section(directory: Path, path: Path, inputs: Set[str]) -> GeometrySection:
-    """Return what the page says of where the camera was; parameters as for `noise_section`."""
+    """Return the section about the poses of the camera; parameters as for `noise_section`."""
     # Loads the calibration of geometries, which most reports do not show
     from faintfield.pipelines.pages.geometry_page import node_drawing, sigma_maps, stage_rows
 
     record = read_geometry(path, GeometryRecord)
     page = path.with_name(GEOMETRY_PAGE)
     options = msgspec.structs.asdict(record.options)
-    return GeometrySection(
+    return Section(
         **_origin(directory, path, inputs),
         pages=[(_link(directory, page), None)] if page.is_file() else [],
         made=Provenance(command=record.command, options=options, inputs=record.inputs, versions=record.versions),
@@ -143,7 +126,7 @@ def geometry_section(directory: Path, path: Path, inputs: Set[str]) -> GeometryS
 
 
 def _origin(directory: Path, path: Path, inputs: Set[str]) -> dict[str, Any]:
-    """Return where a calibration lies, and whether the planes were made with it: the beginning of a `Section`."""
+    """Return the beginning of a `Section`."""
     digest = sha256(path)
     return {"where": _link(directory, path), "sha256": digest, "used": digest in inputs}
 

@@ -1,23 +1,18 @@
-"""The pictures of a report: planes on one grey scale (side by side, on sliders), and their sigmas."""
+"""The pictures of a report: planes on one grey scale (side by side, on sliders), their sigmas, and their curves."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, TypedDict
+from itertools import cycle
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.pipelines.formats.image_files import encoded, grey_levels, shrunk, white_level
-from faintfield.pipelines.formats.results.records import (
-    JOINT_METHODS,
-    Certificate,
-    FocusCurve,
-    ReconstructionRecord,
-)
+from faintfield.pipelines.formats.results.records import JOINT_METHODS, Certificate, FocusCurve, ReconstructionRecord
 from faintfield.pipelines.formats.units import StatedUnits
-from faintfield.pipelines.pages.page import data_uri, words_of_depths
-from faintfield.pipelines.pages.report_curves import focus_curve, weight_curves
-from faintfield.pipelines.pages.report_planes import Plane, best_column, column_titles, plane_words
+from faintfield.pipelines.pages.page import INK, blank_drawing, data_uri, format_depths, ink, svg
+from faintfield.pipelines.pages.report_planes import Plane, best_column, column_titles, place_name
 
 # Largest number of depths side by side; more are shown on a slider only.
 _MAX_ROWS = 6
@@ -27,6 +22,12 @@ _GRID_WIDTH_PX, _ROW_WIDTH_PX, _SLIDER_WIDTH_PX = 640, 1920, 800
 
 # Ends of the scale of what the data moved, in standard deviations.
 _MOST_MOVED = 3.0
+
+# Colour and mark of the curves of several planes.
+_LINES = (("#0072b2", "o"), ("#e69f00", "s"), ("#009e73", "^"), ("#cc79a7", "D"))
+
+# Largest number of curves in the legend: one of many planes would leave no room for the curves.
+_MAX_LABELLED = 8
 
 
 @dataclass(frozen=True)
@@ -56,51 +57,23 @@ class Proposed(NamedTuple):
     moved: str
 
 
-class Slide(TypedDict):
-    """One picture of the sliders, which the page's script takes from the viewer, and the samples across the plane."""
-
-    depth: float
-    words: str
-    samples: int
-
-
-class SliderColumn(TypedDict):
-    """The planes of one column, the nearest first."""
-
-    title: str
-    planes: list[Slide]
-
-
 @dataclass(frozen=True, kw_only=True)
 class PlaneSections:
     """Part of the page about the planes, by default without any; the names are those of the template.
 
     Attributes
     ----------
-    best, best_title : Plane, str
-        If there are planes, one of the column that the page leads with, and the title of the column.
-    left_out : str, optional
-        Why occlusion was left out, if it was.
-    blurred : bool
-        The best planes contain the blur of other planes.
-    best_planes : list of (str, str)
-        Their names and pictures.
-    certificates : list of (str, Certificate)
-        Bounds on their distance to the optimum.
-    columns, rows : list
+    best, best_title, best_planes, certificates
+        Of the column that the page leads with: a plane, the title, names and pictures, and bounds on the distance to
+        the optimum.
+    left_out, blurred
+        Reason for leaving occlusion out there, and True if its planes contain the blur of other planes.
+    columns, rows
         Titles, and pictures side by side.
-    slider, slider_column, slider_depth : list, int, int
+    slider, slider_column, slider_depth, slider_picture
         The sliders, and what they show first.
-    slider_picture, slider_width_px : str, int
-        The picture that they show first, and the largest width of theirs.
-    proposals : list of Proposed
-        What a prior proposed, where that was saved.
-    depths : int
-        Number of planes per column.
-    white : float
-        White of the grey scale, in the unit of light.
-    sharp : str
-        Depths at which the focus curve peaks, in words; empty if there are none.
+    depths, white, sharp
+        Number of planes per column, white of the scale in the unit of light, and depths of the focus curve's peaks.
     """
 
     best: Plane | None = None
@@ -112,7 +85,7 @@ class PlaneSections:
     certificates: list[tuple[str, Certificate]] = field(default_factory=list)
     columns: list[str] = field(default_factory=list)
     rows: list[Row] = field(default_factory=list)
-    slider: list[SliderColumn] | None = None
+    slider: list[dict[str, Any]] | None = None
     slider_column: int = 0
     slider_depth: int = 0
     slider_picture: str | None = None
@@ -126,59 +99,54 @@ class PlaneSections:
 
 
 def plane_sections(planes: list[Plane], results: Iterable[ReconstructionRecord]) -> PlaneSections:
-    """Return what the page shows of the planes."""
+    """Return the part of the page about the planes."""
     if not planes:
         return PlaneSections()
-    depths = sorted({plane.depth_mm for plane in planes if not plane.name})
     places = sorted({plane.place for plane in planes})
     focus = next((result.focus for result in results if result.focus), None)
     units = planes[0].units
     titles, best = column_titles(planes), best_column(planes)
     columns = list(titles)
     white = _shared_white(planes, columns)
-    shown = _shown_depths(depths, focus)
-    rows = _side_by_side(planes, columns, shown, white)
+    shown_depths = _shown_depths(sorted({plane.depth_mm for plane in planes if not plane.name}), focus)
+    shown = [plane for plane in planes if plane.name or plane.depth_mm in shown_depths]
     of_best = [plane for plane in planes if plane.column == best]
-    records = [record for plane in of_best for record in plane.records]
-    place = columns.index(best)
+    records = [(plane.label, record) for plane in of_best for record in plane.records]
     several = len(places) > 1 or len(columns) > 1
     slider_depth = _first_depth([depth for depth, _ in places], focus)
     first_slide = _in_order(planes, best)[: slider_depth + 1][-1]
+    best_rows = _side_by_side([plane for plane in shown if plane.column == best], [best], white)
     return PlaneSections(
         best=of_best[0],
         best_title=titles[best],
-        left_out=next((record.occlusion_left_out for record in records if record.occlusion_left_out), None),
+        left_out=next((record.occlusion_left_out for _, record in records if record.occlusion_left_out), None),
         blurred=len(places) > 1 and of_best[0].method not in JOINT_METHODS,
-        best_planes=[
-            (row.words, cell) for row in _side_by_side(of_best, [best], shown, white) for cell in row.cells if cell
-        ],
-        weight_curves=weight_curves(of_best),
+        best_planes=[(row.words, cell) for row in best_rows for cell in row.cells if cell],
+        weight_curves=_weight_curves(of_best),
         certificates=[
-            (plane.words, record.certificate)
-            for plane in of_best
-            for record in plane.records
+            (label, record.certificate)
+            for label, record in records
             if record.certificate and record.certificate.is_bound
         ],
         columns=list(titles.values()),
-        rows=rows,
+        rows=_side_by_side(shown, columns, white),
         slider=_slider(planes, titles) if several else None,
-        slider_column=place,
+        slider_column=columns.index(best),
         slider_depth=slider_depth,
         slider_picture=_picture(first_slide.pixels(), white, _SLIDER_WIDTH_PX, ".jpg") if several else None,
-        sigmas=_sigmas(planes, titles, shown),
-        proposals=_proposals(planes, titles, shown, white),
+        sigmas=_sigmas(shown, titles),
+        proposals=_proposals(shown, titles, white),
         depths=len(places),
         white=white,
-        focus_curve=focus_curve(focus, units) if focus else None,
+        focus_curve=_focus_curve(focus, units) if focus else None,
         sharp=_sharp(focus, units) if focus else "",
     )
 
 
 def _sharp(focus: FocusCurve, units: StatedUnits) -> str:
-    """Return the depths at which a focus curve peaks, in words."""
     if units.depth == "mm":
         return ", ".join(f"{depth:.0f} mm" for depth in focus.sharp_mm)
-    return words_of_depths(units, *focus.sharp_mm) if focus.sharp_mm else ""
+    return format_depths(units, *focus.sharp_mm) if focus.sharp_mm else ""
 
 
 def _shared_white(planes: list[Plane], columns: list[str]) -> float:
@@ -199,63 +167,59 @@ def _shown_depths(depths: list[float], focus: FocusCurve | None) -> list[float]:
     return sorted(marked)[:_MAX_ROWS]
 
 
-def _side_by_side(planes: list[Plane], columns: list[str], depths: list[float], white: float) -> list[Row]:
+def _side_by_side(planes: list[Plane], columns: list[str], white: float) -> list[Row]:
     """Return the pictures side by side: a row per depth, and per plane given by a pose; a cell per column."""
     by_place = {(plane.place, plane.column): plane for plane in planes}
     width_px = min(_GRID_WIDTH_PX, _ROW_WIDTH_PX // len(columns))
     rows = []
-    for place in sorted({plane.place for plane in planes if plane.name or plane.depth_mm in depths}):
-        found = (by_place.get((place, column)) for column in columns)
-        cells = [None if plane is None else _picture(plane.pixels(), white, width_px, ".png") for plane in found]
-        rows.append(Row(plane_words(planes[0].units, *place), cells))
+    for place in sorted({plane.place for plane in planes}):
+        row = (by_place.get((place, column)) for column in columns)
+        cells = [None if plane is None else _picture(plane.pixels(), white, width_px, ".png") for plane in row]
+        rows.append(Row(place_name(planes[0].units, *place), cells))
     return rows
 
 
-def _sigmas(planes: list[Plane], titles: dict[str, str], depths: list[float]) -> Sigmas | None:
+def _sigmas(planes: list[Plane], titles: dict[str, str]) -> Sigmas | None:
     """Return the standard deviations on one scale of their own, None if they were not asked for."""
-    ordered = sorted(planes, key=lambda plane: plane.depth_mm)
-    known = [(plane, plane.sigma_e()) for plane in ordered if plane.name or plane.depth_mm in depths]
-    found = [(plane, sigma) for plane, sigma in known if sigma is not None]
-    if not found:
-        return None
-    white = max(white_level(sigma) for _, sigma in found)
-    pictures = [
-        (
-            f"{titles[plane.column]}, {plane.words}",
-            float(np.median(sigma)),
-            _picture(sigma, white, _GRID_WIDTH_PX, ".png"),
-        )
-        for plane, sigma in found
+    maps = [
+        (f"{titles[plane.column]}, {plane.label}", sigma)
+        for plane in sorted(planes, key=lambda plane: plane.depth_mm)
+        if (sigma := plane.sigma_e()) is not None
     ]
-    return Sigmas(white, pictures)
+    if not maps:
+        return None
+    white = max(white_level(sigma) for _, sigma in maps)
+    pictures = [_picture(sigma, white, _GRID_WIDTH_PX, ".png") for _, sigma in maps]
+    return Sigmas(
+        white, [(name, float(np.median(sigma)), uri) for (name, sigma), uri in zip(maps, pictures, strict=True)]
+    )
 
 
-def _proposals(planes: list[Plane], titles: dict[str, str], depths: list[float], white: float) -> list[Proposed]:
+def _proposals(planes: list[Plane], titles: dict[str, str], white: float) -> list[Proposed]:
     """Return what was proposed on the scale of the planes, and what the data moved, on one of ± 3 σ."""
-    found = []
+    proposals = []
     for plane in sorted(planes, key=lambda plane: plane.depth_mm):
-        if not (plane.name or plane.depth_mm in depths):
-            continue
         proposal, moved = plane.proposal_e(), plane.moved_sigma()
         if proposal is not None and moved is not None:
             levels = shrunk(grey_levels(moved, _MOST_MOVED, -_MOST_MOVED), _GRID_WIDTH_PX)
             picture = _picture(proposal, white, _GRID_WIDTH_PX, ".png")
-            title = f"{titles[plane.column]}, {plane.words}"
-            found.append(Proposed(title, picture, data_uri(encoded(levels, ".png"), ".png")))
-    return found
+            title = f"{titles[plane.column]}, {plane.label}"
+            proposals.append(Proposed(title, picture, data_uri(encoded(levels, ".png"), ".png")))
+    return proposals
 
 
-def _slider(planes: list[Plane], titles: dict[str, str]) -> list[SliderColumn]:
-    """Return what the sliders show: the planes of each column by depth."""
-    columns: list[SliderColumn] = []
-    for column, title in titles.items():
-        columns.append({"title": title, "planes": [_slide(plane) for plane in _in_order(planes, column)]})
-    return columns
-
-
-def _slide(plane: Plane) -> Slide:
-    """Return one picture of the sliders."""
-    return {"depth": plane.depth_mm, "words": plane.words, "samples": plane.pixels().shape[1]}
+def _slider(planes: list[Plane], titles: dict[str, str]) -> list[dict[str, Any]]:
+    """Return the planes of each column, the nearest first, whose pictures the page's script takes from the viewer."""
+    return [
+        {
+            "title": title,
+            "planes": [
+                {"depth": plane.depth_mm, "words": plane.label, "samples": plane.pixels().shape[1]}
+                for plane in _in_order(planes, column)
+            ],
+        }
+        for column, title in titles.items()
+    ]
 
 
 def _in_order(planes: list[Plane], column: str) -> list[Plane]:
@@ -273,3 +237,57 @@ def _first_depth(depths: list[float], focus: FocusCurve | None) -> int:
 
 def _picture(pixels: NDArray[Any], white: float, width_px: int, suffix: str) -> str:
     return data_uri(encoded(shrunk(grey_levels(pixels, white), width_px), suffix), suffix)
+
+
+def _focus_curve(focus: FocusCurve, units: StatedUnits) -> str:
+    """Return the focus curve as SVG that takes its colour from the page."""
+    figure, axes = blank_drawing(6.0, 2.6, "constrained")
+    axes.plot(focus.depth_mm, focus.detail_e2, "o-", color="#2b8cbe", markersize=3, linewidth=1.5)
+    for depth in focus.sharp_mm:
+        axes.axvline(depth, color="#d95f02", linewidth=1, linestyle="--")
+        text = f"{depth:.0f} mm" if units.depth == "mm" else units.numbers_text([depth]).replace("-", "−")
+        peak = (depth, max(focus.detail_e2))
+        axes.annotate(text, peak, (4, -2), textcoords="offset points", color="#d95f02", va="top")
+    squared = {"electrons": "e⁻²", "dn": "DN²", "relative": "white²"}[units.light]
+    axes.set(xlabel=f"{units.quantity} ({units.length or 'relative'})")
+    axes.set(ylabel=f"detail both halves\nof the views agree on ({squared})")
+    axes.ticklabel_format(axis="y", scilimits=(-3, 3))
+    ink(axes)
+    return svg(figure)
+
+
+def _weight_curves(planes: Sequence[Plane]) -> str | None:
+    """Return the prediction of the held-out views by each penalty weight as SVG; None if none were held out."""
+    records = {
+        (_line_name(plane), record.channel): record
+        for plane in planes
+        for record in plane.records
+        if record.penalty_weight_curve
+    }
+    if not records:
+        return None
+    figure, axes = blank_drawing(5.6, 3.0, "constrained")
+    for index, (((name, channel), record), (colour, marker)) in enumerate(zip(records.items(), cycle(_LINES))):
+        curve = sorted(record.penalty_weight_curve or [], key=lambda score: score.weight)
+        held_out = np.array([score.held_out for score in curve])
+        label: str | None = name if channel == "grey" else f"{name}, {channel}"
+        if index >= _MAX_LABELLED:
+            label = f"and {len(records) - _MAX_LABELLED} more" if index == _MAX_LABELLED else None
+        weights = [score.weight for score in curve]
+        axes.plot(weights, held_out - held_out.min(), marker=marker, markersize=4, color=colour, label=label)
+        if record.penalty_weight is not None:
+            axes.axvline(record.penalty_weight, color=colour, linewidth=1, linestyle="--")
+    axes.set_xscale("log")
+    for axis_format in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
+        axis_format("{x:g}")
+    axes.set(xlabel="penalty weight β", ylabel="held-out views: −log likelihood\nabove their minimum")
+    axes.legend(frameon=False, labelcolor=INK)
+    ink(axes)
+    return svg(figure)
+
+
+def _line_name(plane: Plane) -> str:
+    """Return the name of a plane in the legend; planes that were solved together share one curve."""
+    if plane.method in JOINT_METHODS:
+        return "all planes"
+    return plane.name or format_depths(plane.units, plane.depth_mm)

@@ -23,19 +23,18 @@ from faintfield.pipelines.formats.results.records import (
 from faintfield.pipelines.formats.results.result_files import files_below, read_result
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS
 from faintfield.pipelines.formats.units import StatedUnits, units_of
-from faintfield.pipelines.pages.page import words_of_depths
+from faintfield.pipelines.pages.page import format_depths
 
 # Order of the columns.
 _POSES_IN_ORDER: tuple[Poses, ...] = ("measured", "nominal", "true", "stated")
 
-# The poses and the method that a report leads with: the first of these that there are.
+# The poses that a report leads with: the first of these that there are.
 PREFERRED_POSES: tuple[Poses, ...] = ("measured", "stated", "nominal", "true")
-_PREFERRED_METHODS: tuple[Method, ...] = ("occlusion", "joint", "pmlem", "pmlem-osl", "mlem", "backprojection")
 
 # Order of the poses in the comparison of errors.
 _COMPARED_POSES: tuple[Poses, ...] = ("nominal", "measured", "true")
 
-# Names of the methods, in the order of the columns.
+# Names of the methods, in the order of the columns; a report leads with the last that there is.
 METHOD_NAMES: dict[Method, str] = {
     "backprojection": "back-projection",
     "mlem": "MLEM",
@@ -48,22 +47,14 @@ METHOD_NAMES: dict[Method, str] = {
 
 @dataclass(frozen=True)
 class Plane:
-    """One plane of one method on disk.
+    """One plane of one method on disk, with its records, one per colour, and their units.
 
     Attributes
     ----------
     column : str
-        The column of the report: its method, after the folder of its set if that is not the report's own.
-    method, poses : str
-        By which it was reconstructed.
+        The column of the report: the method, after the folder of its set if that is not the report's own.
     depth_mm : float
-        Its depth, on the axis, in the unit of its records.
-    path : Path
-        Its file.
-    records : list of PlaneRecord
-        Its records, one per colour.
-    units : StatedUnits
-        The units of its records.
+        Depth on the axis, in the unit of the records.
     """
 
     column: str
@@ -73,11 +64,6 @@ class Plane:
     path: Path
     records: list[PlaneRecord]
     units: StatedUnits = field(default_factory=StatedUnits)
-
-    @property
-    def title(self) -> str:
-        """Name of the method."""
-        return method_title(self.records)
 
     @property
     def name(self) -> str:
@@ -90,9 +76,9 @@ class Plane:
         return (self.depth_mm, self.name)
 
     @property
-    def words(self) -> str:
+    def label(self) -> str:
         """Name of the plane on the page."""
-        return plane_words(self.units, *self.place)
+        return place_name(self.units, *self.place)
 
     def pixels(self) -> NDArray[Any]:
         """Return the light of the plane (row, column[, colour])."""
@@ -100,18 +86,17 @@ class Plane:
 
     def sigma_e(self) -> NDArray[Any] | None:
         """Return the standard deviation of each sample, None if it was not asked for."""
-        return self._beside(self.records[0].sigma_file)
+        return self._pixels_of(self.records[0].sigma_file)
 
     def proposal_e(self) -> NDArray[Any] | None:
-        """Return what a prior proposed, None if it was not saved."""
-        return self._beside(self.records[0].proposal_file)
+        """Return the proposal of a prior, None if it was not saved."""
+        return self._pixels_of(self.records[0].proposal_file)
 
     def moved_sigma(self) -> NDArray[Any] | None:
-        """Return how far the data moved the plane from the proposal, in standard deviations, None if not saved."""
-        return self._beside(self.records[0].moved_file)
+        """Return the change of the proposal by the data, in standard deviations, None if it was not saved."""
+        return self._pixels_of(self.records[0].moved_file)
 
-    def _beside(self, name: str | UnsetType) -> NDArray[Any] | None:
-        """Return the pixels of a file beside that of the plane, None without one."""
+    def _pixels_of(self, name: str | UnsetType) -> NDArray[Any] | None:
         return read_frame(_existing(self.path.with_name(Path(name).name))).pixels_dn if name else None
 
 
@@ -139,10 +124,8 @@ def read_planes(directory: Path, results: dict[Path, ReconstructionRecord]) -> l
             # The folders of a method and of a session's reconstructions tell nothing more
             parts = [part for part in where.parts if part not in (method, RECONSTRUCTIONS)]
             column = f"{parts[-1]}/{method}" if parts else method
-            path = _existing(folder / Path(name).name)
-            planes.append(
-                Plane(column, method, result.options.poses, records[0].depth_mm, path, records, units_of(result))
-            )
+            path, depth = _existing(folder / Path(name).name), records[0].depth_mm
+            planes.append(Plane(column, method, result.options.poses, depth, path, records, units_of(result)))
     poses, methods = _POSES_IN_ORDER.index, list(METHOD_NAMES).index
     return sorted(
         planes, key=lambda plane: (poses(plane.poses), plane.column.rpartition("/")[0], methods(plane.method))
@@ -165,24 +148,26 @@ def column_titles(planes: list[Plane]) -> dict[str, str]:
     for column, plane in columns.items():
         where = column.rpartition("/")[0]
         if poses_differ and plane.poses != "stated":
-            titles[column] = f"{plane.title}, {plane.poses} poses"
+            titles[column] = f"{method_title(plane.records)}, {plane.poses} poses"
         else:
-            titles[column] = f"{where} set: {plane.title}" if where else plane.title
+            titles[column] = (f"{where} set: " if where else "") + method_title(plane.records)
     return titles
 
 
 def best_column(planes: list[Plane]) -> str:
     """Return the column that a report leads with: the best method with the best poses."""
-    best = min(planes, key=lambda plane: (PREFERRED_POSES.index(plane.poses), _PREFERRED_METHODS.index(plane.method)))
+    methods = list(METHOD_NAMES)
+    best = min(planes, key=lambda plane: (PREFERRED_POSES.index(plane.poses), -methods.index(plane.method)))
     return best.column
 
 
-def plane_words(units: StatedUnits, depth: float, name: str) -> str:
+def place_name(units: StatedUnits, depth: float, name: str) -> str:
     """Return the name of a plane on the page."""
-    if units.depth == "mm":
-        return f"{name}, {depth:.1f} mm on the axis" if name else f"{round(depth, 1):g} mm"
-    words = words_of_depths(units, depth)
-    return f"{name}, {words} on the axis" if name else words
+    if units.depth != "mm":
+        where = format_depths(units, depth)
+    else:
+        where = f"{depth:.1f} mm" if name else f"{round(depth, 1):g} mm"
+    return f"{name}, {where} on the axis" if name else where
 
 
 @dataclass(frozen=True)
@@ -191,14 +176,10 @@ class ErrorSections:
 
     Attributes
     ----------
-    metrics : list of (str, PlaneErrors)
-        The errors of each plane, after the title of its method.
-    geometry_off : GeometryErrors, optional
-        The errors of the measured poses.
-    pose_kinds : list of Poses
-        The poses of the planes, in the order of the comparison.
-    by_poses : list of ((float, str, str), dict)
-        The errors (bright) by poses of planes with several, after their depth, object and method.
+    metrics, geometry_off
+        Errors of each plane, after the title of its method, and of the measured poses.
+    pose_kinds, by_poses
+        Poses in the order of the comparison, and the errors (bright) by poses, after depth, object and method.
     """
 
     metrics: list[tuple[str, PlaneErrors]]
@@ -214,24 +195,26 @@ class ErrorSections:
 def error_sections(directory: Path, planes: Sequence[Plane]) -> ErrorSections:
     """Return the errors against the truth: the folder's own, else those of the folders within it."""
     own = directory / METRICS_FILE
-    found = [read_result(path, Metrics) for path in ([own] if own.is_file() else files_below(directory, METRICS_FILE))]
-    rows = [(_title_of(errors, planes), errors) for metrics in found for errors in metrics.planes]
+    paths = [own] if own.is_file() else files_below(directory, METRICS_FILE)
+    all_metrics = [read_result(path, Metrics) for path in paths]
+    rows = [(_title_of(errors, planes), errors) for metrics in all_metrics for errors in metrics.planes]
     by_place: dict[tuple[float, str, str], dict[Poses, float]] = {}
     for title, errors in rows:
         by_place.setdefault((errors.depth_mm, errors.object, title), {})[errors.poses] = errors.mse_bright
     return ErrorSections(
         rows,
-        next((metrics.geometry for metrics in found if metrics.geometry is not UNSET), None),
+        next((metrics.geometry for metrics in all_metrics if metrics.geometry is not UNSET), None),
         [kind for kind in _COMPARED_POSES if any(errors.poses == kind for _, errors in rows)],
         sorted((place, errors) for place, errors in by_place.items() if len(errors) > 1),
     )
 
 
 def _is_of(errors: PlaneErrors, plane: Plane) -> bool:
-    """Return whether errors are of a plane's method and poses; poses that a set states match those of any kind."""
+    """Compare errors with a plane's method and poses; poses that a set states match those of any kind."""
     return errors.method == plane.method and plane.poses in ("stated", errors.poses)
 
 
 def _title_of(errors: PlaneErrors, planes: Sequence[Plane]) -> str:
     """Return the title of the method of errors, as the planes have it."""
-    return next((plane.title for plane in planes if _is_of(errors, plane)), METHOD_NAMES[errors.method])
+    records = next((plane.records for plane in planes if _is_of(errors, plane)), None)
+    return METHOD_NAMES[errors.method] if records is None else method_title(records)

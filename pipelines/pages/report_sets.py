@@ -1,7 +1,10 @@
 """The sets of a report: each distinct set once, with its pictures as they were recorded, and its light."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 from msgspec import UNSET
 
@@ -12,7 +15,7 @@ from faintfield.pipelines.formats.reading import read_content
 from faintfield.pipelines.formats.results.overview import Overview
 from faintfield.pipelines.formats.results.result_files import file_within, read_result
 from faintfield.pipelines.formats.units import units_of
-from faintfield.pipelines.pages.page import smaller_uri
+from faintfield.pipelines.pages.page import LOSSLESS, smaller_uri
 from faintfield.pipelines.pages.report_planes import PREFERRED_POSES
 from faintfield.pipelines.reconstruction.overview import (
     BRIGHT_VIEW,
@@ -30,8 +33,7 @@ _PIXELS_ACROSS = 540
 _OVERVIEW_QUALITY = 60
 
 
-@dataclass(frozen=True)
-class LightRow:
+class LightRow(NamedTuple):
     """Light per pixel by one formula: electrons and photons of one view, photons per second, photons of all views."""
 
     words: str
@@ -41,8 +43,7 @@ class LightRow:
     all_views: float | None = None
 
 
-@dataclass(frozen=True)
-class PhotonBudget:
+class PhotonBudget(NamedTuple):
     """The light on a pixel by each formula, and the variance of eq. (6) with the share of each of its parts."""
 
     light: list[LightRow]
@@ -56,12 +57,8 @@ class SetSection:
 
     Attributes
     ----------
-    overview : Overview
-        What overview.json records.
     noise_free : bool
-        The set has no read noise.
-    budget : PhotonBudget, optional
-        Its light, if there is any.
+        True if the set has no read noise.
     pictures : dict of str to str
         Data URIs, None if the file is missing: all views (`integral`), the bright view (`bright`) and the object region
         outlined in it (`region`), the middle of the reference view (`pixels`) and of the noise reference (`no_light`)
@@ -75,14 +72,10 @@ class SetSection:
 
 
 def set_sections(overviews: list[Path]) -> list[SetSection]:
-    """Return what the page shows of each set, sets with noise first; sets with equal pictures are one set.
+    """Return the part of the page about each set, sets with noise first; sets with equal pictures are one set.
 
-    A set may have been reconstructed with several kinds of poses; its overview is that of the preferred ones.
-
-    Parameters
-    ----------
-    overviews : list of Path
-        Every overview.json.
+    A set may have been reconstructed with several kinds of poses; of every overview.json, that of the preferred ones
+    is shown.
     """
     distinct: dict[tuple[bytes, ...], tuple[Path, Overview]] = {}
     for path in overviews:
@@ -101,40 +94,33 @@ def set_sections(overviews: list[Path]) -> list[SetSection]:
 
 
 def _section(folder: Path, overview: Overview) -> SetSection:
-    """Return what the page shows of one set."""
-    view = folder / REFERENCE_VIEW
+    makers: dict[str, tuple[str, Callable[[Path], str]]] = {
+        "integral": (INTEGRAL_IMAGE, partial(_whole, quality=_OVERVIEW_QUALITY)),
+        "bright": (BRIGHT_VIEW, _whole),
+        "region": (REGION_OUTLINED, _whole),
+        "pixels": (REFERENCE_VIEW, _middle),
+        "no_light": (NOISE_REFERENCE_VIEW, _middle),
+        "view": (REFERENCE_VIEW, _thinned),
+    }
     pictures = {
-        "integral": _whole(folder / INTEGRAL_IMAGE, _OVERVIEW_QUALITY),
-        "bright": _whole(folder / BRIGHT_VIEW),
-        "region": _whole(folder / REGION_OUTLINED),
-        "pixels": _pixel_for_pixel(view),
-        "no_light": _pixel_for_pixel(folder / NOISE_REFERENCE_VIEW),
-        "view": _thinned(view),
+        kind: make(folder / name) if (folder / name).is_file() else None for kind, (name, make) in makers.items()
     }
     return SetSection(overview, overview.read_noise_e == 0, photon_budget(overview), pictures)
 
 
-def _whole(path: Path, quality: int | None = None) -> str | None:
-    """Return a whole picture, as it is unless a quality of WebP is given."""
-    content = read_content(path, MAX_PREVIEW_BYTES) if path.is_file() else None
-    if content is None:
-        return None
-    return smaller_uri(content) if quality is None else smaller_uri(content, quality)
+def _whole(path: Path, quality: int = LOSSLESS) -> str:
+    return smaller_uri(read_content(path, MAX_PREVIEW_BYTES), quality)
 
 
-def _pixel_for_pixel(path: Path) -> str | None:
+def _middle(path: Path) -> str:
     """Return the middle of a picture, as large as can be shown pixel for pixel: shrinking would hide the noise."""
-    if not path.is_file():
-        return None
     picture = read_frame(path).pixels_dn
     (top, left) = ((size - min(size, _PIXELS_ACROSS)) // 2 for size in picture.shape[:2])
     return smaller_uri(encoded(picture[top : top + _PIXELS_ACROSS, left : left + _PIXELS_ACROSS], ".png"))
 
 
-def _thinned(path: Path) -> str | None:
+def _thinned(path: Path) -> str:
     """Return a whole picture, with pixels left out if it is too wide: averaging would reduce the noise."""
-    if not path.is_file():
-        return None
     picture = read_frame(path).pixels_dn
     step = -(-picture.shape[1] // (2 * _PIXELS_ACROSS))
     return smaller_uri(encoded(picture[::step, ::step], ".png"))
@@ -163,16 +149,15 @@ def photon_budget(overview: Overview) -> PhotonBudget | None:
     )
     parts = (("read noise", overview.read_noise_e**2), ("light", signal_e), ("dark current", dark_e))
     return PhotonBudget(
-        light=[_light_row(words, electrons, overview) for words, electrons in by_formula if electrons is not None],
+        light=[_light_row(formula, light_e, overview) for formula, light_e in by_formula if light_e is not None],
         variance_e2=variance,
-        shares={words: part / variance for words, part in parts},
+        shares={name: part / variance for name, part in parts},
     )
 
 
-def _light_row(words: str, electrons: float, overview: Overview) -> LightRow:
-    """Return light per pixel in all its units."""
+def _light_row(formula: str, electrons: float, overview: Overview) -> LightRow:
     if overview.quantum_efficiency is None:
-        return LightRow(words, electrons)
+        return LightRow(formula, electrons)
     photons = electrons / overview.quantum_efficiency
     per_s = None if overview.exposure_s is None else photons / overview.exposure_s
-    return LightRow(words, electrons, photons, per_s, photons * overview.views)
+    return LightRow(formula, electrons, photons, per_s, photons * overview.views)

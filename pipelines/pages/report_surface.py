@@ -1,21 +1,21 @@
-"""Surface in a report: its pictures, how much of it is known, and how well it predicts views left out."""
+"""Surfaces and depth maps in a report: pictures, known share, and prediction of views that were left out."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from msgspec import UNSET, UnsetType
 
 from faintfield.pipelines.formats.limits import MAX_PREVIEW_BYTES
 from faintfield.pipelines.formats.reading import read_content
-from faintfield.pipelines.formats.results.records import preview_name
+from faintfield.pipelines.formats.results.records import DepthMapRecord, ReconstructionRecord, preview_name
 from faintfield.pipelines.formats.results.surface import HeldOutRecord, SurfaceFileRecord, SurfaceRecord
 from faintfield.pipelines.formats.units import StatedUnits, units_of
 from faintfield.pipelines.pages.page import data_uri, figure
 
 # Kinds of films that browsers play.
 _FILMS = (".webp", ".png")
-
 
 # A gain over planes that counts, in standard errors.
 _SIGNIFICANT = 3.0
@@ -31,8 +31,7 @@ class Figure:
     moving: str | None = None
 
 
-@dataclass(frozen=True)
-class Prediction:
+class Prediction(NamedTuple):
     """Prediction of the left-out views by one way."""
 
     by: str
@@ -41,25 +40,44 @@ class Prediction:
 
 
 @dataclass(frozen=True)
+class DepthSection:
+    """A depth map with its pictures as data URIs; None if the file is missing."""
+
+    title: str
+    record: DepthMapRecord
+    all_in_focus: str | None
+    map: str | None
+    confidence: str | None
+
+
+def depth_sections(directory: Path, results: dict[Path, ReconstructionRecord]) -> list[DepthSection]:
+    """Return the part of the page about each depth map."""
+    return [
+        DepthSection(
+            folder.relative_to(directory).as_posix(),
+            record,
+            *(
+                _embedded(folder / preview_name(Path(name).name))
+                for name in (record.all_in_focus, record.file, record.confidence)
+            ),
+        )
+        for folder, result in results.items()
+        if (record := result.depth_map)
+    ]
+
+
+@dataclass(frozen=True)
 class SurfaceSection:
     """Part of the page about one surface.
 
     Attributes
     ----------
-    title : str
-        Its folder.
-    made : SurfaceFileRecord
-        Its record, with its provenance.
     picture : str, optional
         The picture as data URI; None if the file is missing.
-    figures : list of Figure
-        Its pictures, the film first.
     rows : list of (str, str, str)
         Name, value and meaning of each number in the table.
-    predictions : list of Prediction
-        How well it and others predict the views that were left out; empty if none were.
-    verdict : str
-        What the predictions say of the surface.
+    predictions, verdict : list of Prediction, str
+        Predictions of the views that were left out, by it and by other ways, and what follows; empty if none were.
     """
 
     title: str
@@ -72,55 +90,53 @@ class SurfaceSection:
 
 
 def surface_sections(directory: Path, surfaces: dict[Path, SurfaceFileRecord]) -> list[SurfaceSection]:
-    """Return what the page shows of each surface."""
-    return [_section(directory, folder, made) for folder, made in surfaces.items()]
-
-
-def _section(directory: Path, folder: Path, made: SurfaceFileRecord) -> SurfaceSection:
-    """Return what the page shows of the surface in one folder."""
-    surface = made.surface
-    predictions = _predictions(surface.held_out) if surface.held_out else []
-    return SurfaceSection(
-        title=folder.relative_to(directory).as_posix(),
-        made=made,
-        picture=_embedded(folder / preview_name(surface.picture)),
-        figures=_figures(folder, surface, units_of(made)),
-        rows=_rows(surface),
-        predictions=predictions,
-        verdict=_verdict(surface.held_out, predictions),
-    )
+    """Return the part of the page about each surface."""
+    sections = []
+    for folder, made in surfaces.items():
+        surface = made.surface
+        predictions = _predictions(surface.held_out) if surface.held_out else []
+        sections.append(
+            SurfaceSection(
+                title=folder.relative_to(directory).as_posix(),
+                made=made,
+                picture=_embedded(folder / preview_name(surface.picture)),
+                figures=_figures(folder, surface, units_of(made)),
+                rows=_rows(surface),
+                predictions=predictions,
+                verdict=_verdict(surface.held_out, predictions) if surface.held_out else "",
+            )
+        )
+    return sections
 
 
 def _figures(folder: Path, surface: SurfaceRecord, units: StatedUnits) -> list[Figure]:
-    """Return the pictures of a surface whose files are there."""
-    what, unit = _quantity(surface), surface.unit
+    quantity, unit = _quantity(surface), surface.unit
     film = _embedded(folder / surface.film) if surface.film and Path(surface.film).suffix in _FILMS else None
     circling = "From viewpoints between the nodes; the middle depth stands still, what is nearer moves most"
     measured = "in the unit of the poses, whose length is not known" if unit == "relative" else f"in {unit}"
+    right = f"Probability that the {quantity} is right within {_tolerance(surface)}"
+    light = "1 = white" if units.light == "relative" else units.light_symbol
+    noise = "Standard deviation of the light of each sample by noise, if its depth is right"
     known = f"Where each sample is, {measured}; hatched where that is not known"
     entries: list[tuple[str | UnsetType, str, str]] = [
         (surface.picture, "Sharp everywhere.", "One picture from all views, as the reference camera would see it"),
-        (surface.depth, f"{what.capitalize()}, {unit}.", known),
-        (surface.depth_confidence, "How sure.", f"Probability that the {what} is right within {_tolerance(surface)}"),
-        (surface.depth_sigma, f"σ of the {what}, {unit}.", "Standard deviation, if the right surface was found"),
-        (
-            surface.picture_sigma,
-            f"σ of the picture, {'1 = white' if units.light == 'relative' else units.light_symbol}.",
-            "Standard deviation of the light of each sample by noise, if its depth is right",
-        ),
+        (surface.depth, f"{quantity.capitalize()}, {unit}.", known),
+        (surface.depth_confidence, "How sure.", right),
+        (surface.depth_sigma, f"σ of the {quantity}, {unit}.", "Standard deviation, if the right surface was found"),
+        (surface.picture_sigma, f"σ of the picture, {light}.", noise),
         (surface.visibility, "Seen by.", "Number of views in which nothing hides the sample"),
         (surface.picture_proposal, "Proposal.", "What the prior proposed"),
         (surface.picture_moved, "Moved, σ.", "Picture less proposal, in standard deviations of the noise"),
     ]
-    found = [
+    figures = [
         Figure(src, name, caption)
         for file, name, caption in entries
         if file is not UNSET and (src := _embedded(folder / preview_name(file))) is not None
     ]
     if film is not None:
         still = _embedded(folder / preview_name(surface.picture)) or film
-        found.insert(1, Figure(still, "Moving.", circling, film))
-    return found
+        figures.insert(1, Figure(still, "Moving.", circling, film))
+    return figures
 
 
 def _embedded(path: Path) -> str | None:
@@ -129,50 +145,43 @@ def _embedded(path: Path) -> str | None:
 
 
 def _rows(surface: SurfaceRecord) -> list[tuple[str, str, str]]:
-    """Return the numbers of a surface in plain words."""
-    what, unit = _quantity(surface), "" if surface.unit == "relative" else f" {surface.unit}"
+    quantity, unit = _quantity(surface), "" if surface.unit == "relative" else f" {surface.unit}"
     first, last = (figure(value) for value in surface.searched)
     how = "found in the views" if surface.range_found else "as asked for"
     compared = f"{how}; {surface.depths} depths compared in bins of {surface.bins_px} × {surface.bins_px} pixels"
     probability = f"with a probability of at least {100 * surface.sure_above:.0f} %"
-    sure = f"the {what} is right within {_tolerance(surface)} {probability}"
+    sure = f"the {quantity} is right within {_tolerance(surface)} {probability}"
     median = f"{figure(surface.median)}{unit}" if surface.median is not None else "–"
     return [
-        (f"{what.capitalize()} searched", f"{first} to {last}{unit}", compared),
-        (f"Median {what}", median, "of all samples whose " + what + " is known"),
-        ("Known", _percent(surface.known_share), f"of the picture has a {what}"),
-        ("Sure", _percent(surface.sure_share), f"of the picture: {sure}"),
+        (f"{quantity.capitalize()} searched", f"{first} to {last}{unit}", compared),
+        (f"Median {quantity}", median, f"of all samples whose {quantity} is known"),
+        ("Known", f"{100 * surface.known_share:.0f} %", f"of the picture has a {quantity}"),
+        ("Sure", f"{100 * surface.sure_share:.0f} %", f"of the picture: {sure}"),
     ]
 
 
 def _quantity(surface: SurfaceRecord) -> str:
-    """Return what the map of a surface shows."""
     return "disparity" if surface.unit == "px" else "depth"
 
 
 def _tolerance(surface: SurfaceRecord) -> str:
-    """Return within what a depth counts as right: 2 % of it, which is a difference of disparities."""
+    """Return the largest error of a depth that counts as right: 2 %, which is a difference of disparities."""
     return "2 % of its difference from that of infinity" if surface.unit == "px" else "2 %"
 
 
-def _percent(share: float) -> str:
-    return f"{100 * share:.0f} %"
-
-
 def _predictions(held_out: HeldOutRecord) -> list[Prediction]:
-    """Return how well views that were left out are predicted, in the order of the page."""
-    known = [
+    ways = [
         ("this surface", held_out.surface),
         ("the same depths on a few planes", held_out.planes),
         ("the mean of each view’s neighbours, blurred", held_out.neighbours),
     ]
-    deviances = [deviance for _, deviance in known if deviance is not None]
-    return [Prediction(by, deviance, deviance == min(deviances)) for by, deviance in known if deviance is not None]
+    lowest = min(deviance for _, deviance in ways if deviance is not None)
+    return [Prediction(by, deviance, deviance == lowest) for by, deviance in ways if deviance is not None]
 
 
-def _verdict(held_out: HeldOutRecord | None, predictions: Sequence[Prediction]) -> str:
-    """Return in words what the predictions say of the surface, which is the first of them."""
-    if held_out is None or len(predictions) < 2:
+def _verdict(held_out: HeldOutRecord, predictions: Sequence[Prediction]) -> str:
+    """Return in words what follows from the predictions, of which that by the surface is the first."""
+    if len(predictions) < 2:
         return ""
     if predictions[0].best:
         if held_out.planes is not None and held_out.standard_error is not UNSET:

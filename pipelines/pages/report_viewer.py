@@ -38,6 +38,9 @@ _MEDIAN_DIFFERENCE = 0.6745 * np.sqrt(2)
 
 type Kind = Literal["light", "sigma", "view", "bright"]
 
+# Black, white and name of the pictures of each kind when the page opens.
+type Scales = dict[Kind, dict[str, float | str]]
+
 
 @dataclass(frozen=True)
 class Fineness:
@@ -54,15 +57,8 @@ class Fineness:
 
 
 # Tried in turn until the numbers fit into their budget.
-_FINENESSES = (
-    Fineness(0, 0),
-    Fineness(1 / 16, 2**-13),
-    Fineness(1 / 8, 2**-12),
-    Fineness(1 / 4, 2**-11),
-    Fineness(1 / 3, 2**-10),
-    Fineness(1 / 2, 2**-9),
-    Fineness(1 / 2, 2**-8),
-)
+_SHARES = ((0, 0), (1 / 16, 2**-13), (1 / 8, 2**-12), (1 / 4, 2**-11), (1 / 3, 2**-10), (1 / 2, 2**-9), (1 / 2, 2**-8))
+_FINENESSES = tuple(Fineness(*shares) for shares in _SHARES)
 
 
 class ViewerPicture(TypedDict):
@@ -86,73 +82,47 @@ class ViewerPicture(TypedDict):
     element: NotRequired[str]
 
 
-class Scale(TypedDict):
-    """Black and white of the pictures of one kind when the page opens."""
-
-    black: float
-    white: float
-    name: str
-
-
-class Viewer(TypedDict):
-    """Data of the viewer; JSON for the page's script.
-
-    `first` are the indices of the two pictures that it opens with, `length` is the unit of lengths on the planes, and
-    `binned` says whether any plane is.
-    """
-
-    pictures: list[ViewerPicture]
-    scales: dict[Kind, Scale]
-    places: list[str]
-    quantity: str
-    length: str
-    binned: bool
-    first: tuple[int, int]
-
-
-def viewer_of(planes: Sequence[Plane], shown: PlaneSections, the_set: SetSection | None) -> Viewer | None:
-    """Return what the viewer shows, None without planes.
+def viewer_of(planes: list[Plane], shown: PlaneSections, the_set: SetSection | None) -> dict[str, Any] | None:
+    """Return the data of the viewer as JSON for the page's script, None without planes.
 
     Parameters
     ----------
-    planes : sequence of Plane
+    planes : list of Plane
         All planes, in the order of the columns.
     shown : PlaneSections
-        What else the page shows of them; the grey scales are the same.
+        Other pictures of them on the page; the grey scales are the same.
     the_set : SetSection, optional
         The set whose views the page shows.
     """
     if not planes:
         return None
     units = planes[0].units
-    places = sorted({plane.place for plane in planes})
-    words = {plane.place: plane.words for plane in planes}
-    scales: dict[Kind, Scale] = {"light": {"black": 0.0, "white": shown.white, "name": "planes"}}
+    places = {plane.place: plane.label for plane in sorted(planes, key=lambda plane: plane.place)}
+    scales: Scales = {"light": {"black": 0.0, "white": shown.white, "name": "planes"}}
     views = _views(the_set, scales) if the_set else []
-    numbers = _plane_pictures(planes, column_titles(list(planes)), places, units)
+    numbers = _plane_pictures(planes, list(places), units)
     if shown.sigmas:
         scales["sigma"] = {"black": 0.0, "white": shown.sigmas.white, "name": "standard deviations"}
     pictures = [*views, *numbers]
     return {
         "pictures": pictures,
         "scales": scales,
-        "places": [words[place] for place in places],
+        "places": list(places.values()),
         "quantity": units.quantity,
         "length": units.length or "(unit of the poses)",
         "binned": any(picture["bins"] > 1 for picture in numbers),
-        "first": _first(planes, shown, places, pictures),
+        "first": _first(planes, shown, list(places), pictures),
     }
 
 
 def _first(
-    planes: Sequence[Plane], shown: PlaneSections, places: list[tuple[float, str]], pictures: list[ViewerPicture]
+    planes: list[Plane], shown: PlaneSections, places: list[tuple[float, str]], pictures: list[ViewerPicture]
 ) -> tuple[int, int]:
     """Return the pictures that the viewer opens with: what the best is compared with, and the best.
 
     A plane of all planes together stands beside that of its own, any other beside a view as recorded.
     """
-    best = best_column(list(planes))
-    titles = column_titles(list(planes))
+    best, titles = best_column(planes), column_titles(planes)
     of_best = [plane for plane in planes if plane.column == best]
     wanted = places[min(shown.slider_depth, len(places) - 1)]
     lead = min(of_best, key=lambda plane: abs(plane.depth_mm - wanted[0]))
@@ -171,34 +141,25 @@ def _first(
     return 0 if second else min(1, len(pictures) - 1), second
 
 
-def _views(the_set: SetSection, scales: dict[Kind, Scale]) -> list[ViewerPicture]:
+def _views(the_set: SetSection, scales: Scales) -> list[ViewerPicture]:
     """Return the views that the page shows anyway, whose grey levels the script reads from there."""
-    found: list[ViewerPicture] = []
+    views: list[ViewerPicture] = []
     if the_set.pictures["view"] and the_set.overview.grey_scale_dn is not UNSET:
         black, white = the_set.overview.grey_scale_dn
         scales["view"] = {"black": black, "white": white, "name": "view as recorded"}
         step = (white - black) / _TOP_GREY
-        found.append(_view("view", "One view", "as recorded", "DN", black, step, "recorded-view"))
+        views.append(_view("view", "One view", "as recorded", "DN", black, step, "recorded-view"))
     if the_set.pictures["bright"]:
         scales["bright"] = {"black": 0.0, "white": float(_TOP_GREY), "name": "bright view"}
         title, unit = "The same view in plenty of light", f"of {_TOP_GREY} grey levels"
-        found.append(_view("bright", title, "preview", unit, 0.0, 1.0, "bright-view"))
-    return found
+        views.append(_view("bright", title, "preview", unit, 0.0, 1.0, "bright-view"))
+    return views
 
 
-def _view(kind: Kind, title: str, words: str, unit: str, low: float, step: float, element: str) -> ViewerPicture:
-    """Return a view, which stands at no depth."""
-    return {
-        "kind": kind,
-        "title": title,
-        "words": words,
-        "place": None,
-        "unit": unit,
-        "low": low,
-        "step": step,
-        "bins": 1,
-        "element": element,
-    }
+def _view(kind: Kind, title: str, caption: str, unit: str, low: float, step: float, element: str) -> ViewerPicture:
+    return ViewerPicture(
+        kind=kind, title=title, words=caption, place=None, unit=unit, low=low, step=step, bins=1, element=element
+    )
 
 
 @dataclass(frozen=True)
@@ -214,30 +175,26 @@ class _Source:
         """Return the numbers (row, column[, colour]) in bins, and the width of these; `coarser` is added to it."""
         numbers = self.plane.sigma_e() if self.kind == "sigma" else self.plane.pixels()
         assert numbers is not None
-        by = _bins(numbers) + coarser
-        return _binned(numbers, by), by
+        bins = 1
+        while (numbers.shape[0] // bins) * (numbers.shape[1] // bins) > _MAX_SAMPLES:
+            bins += 1
+        return _binned(numbers, bins + coarser), bins + coarser
 
 
-def _plane_pictures(
-    planes: Sequence[Plane], titles: dict[str, str], places: list[tuple[float, str]], units: StatedUnits
-) -> list[ViewerPicture]:
+def _plane_pictures(planes: list[Plane], places: list[tuple[float, str]], units: StatedUnits) -> list[ViewerPicture]:
     """Return the planes and their standard deviations, as fine as their budget allows; one at a time is in memory."""
-    sources = []
+    sources, titles = [], column_titles(planes)
     for plane in planes:
         title, place = titles[plane.column], places.index(plane.place)
         sources.append(_Source(plane, "light", title, place))
         if plane.records[0].sigma_file:
             sources.append(_Source(plane, "sigma", f"σ of {title}", place))
-    fineness, coarser = _fitting(sources)
-    found = []
-    for source in sources:
-        numbers, by = source.read(coarser)
-        found.append(_picture(source, pack(numbers, fineness.step(numbers)), by, units))
-    return found
+    fineness, coarser = _choose_fineness(sources)
+    return [_picture(source, fineness, coarser, units) for source in sources]
 
 
-def _fitting(sources: Sequence[_Source]) -> tuple[Fineness, int]:
-    """Return the finest steps, and by how much more bins are wide, that keep a sample of the pictures to its budget."""
+def _choose_fineness(sources: Sequence[_Source]) -> tuple[Fineness, int]:
+    """Return the finest steps and the least extra width of bins that keep a sample of the pictures to its budget."""
     sample = [sources[int(at)] for at in np.unique(np.linspace(0, len(sources) - 1, _SAMPLE).round())]
     share = len(sample) / len(sources)
     budget = share * max(_MIN_BUDGET, _BUDGET_PER_PICTURE * len(sources))
@@ -252,21 +209,13 @@ def _fitting(sources: Sequence[_Source]) -> tuple[Fineness, int]:
         coarser += 1
 
 
-def _bins(numbers: NDArray[Any]) -> int:
-    """Return by how many samples a plane is binned along rows and columns, 1 if it is small enough."""
-    bins = 1
-    while (numbers.shape[0] // bins) * (numbers.shape[1] // bins) > _MAX_SAMPLES:
-        bins += 1
-    return bins
-
-
-def _binned(numbers: NDArray[np.floating], by: int) -> NDArray[np.floating]:
-    """Return the means of bins of `by` × `by` samples; incomplete bins at the end are left out."""
-    rows, columns = (max(size // by, 1) for size in numbers.shape[:2])
-    if by == 1 or min(numbers.shape[:2]) < by:
+def _binned(numbers: NDArray[np.floating], bins: int) -> NDArray[np.floating]:
+    """Return the means of bins of `bins` × `bins` samples; incomplete bins at the end are left out."""
+    if bins == 1 or min(numbers.shape[:2]) < bins:
         return numbers
-    size = (columns, rows)
-    return np.asarray(cv2.resize(numbers[: rows * by, : columns * by], size, interpolation=cv2.INTER_AREA), np.float32)
+    rows, columns = (size // bins for size in numbers.shape[:2])
+    whole = numbers[: rows * bins, : columns * bins]
+    return np.asarray(cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA), np.float32)
 
 
 @dataclass(frozen=True)
@@ -305,16 +254,18 @@ def _noise(plane: NDArray[np.floating]) -> float:
     return float(np.median(finite) / _MEDIAN_DIFFERENCE) if finite.size else 0.0
 
 
-def _picture(source: _Source, packed: Packed, bins: int, units: StatedUnits) -> ViewerPicture:
+def _picture(source: _Source, fineness: Fineness, coarser: int, units: StatedUnits) -> ViewerPicture:
     """Return one plane for the page's script."""
+    numbers, bins = source.read(coarser)
+    packed = pack(numbers, fineness.step(numbers))
     record = source.plane.records[0]
     pitch = record.pitch_mm
     # The first bin's centre lies half a bin less half a sample from that of the first sample
-    x, y = (place + pitch * (bins - 1) / 2 for place in record.origin_mm)
+    x, y = (start + pitch * (bins - 1) / 2 for start in record.origin_mm)
     return {
         "kind": source.kind,
         "title": source.title,
-        "words": source.plane.words,
+        "words": source.plane.label,
         "place": source.place,
         "unit": units.light_per_pixel,
         "low": packed.low,

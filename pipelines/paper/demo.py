@@ -1,4 +1,4 @@
-"""The demo: its simulated rig, the truth about its session, and how far the results are from that."""
+"""The demo: its simulated rig, the truth about its session, and the errors of the results."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -67,26 +67,26 @@ def demo_rig(size: DemoSize, snr: float, seed: int) -> RigSettings:
     Parameters
     ----------
     size : DemoSize
-        How much is captured.
+        Size of the capture.
     snr : float
         SNR of the dark views, eq. (4); it sets the light.
     seed : int
         Seed of the random generator.
     """
     camera = SimulatedSettings(size.size_px, position_error_mm=0.3, rotation_error_mrad=3.5, seed=seed)
-    steps = [
+    steps = (
         *[StepSettings("charuco", 0.1)] * _BOARD_SWEEPS,
         StepSettings("bright", 0.02),
         StepSettings("dark_scene", _EXPOSURE_S),
         StepSettings("noise_reference", _EXPOSURE_S, at="centre"),
         StepSettings("dark", (0.1, 1.0, 10.0, 60.0), size.frames),
         StepSettings("flat", (0.05, 0.1), size.frames, photons_per_s=flat_photons_per_s(camera)),
-    ]
+    )
     return RigSettings(
         stage=StageSettings("simulated", port="simulated:grbl:pty"),
         camera=msgspec.structs.replace(camera, unlit_photons_per_s=_photons_per_s(camera, snr)),
         grid=Grid(size.nodes, size.nodes, size.pitch_mm, Point(-350.0, -350.0)),
-        step=tuple(steps),
+        step=steps,
         settle=SettleSettings(measure=False, wait_s=2.5),
         checks=CheckSettings(saturation_dn=float(camera.saturation_dn)),
         drift=DriftSettings(),
@@ -168,25 +168,25 @@ def demo_metrics(out: Path, session: Path, truth: Path, methods: Sequence[Method
     """
     depths = read_plan(session).rig.scene.depth_mm
     results = session / RECONSTRUCTIONS
-    measured = {
-        (method, depth): folder_of_method(results, method, methods) / f"{plane_name(depth)}.tiff"
-        for method in methods
-        for depth in depths
-    }
-    metrics = assess(load_session(session), measured, truth)
-    assert metrics is not None
+
+    def metrics_of(elemental_set: ElementalSet, folders: dict[Method, Path]) -> Metrics:
+        planes = {
+            (method, depth): folders[method] / f"{plane_name(depth)}.tiff" for method in folders for depth in depths
+        }
+        metrics = assess(elemental_set, planes, truth)
+        assert metrics is not None
+        return metrics
+
+    folders = {method: folder_of_method(results, method, methods) for method in methods}
+    metrics = metrics_of(load_session(session), folders)
     errors = list(metrics.planes)
     for elemental_set in (nominal_session(session), true_set(session, truth)):
-        planes = {(compared, depth): out / elemental_set.poses / f"{plane_name(depth)}.tiff" for depth in depths}
-        assessed = assess(elemental_set, planes, truth)
-        assert assessed is not None
-        errors += assessed.planes
+        errors += metrics_of(elemental_set, {compared: out / elemental_set.poses}).planes
     geometry, noise = _geometry_errors(session), _noise_errors(session)
     return msgspec.structs.replace(metrics, geometry=geometry, noise=noise, planes=errors)
 
 
 def _geometry_errors(session: Path) -> GeometryErrors:
-    """Return how far the measured camera centres and directions are off in the reference frame."""
     poses = true_poses(session)
     measured = {entry.node: np.array(entry.rt_cam_ref) for entry in read_geometry(session, CameraPoses).nodes}
     shared = sorted(measured.keys() & poses.keys())
@@ -202,21 +202,18 @@ def _geometry_errors(session: Path) -> GeometryErrors:
 
 
 def _noise_errors(session: Path) -> dict[str, KnownValue]:
-    """Return what was measured of the sensor, with the truth."""
     sensor = lab_experiment(_camera(session)).sensor
     noise = read_noise(session / NOISE_FILE)
     names = ("read_noise_e", "dark_current_e_per_s", "gain_dn_per_e", "offset_dn")
-    found = {name: getattr(noise, name) for name in names}
-    return {name: KnownValue(it.value, it.se, getattr(sensor, name)) for name, it in found.items()}
+    measured = {name: getattr(noise, name) for name in names}
+    return {name: KnownValue(value.value, value.se, getattr(sensor, name)) for name, value in measured.items()}
 
 
 def _centre_mm(rt_cam_ref: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return where a camera is, (3,), in the reference frame."""
     return np.asarray(-cv2.Rodrigues(rt_cam_ref[:3])[0].T @ rt_cam_ref[3:], np.float64)
 
 
 def _camera(session: Path) -> SimulatedSettings:
-    """Return the settings of a session's camera, which is known to be simulated."""
     camera = read_plan(session).rig.camera
     assert isinstance(camera, SimulatedSettings)
     return camera

@@ -42,7 +42,7 @@ class StagedObject:
     light : float32 array (view, row, column)
         Light of the views, relative to that of a white object.
     region : bool array (row, column)
-        Where the reference view shows the object.
+        Mask of the object in the reference view.
     window : (slice, slice)
         Rows and columns of the reference view that the plane's samples overlay: the object and a margin.
     bright, texture : float array (row, column)
@@ -85,7 +85,7 @@ class StagedObject:
         return mean_square_error(scaled, self.bright, region), mean_square_error(scaled, self.texture, region)
 
 
-# By method and SNR.
+# Best weights by method and SNR.
 type _Weights = dict[tuple[str, float], float | None]
 type _Case = tuple[StagedObject, _Weights, int, tuple[float, ElementalImages, float]]
 
@@ -100,12 +100,23 @@ def measure_errors(size_px: tuple[int, int], seeds: int) -> list[ErrorPoint]:
     seeds : int
         Draws of the noise per object and SNR.
     """
+    errors = []
     cases = progress(_exposures(size_px, seeds), "figure 4: exposures", len(OBJECTS) * seeds * len(SNRS))
-    return [error for stage, weights, seed, exposure in cases for error in _errors(stage, weights, seed, *exposure)]
+    for stage, weights, seed, (snr, images, scale_e) in cases:
+        for method in METHODS:
+            if method.draws is not None and seed > method.draws:
+                continue
+            if (method.name, snr) not in weights:
+                weights[method.name, snr] = _best_weight(stage, method, images, scale_e)
+            weight = weights[method.name, snr]
+            plane = method.plane(stage.operator, images, *(() if weight is None else (weight,)))
+            mse, mse_texture = stage.errors(plane, scale_e)
+            errors.append(ErrorPoint(stage.name, snr, method.name, mse, seed, mse_texture, weight))
+    return errors
 
 
 def _exposures(size_px: tuple[int, int], seeds: int) -> Iterator[_Case]:
-    """Yield every object at every SNR with every draw; an object's draws share the best weights."""
+    """Yield every object at every SNR with every draw; an object's draws share the best weights, of the first draw."""
     for make in OBJECTS:
         stage = stage_object(make(0.0, 0.0, _DEPTH_MM).grey(), size_px)
         weights: _Weights = {}
@@ -114,32 +125,13 @@ def _exposures(size_px: tuple[int, int], seeds: int) -> Iterator[_Case]:
                 yield stage, weights, seed, exposure
 
 
-def _errors(
-    stage: StagedObject,
-    weights: _Weights,
-    seed: int,
-    snr: float,
-    images: ElementalImages,
-    scale_e: float,
-) -> Iterator[ErrorPoint]:
-    """Yield the errors of all methods on one exposure; best weights are those of the first draw, kept in `weights`."""
-    for method in METHODS:
-        if seed > (method.draws or seed):
-            continue
-        if (method.name, snr) not in weights:
-            weights[method.name, snr] = _best_weight(stage, method, images, scale_e)
-        weight = weights[method.name, snr]
-        given = () if weight is None else (weight,)
-        mse, mse_texture = stage.errors(method.plane(stage.operator, images, *given), scale_e)
-        yield ErrorPoint(stage.name, snr, method.name, mse, seed, mse_texture, weight)
-
-
 def _best_weight(stage: StagedObject, method: FigureMethod, images: ElementalImages, scale_e: float) -> float | None:
     """Return the weight whose plane is nearest to the bright one, None for a method that finds its own."""
-    tried = {
-        weight: stage.errors(method.plane(stage.operator, images, weight), scale_e)[0] for weight in method.weights
-    }
-    return min(tried, key=tried.__getitem__) if tried else None
+
+    def error(weight: float) -> float:
+        return stage.errors(method.plane(stage.operator, images, weight), scale_e)[0]
+
+    return min(method.weights, key=error, default=None)
 
 
 def stage_object(shown: TexturedPlane, size_px: tuple[int, int]) -> StagedObject:
@@ -197,11 +189,8 @@ def mean_curves(errors: Sequence[ErrorPoint]) -> list[CurvePoint]:
 
 def is_monotone(points: Sequence[CurvePoint], method: str) -> bool:
     """Return whether every object's mean error by a method falls from each SNR to the next."""
-    curves: dict[str, list[tuple[float, float]]] = {}
-    for point in points:
-        if point.method == method:
-            curves.setdefault(point.object, []).append((point.snr, point.mse))
-    return all(after[1] < before[1] for curve in curves.values() for before, after in pairwise(sorted(curve)))
+    curve = sorted((point.object, point.snr, point.mse) for point in points if point.method == method)
+    return all(after[2] < before[2] for before, after in pairwise(curve) if after[0] == before[0])
 
 
 def over_best(points: Sequence[CurvePoint], method: str, best: str) -> dict[str, float]:

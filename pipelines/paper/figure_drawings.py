@@ -2,7 +2,6 @@
 
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from faintfield.pipelines.formats.results.records import PlaneRecord
 from faintfield.pipelines.paper.figure4 import PAPERS_AXIS, SNRS
 from faintfield.pipelines.paper.figure_methods import METHODS, OURS
 from faintfield.pipelines.paper.figure_records import CurvePoint
@@ -28,30 +28,24 @@ _STYLE: Any = {
 }
 
 
-@dataclass(frozen=True)
-class ShownPlane:
-    """A plane (row, column) in electrons, and its scale in mm."""
-
-    pixels: NDArray[Any]
-    depth_mm: float
-    pitch_mm: float
-    origin_mm: tuple[float, float]
+# Pixels (row, column) in electrons, and the record.
+type DrawnPlane = tuple[NDArray[Any], PlaneRecord]
 
 
-def draw_figure2(integral: NDArray[Any], planes: Sequence[ShownPlane]) -> bytes:
+def draw_figure2(integral: NDArray[Any], planes: Sequence[DrawnPlane]) -> bytes:
     """Return figure 2 as PNG: the bright integral image, and back-projections on one grey scale."""
     with rc_context(_STYLE):
         figure = Figure(figsize=(10.5, 3.1), layout="constrained")
-        first, *others = figure.subplots(1, 1 + len(planes))
+        first, *panels = figure.subplots(1, 1 + len(planes))
         first.imshow(integral, cmap="gray", vmin=0, vmax=255, interpolation="none")
         first.set_title("(a) integral image, one view per node")
         first.set_axis_off()
-        _draw_planes(figure, others, planes, "bc", "back-projection")
+        _draw_planes(figure, panels, planes, "bc", "back-projection")
         return _png(figure)
 
 
 def draw_figure3(
-    dark: NDArray[Any], reference: NDArray[Any], scale_dn: tuple[float, float], snr: float, planes: Sequence[ShownPlane]
+    dark: NDArray[Any], reference: NDArray[Any], scale_dn: tuple[float, float], snr: float, planes: Sequence[DrawnPlane]
 ) -> bytes:
     """Return figure 3 as PNG: one dark view and the noise reference on one scale, and the planes on another."""
     with rc_context(_STYLE):
@@ -68,15 +62,15 @@ def draw_figure3(
         return _png(figure)
 
 
-def _draw_planes(figure: Figure, axes: Sequence[Axes], planes: Sequence[ShownPlane], letters: str, what: str) -> None:
+def _draw_planes(figure: Figure, axes: Sequence[Axes], planes: Sequence[DrawnPlane], letters: str, what: str) -> None:
     """Draw planes on one grey scale, with axes in millimetres."""
-    white = max(float(np.quantile(plane.pixels, 0.998)) for plane in planes)
-    for one, plane, letter in zip(axes, planes, letters, strict=True):
-        rows, columns = plane.pixels.shape[:2]
+    white = max(float(np.quantile(pixels, 0.998)) for pixels, _ in planes)
+    for panel, (pixels, plane), letter in zip(axes, planes, letters, strict=True):
+        rows, columns = pixels.shape[:2]
         left, top = (start - plane.pitch_mm / 2 for start in plane.origin_mm)
         extent = (left, left + columns * plane.pitch_mm, top + rows * plane.pitch_mm, top)
-        image = one.imshow(plane.pixels, cmap="gray", vmin=0, vmax=white, extent=extent, interpolation="none")
-        one.set(title=f"({letter}) {what} at {plane.depth_mm:g} mm", xlabel="x (mm)", ylabel="y, downwards (mm)")
+        image = panel.imshow(pixels, cmap="gray", vmin=0, vmax=white, extent=extent, interpolation="none")
+        panel.set(title=f"({letter}) {what} at {plane.depth_mm:g} mm", xlabel="x (mm)", ylabel="y, downwards (mm)")
     figure.colorbar(image, ax=list(axes), shrink=0.85, label="expected e⁻ per pixel")
 
 
@@ -87,9 +81,10 @@ def draw_figure4(points: Sequence[CurvePoint]) -> bytes:
         figure = Figure(figsize=(10.5, 7.6), layout="constrained")
         above, below = np.asarray(figure.subfigures(2, 1, height_ratios=(1.1, 1))).flat
         papers, ours = above.subplots(1, 2)
-        for axes, title in ((papers, f"(a) on the paper's axis: {_title(OURS)}"), (ours, "(b) the same, nearer")):
+        our_title = next(method.title for method in METHODS if method.name == OURS)
+        for axes, title in ((papers, f"(a) on the paper's axis: {our_title}"), (ours, "(b) the same, nearer")):
             for index, name in enumerate(objects):
-                _curve(axes, _of(points, name, OURS), index, name)
+                _draw_curve(axes, points, (name, OURS), index, name)
             axes.set_title(title)
             _name_axes(axes)
             axes.set_ylim(0, None)
@@ -98,7 +93,7 @@ def draw_figure4(points: Sequence[CurvePoint]) -> bytes:
         panels = below.subplots(1, len(objects), sharey=True)
         for axes, name, letter in zip(np.atleast_1d(panels), objects, "cdefgh", strict=False):
             for index, method in enumerate(METHODS):
-                _curve(axes, _of(points, name, method.name), index, method.title)
+                _draw_curve(axes, points, (name, method.name), index, method.title)
             axes.axhspan(*PAPERS_AXIS, color="0.93", zorder=0)
             axes.set(yscale="log", title=f"({letter}) {name}: all methods")
             _name_axes(axes)
@@ -108,35 +103,25 @@ def draw_figure4(points: Sequence[CurvePoint]) -> bytes:
         return _png(figure)
 
 
-def _of(points: Sequence[CurvePoint], name: str, method: str) -> list[CurvePoint]:
-    """Return the points of one curve in the order of SNR."""
-    chosen = [point for point in points if (point.object, point.method) == (name, method)]
-    return sorted(chosen, key=lambda point: point.snr)
-
-
-def _title(method: str) -> str:
-    """Return what a method is called on figures."""
-    return next(known.title for known in METHODS if known.name == method)
-
-
-def _curve(axes: Axes, points: Sequence[CurvePoint], index: int, label: str) -> None:
-    """Draw the means with twice their standard errors."""
+def _draw_curve(axes: Axes, points: Sequence[CurvePoint], key: tuple[str, str], index: int, label: str) -> None:
+    """Draw the means of an object and a method with twice their standard errors."""
     index %= len(_COLOURS)
     look: dict[str, Any] = {"color": _COLOURS[index], "marker": _MARKS[index], "linestyle": _DASHES[index]}
-    bars = [2 * (point.standard_error or 0.0) for point in points]
-    snr, mse = [point.snr for point in points], [point.mse for point in points]
+    curve = sorted(
+        (point.snr, point.mse, point.standard_error or 0.0) for point in points if (point.object, point.method) == key
+    )
+    snr, mse, error = zip(*curve, strict=True)
+    bars = 2 * np.array(error)
     axes.errorbar(snr, mse, bars, label=label, markersize=4, linewidth=1.3, capsize=2, **look)
 
 
 def _name_axes(axes: Axes) -> None:
-    """Label the axes of a panel of curves."""
     axes.set(xlabel="SNR, eq. (4)", ylabel="mean square error, object 0…1")
     axes.set_xticks(SNRS[::2] if axes.get_position().width < 0.3 else SNRS)
     axes.grid(alpha=0.3, linewidth=0.5)
 
 
 def _png(figure: Figure) -> bytes:
-    """Return a figure as PNG."""
     content = io.BytesIO()
     figure.savefig(content, format="png", metadata={"Software": None})
     return content.getvalue()

@@ -45,7 +45,6 @@ def _solved(
     operator: PlaneOperator,
     images: ElementalImages,
     weight: float | None = None,
-    *,
     prior: PriorName = "tv",
 ) -> Image:
     """Return the plane that `reconstruct --method` would write."""

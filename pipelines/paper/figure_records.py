@@ -85,7 +85,7 @@ class Figure4(msgspec.Struct, frozen=True):
     Attributes
     ----------
     monotone : dict of str to bool
-        Whether every object's error by a method falls from each SNR to the next.
+        By method, True if every object's error falls from each SNR to the next.
     over_best : dict of str to float
         For each object, the largest ratio of our error to that with the best weight.
     """

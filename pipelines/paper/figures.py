@@ -21,7 +21,7 @@ from faintfield.pipelines.formats.sets.ground_truth import read_truth, texture_a
 from faintfield.pipelines.pages.page import data_uri, template
 from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.paper.figure4 import PAPERS_AXIS, is_monotone, mean_curves, measure_errors, over_best
-from faintfield.pipelines.paper.figure_drawings import ShownPlane, draw_figure2, draw_figure3, draw_figure4
+from faintfield.pipelines.paper.figure_drawings import DrawnPlane, draw_figure2, draw_figure3, draw_figure4
 from faintfield.pipelines.paper.figure_methods import BEST, METHODS, OURS
 from faintfield.pipelines.paper.figure_records import (
     DarkPlaneRow,
@@ -64,17 +64,9 @@ class FigureOptions(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class _FigureProvenance(Provenance[dict[str, object]], frozen=True, kw_only=True):
-    """The provenance of a figure, which is written last: it says that the figure is whole."""
+    """Provenance of a figure, which is written last: with it, the figure is whole."""
 
     wall_time_s: float
-
-
-class _FoundFigure(msgspec.Struct):
-    """A figure that lies in the folder."""
-
-    src: str
-    numbers: object
-    provenance: _FigureProvenance
 
 
 def make_figures(out: Path, options: FigureOptions) -> dict[str, Figure2 | Figure3 | Figure4]:
@@ -92,31 +84,31 @@ def make_figures(out: Path, options: FigureOptions) -> dict[str, Figure2 | Figur
         write_synthetic_set(out / _SCENE, scene, overwrite=True)
     makers: dict[int, Callable[[Path, FigureOptions], Figure2 | Figure3 | Figure4]]
     makers = {2: _figure2, 3: _figure3, 4: _figure4}
-    made = {}
+    numbers = {}
     for number in options.only:
-        started = time.monotonic()
+        start_s = time.monotonic()
         remove(_provenance_path(out, number))
-        made[f"figure{number}"] = makers[number](out, options)
+        numbers[f"figure{number}"] = makers[number](out, options)
         origin = msgspec.structs.asdict(provenance("figures", msgspec.structs.asdict(options), {}))
-        made_in_s = time.monotonic() - started
-        write_json(_provenance_path(out, number), _FigureProvenance(**origin, wall_time_s=made_in_s))
-        inform(f"figure {number}: {made_in_s:.1f} s")
+        wall_time_s = time.monotonic() - start_s
+        write_json(_provenance_path(out, number), _FigureProvenance(**origin, wall_time_s=wall_time_s))
+        inform(f"figure {number}: {wall_time_s:.1f} s")
     _write_page(out)
-    return made
+    return numbers
 
 
 def _figure2(out: Path, _: FigureOptions) -> Figure2:
     """Back-project the bright set, and measure how much of each object's detail each plane shows."""
     outcome = _reconstruct(out / _SCENE / NOISE_FREE, out / _BRIGHT, "backprojection")
-    planes = _shown(out / _BRIGHT, outcome.planes)
+    planes = _read_planes(out / _BRIGHT, outcome.planes)
     integral = read_frame(out / _BRIGHT / INTEGRAL_IMAGE).pixels_dn
-    rows = [row for plane in planes for row in _detail_rows(out / _SCENE, plane)]
+    rows = [row for pixels, plane in planes for row in _detail_rows(out / _SCENE, pixels, plane.depth_mm)]
     numbers = Figure2(rows)
     _write(out, 2, draw_figure2(integral, planes), rows, numbers)
     return numbers
 
 
-def _detail_rows(scene: Path, plane: ShownPlane) -> list[DetailRow]:
+def _detail_rows(scene: Path, pixels: NDArray[np.float32], depth_mm: float) -> list[DetailRow]:
     """Return the share of each object's detail that a plane shows.
 
     Detail d is what a small blur removes. The share is `<d_plane · d_object> / <d_object²>` over the region where the
@@ -127,15 +119,10 @@ def _detail_rows(scene: Path, plane: ShownPlane) -> list[DetailRow]:
     rows = []
     for known in truth.planes:
         texture, region = texture_and_region(scene, known)
-        of_plane, of_object = (_detail(image)[region] for image in (plane.pixels, texture))
+        of_plane, of_object = ((image - blurred(image, _DETAIL_BLUR))[region] for image in (pixels, texture))
         share = float(np.sum(of_plane * of_object) / np.sum(np.square(of_object)))
-        rows.append(DetailRow(plane.depth_mm, known.name, known.depth_mm, share))
+        rows.append(DetailRow(depth_mm, known.name, known.depth_mm, share))
     return rows
-
-
-def _detail(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return what a small blur removes from an image (row, column)."""
-    return np.asarray(image - blurred(image, _DETAIL_BLUR))
 
 
 def _figure3(out: Path, _: FigureOptions) -> Figure3:
@@ -158,7 +145,7 @@ def _figure3(out: Path, _: FigureOptions) -> Figure3:
     elemental_set = load_set(out / _SCENE)
     dark = read_frame(elemental_set.image_paths[elemental_set.reference_view]).pixels_dn
     reference = read_frame(out / _SCENE / NOISE_REFERENCE).pixels_dn
-    planes = _shown(out / _DARK, outcome.planes)
+    planes = _read_planes(out / _DARK, outcome.planes)
     picture = draw_figure3(dark, reference, grey_scale_dn(dark), metrics.snr.measured, planes)
     _write(out, 3, picture, rows, numbers)
     return numbers
@@ -183,46 +170,38 @@ def _reconstruct(set_path: Path, out: Path, method: Method) -> Outcome:
     return outcome
 
 
-def _shown(folder: Path, records: Sequence[PlaneRecord]) -> list[ShownPlane]:
-    """Return the planes of a folder as they are drawn."""
-    return [
-        ShownPlane(read_frame(folder / plane.file).pixels_dn, plane.depth_mm, plane.pitch_mm, plane.origin_mm)
-        for plane in records
-    ]
+def _read_planes(folder: Path, records: Sequence[PlaneRecord]) -> list[DrawnPlane]:
+    return [(read_frame(folder / plane.file).pixels_dn, plane) for plane in records]
 
 
 def _write(out: Path, number: int, picture: bytes, rows: Sequence[Row], numbers: Any) -> None:
-    """Write a figure and its numbers, as CSV and as JSON."""
     write_whole(out / f"figure{number}.csv", as_csv(rows))
     write_whole(out / f"figure{number}.png", picture)
     write_json(out / f"figure{number}.json", numbers)
 
 
 def _provenance_path(folder: Path, number: int) -> Path:
-    """Return the path of a figure's provenance."""
     return folder / f"figure{number}_provenance.json"
 
 
 def _write_page(folder: Path) -> None:
-    """Write figures.html of the figures that are in a folder."""
-    found = {number: _read(folder, number) for number in _KINDS if _provenance_path(folder, number).is_file()}
+    figures = {
+        number: {
+            "src": data_uri((folder / f"figure{number}.png").read_bytes(), ".png"),
+            "numbers": msgspec.json.decode((folder / f"figure{number}.json").read_bytes(), type=kind),
+            "provenance": msgspec.json.decode(path.read_bytes(), type=_FigureProvenance),
+        }
+        for number, kind in _KINDS.items()
+        if (path := _provenance_path(folder, number)).is_file()
+    }
     curves = None
-    if 4 in found:
+    if 4 in figures:
         curves = msgspec.json.decode((folder / _CURVES_FILE).read_bytes(), type=Figure4Curves)
     page = template(PAGE_FILE).render(
-        found=found,
+        found=figures,
         curves=curves,
         methods=[method for method in METHODS if curves is None or method.name in curves.monotone],
         ours=OURS,
         papers_axis=PAPERS_AXIS,
     )
     write_whole(folder / PAGE_FILE, page)
-
-
-def _read(folder: Path, number: int) -> _FoundFigure:
-    """Return a figure's picture, numbers and origin."""
-    return _FoundFigure(
-        src=data_uri((folder / f"figure{number}.png").read_bytes(), ".png"),
-        numbers=msgspec.json.decode((folder / f"figure{number}.json").read_bytes(), type=_KINDS[number]),
-        provenance=msgspec.json.decode(_provenance_path(folder, number).read_bytes(), type=_FigureProvenance),
-    )

@@ -3,28 +3,19 @@
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.noise_model import NoiseModel
-from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.reading import is_file, is_folder
-from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, CameraPoses, read_geometry
-from faintfield.pipelines.formats.results.noise import (
-    NOISE_FILE,
-    NOISE_MAPS,
-    NoiseRecord,
-    read_fitted_noise,
-    read_maps,
-    read_noise,
-)
+from faintfield.pipelines.formats.results.geometry import CameraPoses, read_geometry
+from faintfield.pipelines.formats.results.noise import NOISE_MAPS, NoiseRecord, read_maps, read_noise
 from faintfield.pipelines.formats.results.noise_fit import Measured
 from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import RigError
-from faintfield.rig.plan import CapturePlan, Grid
 from faintfield.rig.settings import RigSettings
 from faintfield.rig.simulation.lab import lab_experiment
 from faintfield.rig.stages.motion import StageWorkspace
@@ -35,27 +26,22 @@ _NEAR_PX = 4
 
 _NOT_MEASURED = "no noise calibration; give the result of `faintfield noise` as --noise, or --read-noise-e"
 
-
 # Its objects take a while to draw.
 _simulated_experiment = lru_cache(maxsize=1)(lab_experiment)
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """Known noise.
+    """Knowledge of the noise.
 
     Attributes
     ----------
     source : str
-        Where it is from, in words.
-    read_noise_e, dark_current_e_per_s, gain_dn_per_e, quantum_efficiency : Measured
-        The paper's quantities, and the gain.
-    record : NoiseRecord, optional
-        The calibration that it is from.
-    path : Path, optional
-        Its file.
+        Its source, in words.
+    record, path : NoiseRecord and Path, optional
+        The calibration that it is from, and its file.
     model : NoiseModel, optional
-        That of a simulated camera.
+        Noise model of a simulated camera.
     """
 
     source: str
@@ -67,103 +53,50 @@ class Sensor:
     path: Path | None = None
     model: NoiseModel | None = None
 
-    def of_frame(self, size_px: tuple[int, int], what: str) -> tuple[NoiseModel, NDArray[np.bool_]]:
-        """Return the noise model of a frame's pixels, and which of them are unusable (row, column).
 
-        Raises
-        ------
-        InputError
-            Offset and gain are not known, or are those of another camera.
-        """
-        if self.model is not None:
-            return self.model, np.zeros(size_px[::-1], bool)
-        if self.path is None:
-            raise BadValue(
-                f"{what}: its DN tell no electrons, as there is no noise calibration; give the result of `faintfield "
-                "noise` as --noise, or the light as --light-e"
-            )
-        fitted = read_fitted_noise(self.path, size_px)
-        return fitted.model, fitted.unusable
+def known_sensor(settings: RigSettings, noise: Path | None, **options: float | None) -> Sensor:
+    """Return what is known of the sensor: `options`, else measured (`noise`, a noise.json), else simulated.
 
-
-class StatedNoise(msgspec.Struct, frozen=True):
-    """Numbers that options state in place of a calibration's."""
-
-    read_noise_e: float | None = None
-    dark_current_e_per_s: float | None = None
-    quantum_efficiency: float | None = None
-
-
-def known_sensor(settings: RigSettings, rig: Path, noise: Path | None, stated: StatedNoise) -> Sensor:
-    """Return what is known of the sensor: stated, else measured (`noise`, or beside the rig.toml), else simulated.
+    `options` are named as attributes of `Sensor`.
 
     Raises
     ------
     MissingFile, BadValue
         noise.json cannot be read.
     """
-    path = _file_of(noise, rig, NOISE_FILE)
-    if path is not None:
-        sensor = _measured_sensor(path)
+    if noise is not None:
+        sensor = _measured_sensor(noise)
     elif isinstance(settings.camera, SimulatedSettings):
         sensor = _simulated_sensor(settings.camera)
     else:
         unknown = Measured(None, why=_NOT_MEASURED)
         sensor = Sensor("no calibration", unknown, unknown, unknown, unknown)
-    numbers = msgspec.structs.asdict(stated)
-    given = {name: Measured(value) for name, value in numbers.items() if value is not None}
-    if not given:
-        return sensor
-    return replace(
-        sensor,
-        source=f"options and {sensor.source}",
-        read_noise_e=given.get("read_noise_e", sensor.read_noise_e),
-        dark_current_e_per_s=given.get("dark_current_e_per_s", sensor.dark_current_e_per_s),
-        quantum_efficiency=given.get("quantum_efficiency", sensor.quantum_efficiency),
-    )
+    numbers: dict[str, Any] = {name: Measured(value) for name, value in options.items() if value is not None}
+    return replace(sensor, source=f"options and {sensor.source}", **numbers) if numbers else sensor
 
 
 def _measured_sensor(path: Path) -> Sensor:
-    """Return the sensor of a noise.json."""
     record = read_noise(path)
     efficiency = record.quantum_efficiency
-    if not isinstance(efficiency, Measured):  # it may be written with or without its error
+    if not isinstance(efficiency, Measured):  # a record holds it with or without its error
         efficiency = Measured(efficiency, why="not stated" if efficiency is None else None)
     return Sensor(
-        str(path),
-        record.read_noise_e,
-        record.dark_current_e_per_s,
-        record.gain_dn_per_e,
-        efficiency,
-        record,
-        path,
+        str(path), record.read_noise_e, record.dark_current_e_per_s, record.gain_dn_per_e, efficiency, record, path
     )
 
 
 def _simulated_sensor(settings: SimulatedSettings) -> Sensor:
-    """Return the sensor of a simulated camera."""
-    made = _simulated_experiment(settings).sensor
-    model = NoiseModel(
-        made.offset_dn,
-        made.gain_dn_per_e,
-        made.read_noise_e,
-        made.dark_current_e_per_s,
-        made.quantum_efficiency,
-        made.saturation_dn,
-    )
-    return Sensor(
-        "the simulated camera",
-        Measured(made.read_noise_e),
-        Measured(made.dark_current_e_per_s),
-        Measured(made.gain_dn_per_e),
-        Measured(made.quantum_efficiency),
-        model=model,
-    )
+    sensor = _simulated_experiment(settings).sensor
+    names = ("read_noise_e", "dark_current_e_per_s", "gain_dn_per_e", "quantum_efficiency")
+    numbers = {name: getattr(sensor, name) for name in names}
+    model = NoiseModel(sensor.offset_dn, saturation_dn=sensor.saturation_dn, **numbers)
+    measured: dict[str, Any] = {name: Measured(value) for name, value in numbers.items()}
+    return Sensor("the simulated camera", **measured, model=model)
 
 
 @dataclass(frozen=True)
 class KnownLens:
-    """Known lens.
+    """Knowledge of the lens.
 
     Attributes
     ----------
@@ -172,7 +105,7 @@ class KnownLens:
     size_px : (int, int), optional
         Width and height of a frame.
     centre_px : (float, float), optional
-        Where the axis meets the detector.
+        Point where the axis meets the detector.
     response : array (row, column), optional
         Relative response, vignetting included.
     """
@@ -185,7 +118,7 @@ class KnownLens:
     def responses(self, centres_mm: NDArray[np.float64], depth_mm: float | None) -> NDArray[np.float64]:
         """Return the response of each view (view,) where it sees the middle of the reference view; 0 if it does not.
 
-        What is not known takes nothing away: all views then see it, or see it equally well.
+        Without a depth, a lens or a response all views see it, or see it equally well.
 
         Parameters
         ----------
@@ -194,48 +127,39 @@ class KnownLens:
         depth_mm : float, optional
             Depth of the plane.
         """
-        found = np.ones(len(centres_mm))
+        responses = np.ones(len(centres_mm))
         if depth_mm is None or self.f_px.value is None or self.size_px is None or self.centre_px is None:
-            return found
+            return responses
         places = np.rint(np.array(self.centre_px) - self.f_px.value / depth_mm * centres_mm).astype(int)
-        found[((places < 0) | (places >= self.size_px)).any(axis=1)] = 0
+        responses[((places < 0) | (places >= self.size_px)).any(axis=1)] = 0
         if self.response is not None:
-            axis = self._near(*np.rint(self.centre_px).astype(int).tolist())
-            for view in np.flatnonzero(found):
-                found[view] = self._near(*places[view].tolist()) / axis
-        return found
-
-    def _near(self, column: int, row: int) -> float:
-        """Return the mean response around a pixel."""
-        response = self.response
-        if response is None:
-            return 1.0
-        rows, columns = (slice(max(at - _NEAR_PX, 0), at + _NEAR_PX + 1) for at in (row, column))
-        return float(response[rows, columns].mean())
+            axis = _mean_around(self.response, *np.rint(self.centre_px).astype(int).tolist())
+            for view in np.flatnonzero(responses):
+                responses[view] = _mean_around(self.response, *places[view].tolist()) / axis
+        return responses
 
 
-def known_lens(
-    settings: RigSettings, rig: Path, sensor: Sensor, geometry: Path | None, fx_px: float | None
-) -> KnownLens:
-    """Return what is known of the lens: stated, else measured (`geometry`, or beside the rig.toml), else simulated.
+def _mean_around(response: NDArray[np.floating], column: int, row: int) -> float:
+    rows, columns = (slice(max(middle - _NEAR_PX, 0), middle + _NEAR_PX + 1) for middle in (row, column))
+    return float(response[rows, columns].mean())
+
+
+def known_lens(settings: RigSettings, sensor: Sensor, geometry: Path | None, fx_px: float | None) -> KnownLens:
+    """Return what is known of the lens: stated, else measured (`geometry`, a geometry.json), else simulated.
 
     Raises
     ------
     MissingFile, BadValue
         geometry.json or the maps beside noise.json cannot be read.
     """
-    path = _file_of(geometry, rig, GEOMETRY_FILE)
-    simulated = (
-        _simulated_experiment(settings.camera).optics if isinstance(settings.camera, SimulatedSettings) else None
-    )
+    camera = settings.camera
+    simulated = _simulated_experiment(camera).optics if isinstance(camera, SimulatedSettings) else None
     size_px = sensor.record.size_px if sensor.record is not None else None
     centre_px = None
     f_px = Measured(None, why="no focal length; give --fx-px, or the result of `faintfield geometry` as --geometry")
-    if path is not None:
-        lens = read_geometry(path, CameraPoses).camera_lens()
+    lens = simulated if geometry is None else read_geometry(geometry, CameraPoses).camera_lens()
+    if lens is not None:
         size_px, centre_px, f_px = lens.size_px, (lens.cx_px, lens.cy_px), Measured(lens.fx_px)
-    elif simulated is not None:
-        size_px, centre_px, f_px = simulated.size_px, (simulated.cx_px, simulated.cy_px), Measured(simulated.fx_px)
     if fx_px is not None:
         f_px = Measured(fx_px)
     if centre_px is None and size_px is not None:
@@ -251,17 +175,7 @@ def known_lens(
 
 @dataclass(frozen=True)
 class KnownPace:
-    """Speeds of stage and camera, and the travel of the stage.
-
-    Attributes
-    ----------
-    motion, feed_mm_per_s : MotionLimits, float
-        Of the stage.
-    readout_s : float
-        Of the camera.
-    workspace : StageWorkspace
-        Positions that are allowed.
-    """
+    """Limits, feed and allowed positions of the stage, and the readout of the camera."""
 
     motion: MotionLimits
     feed_mm_per_s: float
@@ -286,30 +200,8 @@ def known_pace(settings: RigSettings) -> KnownPace | str:
         return str(failure)
 
 
-def plan_over(settings: RigSettings, grid: Grid, exposure_s: float | None, frames: int | None) -> CapturePlan:
-    """Return the plan of a capture over another grid, with other frames of the dark scene and the noise reference.
-
-    Parameters
-    ----------
-    settings : RigSettings
-        Content of the rig.toml.
-    grid : Grid
-        The nodes.
-    exposure_s, frames : float and int, optional
-        Exposure and number of frames at a node, of the dark scene, and of the noise reference, which must be alike;
-        by default those of the rig.toml.
-    """
-    changes = {} if exposure_s is None or frames is None else {"exposure_s": (exposure_s,), "frames_per_node": frames}
-    steps = [
-        msgspec.structs.replace(step, **changes) if step.kind in ("dark_scene", "noise_reference") else step
-        for step in settings.steps()
-    ]
-    return CapturePlan.of(grid, steps, approach_mm=settings.stage.approach_mm, frame_bytes=0)
-
-
-def _file_of(given: Path | None, rig: Path, name: str) -> Path | None:
-    """Return the file of a calibration: as given, or in the folder given, or beside the rig.toml if it is there."""
-    if given is not None:
-        return given / name if is_folder(given) else given
-    beside = rig.parent / name
-    return beside if is_file(beside) else None
+def calibration_file(path: Path | None, name: str, *folders: Path) -> Path | None:
+    """Return the file of a calibration: `path` or the file in that folder; else the first that lies in `folders`."""
+    if path is not None:
+        return path / name if is_folder(path) else path
+    return next((folder / name for folder in folders if is_file(folder / name)), None)

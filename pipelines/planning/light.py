@@ -7,17 +7,18 @@ import numpy as np
 
 from faintfield.pipelines.errors import BadValue, WrongUsage
 from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.results.noise import read_fitted_noise
 from faintfield.pipelines.formats.results.noise_fit import Measured
 from faintfield.pipelines.planning.known import Sensor
 
 # Two-sided 95 % of the normal distribution.
-_WITHIN = 1.96
+_Z95 = 1.96
 
 # Largest part of saturated pixels whose light is still that of the others.
-_MOST_SATURATED = 0.01
+_MAX_SATURATED = 0.01
 
-# Part of a frame's larger side around its middle that is taken of a flat, to either side.
-_OF_FLAT = 20
+# The middle of a flat reaches to either side by the frame's larger side over this.
+_MIDDLE_DIVISOR = 20
 
 
 @dataclass(frozen=True)
@@ -29,17 +30,15 @@ class Light:
 
 
 @dataclass(frozen=True)
-class GivenLight:
+class LightOptions:
     """The light as options give it: exactly one of the first four.
 
     Attributes
     ----------
     e, e_per_s : float, optional
         Electrons per pixel in one frame, or in a second.
-    flat, test_frame : Path, optional
-        A frame of even light, and one of the scene.
-    exposure_s : float, optional
-        That of the frame; by default what its file states.
+    flat, test_frame, exposure_s : Path and float, optional
+        A frame of even light, or one of the scene, and its exposure; by default that which its file states.
     region_px : (int, int, int, int), optional
         Left column, upper row, width and height of the object in the frame; by default the middle of a flat, or all
         of a test frame.
@@ -69,11 +68,10 @@ class GivenLight:
         InputError
             The frame cannot be used, or shows no light.
         """
-        given = [statement for statement in (self.e, self.e_per_s, self.flat, self.test_frame) if statement is not None]
-        if len(given) != 1:
+        count = sum(value is not None for value in (self.e, self.e_per_s, self.flat, self.test_frame))
+        if count != 1:
             raise WrongUsage(
-                f"{len(given)} lights are given, and one is wanted; give --light-e, --light-e-per-s, --flat or "
-                "--test-frame"
+                f"{count} lights are given, and one is wanted; give --light-e, --light-e-per-s, --flat or --test-frame"
             )
         if (path := self.flat or self.test_frame) is not None:
             return _light_of_frame(path, self, sensor)
@@ -83,59 +81,66 @@ class GivenLight:
         return Light(Measured(per_s), "as stated")
 
 
-def _light_of_frame(path: Path, given: GivenLight, sensor: Sensor) -> Light:
+def _light_of_frame(path: Path, options: LightOptions, sensor: Sensor) -> Light:
     """Return the light of a frame, with its interval: by the noise of its pixels, and by that of the calibration."""
     frame = read_frame(path)
-    exposure_s = given.exposure_s or frame.exposure_s
+    exposure_s = options.exposure_s or frame.exposure_s
     if exposure_s is None:
         raise BadValue(f"{path}: states no exposure time; give --frame-exposure-ms")
     if frame.pixels_dn.ndim != 2:
         raise BadValue(f"{path}: is a colour picture; give a grey or raw frame as the sensor counts it")
     height, width = frame.pixels_dn.shape
-    model, unusable = sensor.of_frame((width, height), str(path))
-    where = _region(path, given, width, height)
+    if sensor.model is not None:
+        model, unusable = sensor.model, np.zeros((height, width), bool)
+    elif sensor.path is not None:
+        fitted = read_fitted_noise(sensor.path, (width, height))
+        model, unusable = fitted.model, fitted.unusable
+    else:
+        raise BadValue(
+            f"{path}: its DN tell no electrons, as there is no noise calibration; give the result of `faintfield "
+            "noise` as --noise, or the light as --light-e"
+        )
+    where = _region(path, options, width, height)
     usable = ~unusable[where]
     saturated = model.saturated(frame.pixels_dn)[where] & usable
-    if not usable.any() or saturated.sum() > _MOST_SATURATED * usable.sum():
+    if not usable.any() or saturated.sum() > _MAX_SATURATED * usable.sum():
         raise BadValue(
             f"{path}: {saturated.sum()} of {usable.sum()} usable pixels are saturated, at most "
-            f"{_MOST_SATURATED:.0%} may be; expose it for less than {1e3 * exposure_s:g} ms"
+            f"{_MAX_SATURATED:.0%} may be; expose it for less than {1e3 * exposure_s:g} ms"
         )
     usable &= ~saturated
     count = int(usable.sum())
-    shape = frame.pixels_dn.shape
-    dark_e = np.broadcast_to(model.background_e(exposure_s), shape)[where][usable]
+    dark_e = np.broadcast_to(model.background_e(exposure_s), frame.pixels_dn.shape)[where][usable]
     electrons = model.electrons(frame.pixels_dn)[where][usable]
     light_e = float(np.mean(electrons, dtype=np.float64) - np.mean(dark_e))
     known_e2 = float(np.mean(dark_e) + np.mean(model.read_variance_e2()))
     variance_e2 = (max(light_e, 0.0) + known_e2) / count + _variance_of_calibration(sensor, light_e, exposure_s)
-    margin_e = _WITHIN * variance_e2**0.5
+    margin_e = _Z95 * variance_e2**0.5
     low_e, high_e = light_e - margin_e, light_e + margin_e
     if low_e <= 0:
         raise BadValue(
             f"{path}: shows {light_e:.3g} e⁻ per pixel (95 %: {low_e:.3g} to {high_e:.3g}), which may be none; "
             f"expose it for longer than {1e3 * exposure_s:g} ms"
         )
-    part = "its middle" if given.flat is not None and given.region_px is None else f"{count} pixels"
-    measured = "" if sensor.record is not None else ", the sensor's numbers taken as exact"
-    source = f"{path.name}, {1e3 * exposure_s:g} ms, mean of {part}{measured}"
+    part = "its middle" if options.flat is not None and options.region_px is None else f"{count} pixels"
+    exact = "" if sensor.record is not None else ", the sensor's numbers taken as exact"
+    source = f"{path.name}, {1e3 * exposure_s:g} ms, mean of {part}{exact}"
     ends = low_e / exposure_s, high_e / exposure_s
-    return Light(Measured(light_e / exposure_s, margin_e / _WITHIN / exposure_s, ends), source)
+    return Light(Measured(light_e / exposure_s, margin_e / _Z95 / exposure_s, ends), source)
 
 
-def _region(path: Path, given: GivenLight, width: int, height: int) -> tuple[slice, slice]:
-    """Return rows and columns of a frame that count."""
-    if given.region_px is not None:
-        left, upper, wide, high = given.region_px
+def _region(path: Path, options: LightOptions, width: int, height: int) -> tuple[slice, slice]:
+    if options.region_px is not None:
+        left, upper, wide, high = options.region_px
         if min(left, upper) < 0 or min(wide, high) < 1 or left + wide > width or upper + high > height:
             raise BadValue(
                 f"{path}: --region-px {left} {upper} {wide} {high} is not within its {width} x {height} px; give left "
                 "column, upper row, width and height"
             )
         return slice(upper, upper + high), slice(left, left + wide)
-    if given.flat is None:
+    if options.flat is None:
         return slice(None), slice(None)
-    near = max(width, height) // _OF_FLAT + 1
+    near = max(width, height) // _MIDDLE_DIVISOR + 1
     row, column = height // 2, width // 2
     return slice(max(row - near, 0), row + near), slice(max(column - near, 0), column + near)
 

@@ -1,4 +1,4 @@
-"""Predict what a capture will show, of a rig.toml and of others like it: exposures, grids, frames at a node."""
+"""Prediction of a capture by a rig.toml, and a table of others: exposures, grids, frames at a node."""
 
 import math
 import re
@@ -20,7 +20,7 @@ from faintfield.pipelines.formats.results.prediction import (
     FeaturePrediction,
     PredictionRecord,
 )
-from faintfield.pipelines.planning.known import KnownLens, KnownPace, Sensor, plan_over
+from faintfield.pipelines.planning.known import KnownLens, KnownPace, Sensor
 from faintfield.pipelines.planning.light import Light
 from faintfield.recon.metrics import expected_snr_from_powers
 from faintfield.recon.prediction import (
@@ -38,7 +38,11 @@ from faintfield.rig.stages.protocol import Point
 # Longest table; more rows are a typing error.
 _MAX_ROWS = 500
 
+_NO_BLUR = "nothing measures the lens's blur, none is assumed; --blur-px states it"
 _NO_DEPTH = "no depth; give --depth-mm, or depth_mm under [scene] of the rig.toml"
+
+
+type Array = NDArray[np.float64]
 
 
 class View(NamedTuple):
@@ -54,16 +58,14 @@ class Question:
 
     Attributes
     ----------
-    depths_mm : sequence of float
-        Depths of planes; none if not known.
-    sides_px : sequence of float
-        Sides of features.
+    depths_mm, sides_px : sequence of float
+        Depths of planes, none if not known, and sides of features.
     blur_px : float, optional
         Standard deviation of the lens's blur.
     rose_k : float
         Standard deviations by which a visible feature stands out.
     exposures_s, grids, frames : sequence
-        Of the table: exposure times, rows and columns, and frames at a node; those of the rig.toml if empty.
+        Exposure times, rows and columns, and frames at a node of the table; those of the rig.toml if empty.
     sigma_e : float, optional
         Largest σ of a sample that is wanted, in electrons of a frame of the rig.toml.
     """
@@ -78,15 +80,15 @@ class Question:
     sigma_e: float | None
 
 
-def grids_of(words: Sequence[str]) -> list[tuple[int, int]]:
-    """Return rows and columns of words such as 5x7."""
-    found = []
-    for word in words:
-        parts = re.fullmatch(r"(\d{1,4})x(\d{1,4})", word)
-        if parts is None or min(int(part) for part in parts.groups()) < 1:
-            raise WrongUsage(f"--grids {word}: is no grid; give ROWSxCOLUMNS, such as 5x7")
-        found.append((int(parts[1]), int(parts[2])))
-    return found
+def parse_grids(texts: Sequence[str]) -> list[tuple[int, int]]:
+    """Return rows and columns of texts such as 5x7."""
+    grids = []
+    for text in texts:
+        match = re.fullmatch(r"([1-9]\d{0,3})x([1-9]\d{0,3})", text, re.ASCII)
+        if match is None:
+            raise WrongUsage(f"--grids {text}: is no grid; give ROWSxCOLUMNS, such as 5x7")
+        grids.append((int(match[1]), int(match[2])))
+    return grids
 
 
 def scene_view(settings: RigSettings, exposures_s: Sequence[float]) -> tuple[float, View]:
@@ -97,29 +99,20 @@ def scene_view(settings: RigSettings, exposures_s: Sequence[float]) -> tuple[flo
     WrongUsage
         The rig.toml has no dark scene, and no exposure is asked for.
     """
-    taken = [
+    frames_s = [
         exposure_s
         for step in settings.steps()
         if step.kind == "dark_scene"
         for exposure_s in step.exposure_s * step.frames_per_node
-    ]
-    if not taken and not exposures_s:
+    ] or exposures_s[:1]
+    if not frames_s:
         raise WrongUsage("the rig.toml has no dark_scene step; add one, or give --exposures-ms")
-    taken = taken or [exposures_s[0]]
-    return taken[0], View(sum(taken), len(taken))
+    return frames_s[0], View(sum(frames_s), len(frames_s))
 
 
 @dataclass(frozen=True)
 class Predictor:
-    """Predicts from what is known.
-
-    Attributes
-    ----------
-    settings, sensor, lens, pace, light
-        What is known of the rig and the scene; for the pace a reason if it is not known.
-    question : Question
-        What is asked for.
-    """
+    """Prediction from what is known of the rig and the scene; for the pace, a reason if it is not known."""
 
     settings: RigSettings
     sensor: Sensor
@@ -158,9 +151,7 @@ class Predictor:
             ),
             pixel_share=self.pixel_share,
             snr=self._snr(view),
-            snr_linear=_finite(
-                self._from_light(view, lambda light, _, noise: light / noise**2 if noise > 0 else math.inf)
-            ),
+            snr_linear=_finite(self._from_light(view, _snr_linear)),
             vignetting=None if self.lens.response is not None else "no flats in the noise calibration",
             rose_k=question.rose_k,
             depths=[self._depth(view, grid, depth_mm) for depth_mm in question.depths_mm or (None,)],
@@ -183,21 +174,13 @@ class Predictor:
         return _with(of_view, self.light.e_per_s, self.sensor.read_noise_e, self.sensor.dark_current_e_per_s)
 
     def _snr(self, view: View) -> Measured:
-        """Return eq. (4) of a view of a uniform object."""
-
-        def compute(light_e: float, dark_e: float, noise_e: float) -> float:
-            if dark_e == noise_e == 0:
-                return math.inf
-            return expected_snr_from_powers(np.array([light_e]), dark_e, noise_e)
-
-        return _finite(self._from_light(view, compute))
+        return _finite(self._from_light(view, _snr_by_powers))
 
     def _depth(self, view: View, grid: Grid, depth_mm: float | None) -> DepthPrediction:
-        """Return the prediction of a plane."""
         centres_mm, response = self._views(grid, depth_mm)
         depth = Measured(depth_mm) if depth_mm is not None else Measured(None, why=_NO_DEPTH)
         scale = _with(lambda z, f: z / f, depth, self.lens.f_px)
-        blur_px = self._blur()
+        blur = Measured(self.question.blur_px, why=_NO_BLUR if self.question.blur_px is None else None)
         aperture_mm = grid.pitch_mm * (max(grid.rows, grid.columns) - 1)
         step = Measured(None, why="one node has no aperture")
         if aperture_mm > 0:
@@ -208,68 +191,60 @@ class Predictor:
             seen_by_all_mm=self._seen_by_all_mm(grid, scale.value),
             sigma_e=self._sigma(view, response),
             mm_per_px=scale,
-            blur_mm=_with(lambda blur, mm: blur * mm, blur_px, scale),
+            blur_mm=_with(lambda blur, mm: blur * mm, blur, scale),
             depth_step_mm=step,
-            features=[
-                self._feature(view, centres_mm, response, side_px, depth, scale) for side_px in self.question.sides_px
-            ],
+            features=[self._feature(view, centres_mm, response, side_px, depth) for side_px in self.question.sides_px],
         )
 
     def _feature(
-        self,
-        view: View,
-        centres_mm: NDArray[np.float64],
-        response: NDArray[np.float64],
-        side_px: float,
-        depth: Measured,
-        scale: Measured,
+        self, view: View, centres_mm: Array, response: Array, side_px: float, depth: Measured
     ) -> FeaturePrediction:
-        """Return what is predicted of a square."""
-        blur_px = self.question.blur_px or 0.0
         contrast = self._contrast(view, response, side_px)
-
-        def depth_sigma(light_e: float, dark_e: float, noise_e: float) -> float:
-            information = self.pixel_share * information_of_views(light_e, dark_e, noise_e, response)
-            black = {"side_px": side_px, "difference_e": light_e, "blur_px": blur_px}
-            return depth_sigma_mm(depth.value or 0.0, self.lens.f_px.value or 0.0, centres_mm, information, **black)
-
         unknown = next((quantity for quantity in (depth, self.lens.f_px) if quantity.value is None), None)
         if unknown is None and len(np.unique(centres_mm[response > 0], axis=0)) < 2:
             unknown = Measured(None, why="one view tells no depth")
         if unknown is None and contrast.value is not None and contrast.value > 1:
             unknown = Measured(None, why="even a black square is not visible")
+
+        def depth_sigma(light_e: float, information: Array) -> float:
+            black = {"side_px": side_px, "difference_e": light_e, "blur_px": self.question.blur_px or 0.0}
+            return depth_sigma_mm(depth.value or 0.0, self.lens.f_px.value or 0.0, centres_mm, information, **black)
+
         return FeaturePrediction(
             side_px=side_px,
-            side_mm=_with(lambda mm: side_px * mm, scale),
+            side_mm=_with(lambda z, f: side_px * (z / f), depth, self.lens.f_px),
             smallest_contrast=contrast,
-            depth_sigma_mm=unknown or self._from_light(view, depth_sigma),
+            depth_sigma_mm=unknown or self._from_information(view, response, depth_sigma),
         )
 
-    def _contrast(self, view: View, response: NDArray[np.float64], side_px: float) -> Measured:
+    def _contrast(self, view: View, response: Array, side_px: float) -> Measured:
         """Return the contrast from which a square is visible."""
         k, blur_px = self.question.rose_k, self.question.blur_px or 0.0
 
-        def compute(light_e: float, dark_e: float, noise_e: float) -> float:
-            information = self._information(light_e, dark_e, noise_e, response)
-            return smallest_contrast(side_px, light_e, information, k=k, blur_px=blur_px)
+        def contrast(light_e: float, information: Array) -> float:
+            return smallest_contrast(side_px, light_e, float(information.sum()), k=k, blur_px=blur_px)
 
-        return self._from_light(view, compute)
+        return self._from_information(view, response, contrast)
 
-    def _sigma(self, view: View, response: NDArray[np.float64], exposure_s: float | None = None) -> Measured:
+    def _sigma(self, view: View, response: Array, exposure_s: float | None = None) -> Measured:
         """Return σ of a sample in electrons of a view, or of an exposure."""
         count = int(np.count_nonzero(response))
         unit = 1.0 if exposure_s is None else exposure_s / view.exposure_s
 
-        def compute(light_e: float, dark_e: float, noise_e: float) -> float:
-            return unit * sample_sigma_e(self._information(light_e, dark_e, noise_e, response), count)
+        def sigma(_: float, information: Array) -> float:
+            return unit * sample_sigma_e(float(information.sum()), count)
 
-        return self._from_light(view, compute)
+        return self._from_information(view, response, sigma)
 
-    def _information(self, light_e: float, dark_e: float, noise_e: float, response: NDArray[np.float64]) -> float:
-        """Return the information of all views about a sample."""
-        return self.pixel_share * float(information_of_views(light_e, dark_e, noise_e, response).sum())
+    def _from_information(self, view: View, response: Array, compute: Callable[[float, Array], float]) -> Measured:
+        """Return a number computed from the light in electrons and the information of each view about a sample."""
 
-    def _views(self, grid: Grid, depth_mm: float | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        def of_view(light_e: float, dark_e: float, noise_e: float) -> float:
+            return compute(light_e, self.pixel_share * information_of_views(light_e, dark_e, noise_e, response))
+
+        return self._from_light(view, of_view)
+
+    def _views(self, grid: Grid, depth_mm: float | None) -> tuple[Array, Array]:
         """Return the cameras' places (view, 2) relative to the reference camera, and the response of each view."""
         nodes = np.array(grid_nodes(grid.rows, grid.columns)) - centre_node(grid.rows, grid.columns)
         centres_mm = grid.pitch_mm * nodes[:, ::-1].astype(float)
@@ -284,14 +259,7 @@ class Predictor:
         high = height * mm_per_px - (grid.rows - 1) * grid.pitch_mm
         return max(wide, 0.0), max(high, 0.0)
 
-    def _blur(self) -> Measured:
-        """Return the lens's blur in pixels."""
-        if self.question.blur_px is not None:
-            return Measured(self.question.blur_px)
-        return Measured(None, why="nothing measures the lens's blur, none is assumed; --blur-px states it")
-
     def _alternatives(self, exposure_s: float, view: View) -> list[Alternative]:
-        """Return the rows of the table."""
         question, grid = self.question, self.settings.grid
         exposures_s = question.exposures_s or (exposure_s,)
         grids = question.grids or ((grid.rows, grid.columns),)
@@ -302,7 +270,6 @@ class Predictor:
         return [self._alternative(*row, exposure_s) for row in product(grids, exposures_s, frames)]
 
     def _alternative(self, shape: tuple[int, int], exposure_s: float, frames: int, reference_s: float) -> Alternative:
-        """Return a row of the table."""
         if not 0 < exposure_s <= MAX_EXPOSURE_S:
             raise WrongUsage(
                 f"--exposures-ms {1e3 * exposure_s:g}: an exposure lasts {1e3 * MAX_EXPOSURE_S:g} ms at most; give "
@@ -333,25 +300,29 @@ class Predictor:
     def _duration(
         self, grid: Grid, exposure_s: float | None, frames: int | None
     ) -> tuple[Measured, Measured, str | None]:
-        """Return the duration of the session and of its dark scene, and why it cannot be done."""
-        pace = self.pace
-        plan = plan_over(self.settings, grid, exposure_s, frames)
+        """Return the duration of the session and of its dark scene, and why it cannot be done.
+
+        Exposure and frames at a node are those of the dark scene; by default those of the rig.toml.
+        """
+        settings, pace = self.settings, self.pace
+        changes = {"exposure_s": (exposure_s,), "frames_per_node": frames} if exposure_s is not None else {}
+        steps = [
+            # The noise reference must be exposed like the dark scene
+            msgspec.structs.replace(step, **changes) if step.kind in ("dark_scene", "noise_reference") else step
+            for step in settings.steps()
+        ]
+        plan = CapturePlan.of(grid, steps, approach_mm=settings.stage.approach_mm, frame_bytes=0)
         if isinstance(pace, str):
             unknown = Measured(None, why=pace)
             return unknown, unknown, None
-        plan = msgspec.structs.replace(plan, settle_s=self.settings.settle.wait_s, readout_s=pace.readout_s)
+        plan = msgspec.structs.replace(plan, settle_s=settings.settle.wait_s, readout_s=pace.readout_s)
         scene = msgspec.structs.replace(plan, steps=tuple(step for step in plan.steps if step.kind == "dark_scene"))
         whole, part = (Measured(schedule.duration_s(pace.motion, pace.feed_mm_per_s)) for schedule in (plan, scene))
-        return whole, part, _why_not(plan, pace)
-
-
-def _why_not(plan: CapturePlan, pace: KnownPace) -> str | None:
-    """Return why the stage cannot go along a plan's path."""
-    try:
-        pace.workspace.check_path(plan.path())
-    except (OutsideTravel, KeepOutCrossed) as failure:
-        return str(failure)
-    return None
+        try:
+            pace.workspace.check_path(plan.path())
+        except (OutsideTravel, KeepOutCrossed) as failure:
+            return whole, part, str(failure)
+        return whole, part, None
 
 
 def _about_the_centre(grid: Grid, shape: tuple[int, int]) -> Grid:
@@ -364,10 +335,20 @@ def _about_the_centre(grid: Grid, shape: tuple[int, int]) -> Grid:
 
 
 def _reaches(row: Alternative, sigma_e: float | None) -> bool:
-    """Return whether a row reaches a σ, as far as is known, and can be done in a known time."""
-    found = row.sigma_e.value
-    known = sigma_e is not None and found is not None and row.time_s.value is not None
-    return known and row.why_not is None and found <= sigma_e  # type: ignore[operator]
+    """Test that a row reaches a σ, as far as is known, and can be done in a known time."""
+    if sigma_e is None or row.sigma_e.value is None or row.time_s.value is None:
+        return False
+    return row.why_not is None and row.sigma_e.value <= sigma_e
+
+
+def _snr_by_powers(light_e: float, dark_e: float, noise_e: float) -> float:
+    """Return eq. (4) of a view of a uniform object."""
+    return math.inf if dark_e == noise_e == 0 else expected_snr_from_powers(np.array([light_e]), dark_e, noise_e)
+
+
+def _snr_linear(light_e: float, _: float, noise_e: float) -> float:
+    """Return eq. (7) of a view of a uniform object."""
+    return light_e / noise_e**2 if noise_e > 0 else math.inf
 
 
 def _finite(snr: Measured) -> Measured:
@@ -375,12 +356,12 @@ def _finite(snr: Measured) -> Measured:
     return Measured(None, why="there is no noise to compare with") if snr.value == math.inf else snr
 
 
-def _with(compute: Callable[..., float], first: Measured, *others: Measured) -> Measured:
+def _with(compute: Callable[..., float], first: Measured, *further: Measured) -> Measured:
     """Return a number computed from others, with the interval that the first one's gives it; unknown if any is."""
-    for estimate in (first, *others):
+    for estimate in (first, *further):
         if estimate.value is None:
             return estimate
-    rest = [estimate.value for estimate in others]
+    rest = [estimate.value for estimate in further]
     value = compute(first.value, *rest)
     if first.ci95 is None:
         return Measured(value)

@@ -10,9 +10,9 @@ import time
 import urllib.parse
 from collections.abc import Callable
 from contextlib import ExitStack
+from multiprocessing import Pipe
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 import tifffile
@@ -23,10 +23,9 @@ from faintfield.pipelines import cli
 from faintfield.pipelines.formats.results.geometry import LensRecord
 from faintfield.pipelines.live.capture_page import serve_page
 from faintfield.pipelines.live.guided import read_pixels
-from faintfield.pipelines.live.panel import CapturePanel
+from faintfield.pipelines.live.panel import CapturePanel, SessionFrames
 from faintfield.pipelines.live.planes_client import PlanesClient, live_planes
 from faintfield.pipelines.live.planes_messages import LiveOrder, LiveStatus
-from faintfield.pipelines.live.taken import TakenFrames
 from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.capture.loop import Capture
 from faintfield.rig.devices import open_rig
@@ -75,8 +74,8 @@ class Running:
         known = folder / "known"
         if calibrated:
             write_calibrations(known, self.settings)
-        place = str(known) if calibrated else None
-        self._order = LiveOrder("", str(self.folder), str(folder / "rig.toml"), _DEPTHS_MM, place, place)
+        place = known if calibrated else None
+        self._order = LiveOrder(self.folder, folder / "rig.toml", _DEPTHS_MM, place, place)
         self._panel = CapturePanel(unattended=True)
         self._may_take = 0
         self._allowed = threading.Condition()
@@ -97,7 +96,7 @@ class Running:
         self._thread = threading.Thread(target=capture, daemon=True)
         self._thread.start()
         assert begun.wait(HANG_S)
-        self.taken = TakenFrames(opened[0])
+        self.taken = SessionFrames(opened[0])
         client = self._stack.enter_context(live_planes(self._order, self.taken.of_dark_scene))
         assert client is not None
         self.client: PlanesClient = client
@@ -204,13 +203,10 @@ def content(session: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in session.rglob("*") if path.is_file() and path.name not in left_out}
 
 
-def wait_for(client: PlanesClient, holds: Callable[[LiveStatus], bool]) -> LiveStatus:
+def wait_for(client: PlanesClient, holds: Callable[[LiveStatus], bool]) -> None:
     """Wait until the process of live planes says what is wanted."""
-    while True:
-        assert client.ended() is None
-        status = client.status()
-        if status is not None and holds(status):
-            return status
+    while client.status is None or not holds(client.status):
+        assert client.failure() is None
         time.sleep(_POLL_S)
 
 
@@ -223,9 +219,9 @@ def test_end_of_live_planes_leaves_session_alone(tmp_path: Path, number: signal.
         check_access(running.address)
         os.kill(running.client.pid, number)
         if number == signal.SIGKILL:
-            while running.client.ended() is None:
+            while running.client.failure() is None:
                 time.sleep(_POLL_S)
-            assert running.client.ended() == "live planes ended (by signal SIGKILL); the capture goes on without them"
+            assert running.client.failure() == "live planes ended (by signal SIGKILL); the capture goes on without them"
         running.end()
     verdict = verify(running.folder)
     assert (verdict.problems, verdict.present, verdict.sealed) == ((), 4, True)
@@ -249,20 +245,14 @@ def check_access(address: str) -> None:
 
 @pytest.mark.deep
 def test_process_of_planes_ends_with_killed_capture(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    out.mkdir()
-    order = LiveOrder(str(out), str(tmp_path), str(tmp_path / "rig.toml"), (500.0,))
-    command = [sys.executable, "-m", "faintfield.pipelines.live.planes_process"]
-    with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
-        assert process.stdin is not None
-        process.stdin.write(msgspec.json.encode(order) + b"\n")
-        process.stdin.flush()
-        while not (out / "status.json").exists():
-            assert process.poll() is None
-            time.sleep(_POLL_S)
-        process.stdin.close()
+    line, end = Pipe()
+    command = [sys.executable, "-m", "faintfield.pipelines.live.planes_process", str(end.fileno())]
+    with subprocess.Popen(command, pass_fds=[end.fileno()]) as process, line:
+        end.close()
+        line.send(LiveOrder(tmp_path, tmp_path / "rig.toml", (500.0,)))
+        assert line.recv().doing == "waiting for frames of the dark scene"
+        line.close()
         assert process.wait(HANG_S) == 0
-    assert not out.exists()
 
 
 def test_capture_goes_on_without_live_planes(

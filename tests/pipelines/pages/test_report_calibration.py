@@ -19,7 +19,7 @@ from faintfield.pipelines.formats.results.geometry import GeometryRecord
 from faintfield.pipelines.formats.results.overview import Overview
 from faintfield.pipelines.pages.geometry_page import holdout_rows
 from faintfield.pipelines.pages.report import write_report
-from faintfield.pipelines.pages.report_calibration import find_beside
+from faintfield.pipelines.pages.report_calibration import find_calibration
 from faintfield.pipelines.pages.report_sets import photon_budget
 from tests.pipelines.by_hand import write_by_hand
 from tests.pipelines.conftest import Command, assert_refused, run_undrawn
@@ -112,7 +112,7 @@ def test_pages_show_link_and_compare_calibrations(session: Path, done: Command) 
 
 def test_calibrations_can_be_named(drawn: Path, session: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(drawn, tmp_path / "elsewhere" / "a" / "b" / "c"))
-    assert find_beside(folder, "noise.json") is None
+    assert find_calibration(folder, "noise.json") is None
     text = write_report(folder, noise=session / "noise.json").read_text()
     assert 'id="noise"' in text
     assert 'id="geometry"' not in text

@@ -75,7 +75,8 @@ def _plane(folder: Path, method: Method, depth_mm: float, pixels: NDArray[np.flo
 def _pictures(planes: list[Plane]) -> list[ViewerPicture]:
     shown = viewer_of(planes, PlaneSections(white=1.0), None)
     assert shown is not None
-    return shown["pictures"]
+    pictures: list[ViewerPicture] = shown["pictures"]
+    return pictures
 
 
 def test_small_plane_is_fine_and_large_one_binned(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Planes of the views so far: back-projections that each frame is added to at once, and PMLEM in what time is left."""
+"""Planes of the frames so far: back-projections that each frame is added to at once, and PMLEM in the time left."""
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -49,14 +49,7 @@ class _Refined(NamedTuple):
 class CompleteViews:
     """Images of the nodes that have all of their frames, one after another in memory, which solvers read as they are.
 
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns of an image.
-    nodes : int
-        Number of nodes; memory is taken as they are complete.
-    frames_per_view : int
-        Number of frames that a node has when it is complete.
+    Memory is taken as nodes are complete.
     """
 
     def __init__(self, shape: tuple[int, int], nodes: int, frames_per_view: int) -> None:
@@ -103,17 +96,8 @@ class _Frame:
     share: float
 
 
-class PlanesSoFar:
-    """Planes at some depths, from the frames that are there.
-
-    Parameters
-    ----------
-    scene : LiveScene
-        The views, and what is known of them.
-    folder : Path
-        Where the frames' files are.
-    depths_mm : sequence of float
-        Depths of the planes.
+class PlaneAccumulator:
+    """Planes of a scene at some depths, from the frames in a folder that are there.
 
     Attributes
     ----------
@@ -158,9 +142,9 @@ class PlanesSoFar:
         """
         read, pixels = self._read(frame)
         for index in planes_in_order:
-            self._latest[index] = self._seen(index, read)
-            if (seen := self._latest[index]) is not None:
-                self._running[index].add(seen, _half(frame))
+            self._latest[index] = view = self._project(index, read)
+            if view is not None:
+                self._running[index].add(view, _half(frame))
         if self._complete is not None:
             self._complete.add(read.view, read.images)
         self.frames[frame.intent] = frame
@@ -171,13 +155,12 @@ class PlanesSoFar:
         del self.frames[frame.intent]
         read, _ = self._read(frame)
         for index, running in enumerate(self._running):
-            if (seen := self._seen(index, read)) is not None:
-                running.remove(seen, _half(frame))
+            if (view := self._project(index, read)) is not None:
+                running.remove(view, _half(frame))
         if self._complete is not None:
             self._complete.drop(read.view)
-            for other in self.frames.values():
-                if other.node == frame.node:
-                    self._complete.add(read.view, self._read(other)[0].images)
+            for same_node in [kept for kept in self.frames.values() if kept.node == frame.node]:
+                self._complete.add(read.view, self._read(same_node)[0].images)
 
     def picture(self, index: int, kind: PictureKind) -> tuple[Image, NDArray[np.bool_], int] | None:
         """Return a plane (row, column) in electrons per pixel, where it is covered, and from how many nodes."""
@@ -194,8 +177,8 @@ class PlanesSoFar:
 
     def focus(self, index: int) -> FocusMeasure:
         """Return the power of detail that the two halves of the views agree on, in electrons per pixel, squared."""
-        found, bins = self._running[index].focus(), self.scene.bins
-        return FocusMeasure(found.detail_e2 / bins**4, found.sigma_e2 / bins**4)
+        measure, bins = self._running[index].focus(), self.scene.bins
+        return FocusMeasure(measure.detail_e2 / bins**4, measure.sigma_e2 / bins**4)
 
     def is_refined(self, index: int) -> bool:
         """Return whether PMLEM has reached the optimum of the nodes that are complete."""
@@ -211,7 +194,11 @@ class PlanesSoFar:
         """
         assert self._complete is not None
         views = tuple(self._complete.views)
-        images = self._complete.images(*self._known())
+        elemental_set, bins = self.scene.elemental_set, self.scene.bins
+        images = self._complete.images(
+            _binned_sum(elemental_set.background_e(self._noise), bins),
+            _binned_sum(elemental_set.read_variance_e2(self._noise), bins),
+        )
         operator = self._factory.of_views(self._depths_mm[index], self._grids[index], views, images.valid)
         objective = Objective.of(SceneProblem(operator, images), Settings())
         weight = universal_penalty_weight(operator, objective.posed.images, objective.start)
@@ -228,8 +215,8 @@ class PlanesSoFar:
                 if done or interrupted():
                     return
 
-    def _seen(self, index: int, read: _Frame) -> SeenByView | None:
-        """Return what a frame says of a plane, None if its view does not see the plane."""
+    def _project(self, index: int, read: _Frame) -> SeenByView | None:
+        """Back-project a frame to a plane; None if its view does not see the plane."""
         try:
             operator = self._factory.of_views(
                 self._depths_mm[index], self._grids[index], [read.view], read.images.valid
@@ -251,20 +238,14 @@ class PlanesSoFar:
         view = self.scene.view_of[frame.node]
         return _Frame(view, images.binned(self.scene.bins), frame.exposure_s / total_s), electrons
 
-    def _known(self) -> tuple[float | Image, float | Image]:
-        """Return background and read variance of a bin of a complete view."""
-        elemental_set, noise = self.scene.elemental_set, self._noise
-        background_e, variance_e2 = elemental_set.background_e(noise), elemental_set.read_variance_e2(noise)
-        return _binned_sum(background_e, self.scene.bins), _binned_sum(variance_e2, self.scene.bins)
-
 
 def _binned_sum(value: float | NDArray[np.floating], bins: int) -> float | Image:
-    """Return a number per pixel, or a map of them, as sums over bins."""
+    """Return a number per pixel, or a map of numbers, as sums over bins."""
     if np.ndim(value) == 0:
         return float(value) * bins**2
     return np.asarray(binned(np.asarray(value), bins) * bins**2, np.float32)
 
 
 def _half(frame: LiveFrame) -> int:
-    """Return which half of the views a node belongs to: those of a checkerboard."""
+    """Return the half of the views that a node belongs to: a colour of the checkerboard."""
     return sum(frame.node) % 2
