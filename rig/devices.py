@@ -32,7 +32,8 @@ from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.grblhal import SimulatedGrblHal
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.simulation.lab import SimulatedCamera, SimulatedLab
-from faintfield.rig.stages.gantry import Gantry, make_stage
+from faintfield.rig.stages.drivers import make_stage
+from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.micromanager import MicroManagerController, MicroManagerStage
 from faintfield.rig.stages.protocol import SERIAL_PROTOCOLS, StageSettings
 from faintfield.rig.stages.protocol import SIMULATED as SIMULATED  # commands take it from here

@@ -7,16 +7,13 @@ axes restores trust.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 from faintfield.rig.clock import Clock
 from faintfield.rig.errors import NotHomed, OutsideTravel, PositionLost, StageError, StageLost
-from faintfield.rig.stages.grbl.controller import GrblController
-from faintfield.rig.stages.marlin.controller import MarlinController
 from faintfield.rig.stages.motion import StageWorkspace, duration_s, one_sided_path, path_duration_s
 from faintfield.rig.stages.protocol import AxisIndex, Box, Controller, Homing, Identity, Point, Position, StageSettings
-from faintfield.rig.stages.transport import LineTransport, Port, TrafficLog
 
 # Longest jog without homing, in mm: enough to see which way an axis moves, too short to do damage.
 _MAX_UNHOMED_JOG_MM = 10.0
@@ -270,13 +267,3 @@ class Gantry:
         except BaseException:
             self.trusted &= self._controller.abort()
             raise
-
-
-def make_stage(
-    settings: StageSettings, clock: Clock, traffic: TrafficLog | None, open_port: Callable[[], Port]
-) -> Gantry:
-    """Return the GRBL or Marlin stage that `settings` describe, not yet connected; `open_port` opens its connection."""
-    line = LineTransport(open_port, clock, traffic)
-    if settings.protocol == "grbl":
-        return Gantry(GrblController(line, settings.axes), settings, clock)
-    return Gantry(MarlinController(line, settings.axes, settings.travel_mm), settings, clock)

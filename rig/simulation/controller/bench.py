@@ -10,7 +10,8 @@ from typing import Protocol
 from faintfield.rig.errors import StageLost
 from faintfield.rig.simulation.controller.firmware import SimulatedFirmware
 from faintfield.rig.simulation.controller.wire import SimulatedClock, Wire
-from faintfield.rig.stages.gantry import Gantry, make_stage
+from faintfield.rig.stages.drivers import make_stage
+from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.protocol import Point, StageSettings
 from faintfield.rig.stages.transport import Port, SerialPort, TrafficLog
 
