@@ -45,7 +45,6 @@ _AGREE, _SQUARE = 0.35, 0.08
 # Standard errors from which the occlusion test decides, and from which it casts doubt on what signs say.
 _SURE_SIDE, _DOUBT = 4.0, 2.5
 
-type FailureReason = Literal["small", "single", "even", "apart", "dark"]
 type DirectionSource = Literal["pictures", "signs", "names"]
 
 
@@ -82,7 +81,7 @@ class GridInspection:
     """
 
     orientation: Orientation
-    failure: FailureReason | None = None
+    failure: Literal["small", "single", "even", "apart", "dark"] | None = None
     axes: Axes = field(default_factory=Axes)
     side_z: float = 0.0
     direction: DirectionSource = "names"

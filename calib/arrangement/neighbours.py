@@ -84,11 +84,13 @@ def compare_neighbours(pictures: Mapping[Node, Picture], range_px: tuple[float, 
     pairs = []
     for node, view in pictures.items():
         for axis, unit in ((0, 1.0), (1, 1.0 / ratio)):
-            candidates = ((steps, neighbour(node, 1 - axis, steps)) for steps in range(1, _MOST_STEPS + 1))
-            steps, other = next((pair for pair in candidates if pair[1] in pictures), (0, node))
-            fit = compare_pair(view, pictures[other], axis, (steps * unit * range_px[0], steps * unit * range_px[1]))
-            if steps and fit is not None:
-                pairs.append((places[node], places[other], axis, *fit))
+            for steps in range(1, _MOST_STEPS + 1):
+                other = neighbour(node, 1 - axis, steps)
+                if other in pictures:
+                    limits_px = steps * unit * range_px[0], steps * unit * range_px[1]
+                    fit = compare_pair(view, pictures[other], axis, limits_px)
+                    pairs += [(places[node], places[other], axis, *fit)] if fit is not None else []
+                    break
     table = np.array(pairs).reshape(-1, 3 + len(PairFit._fields))
     good, odd = _find_odd(len(pictures), table)
     _, _, axes, _, _, offset_px, turn_rad, magnification = table.T

@@ -8,14 +8,11 @@ import numpy as np
 
 from faintfield.pipelines.errors import BadValue
 
-# Digits of the largest row, column or running number: times and serial numbers have more.
-_MAX_DIGITS = 9
+# Largest row, column, running number or position: times and serial numbers are larger.
+_MAX_NUMBER = 1e9
 
 # Digits up to which a constant number before the one that varies may be the row of a grid of one row.
 _ROW_DIGITS = 2
-
-# Largest position in a name, in any unit.
-_MAX_POSITION = 1e9
 
 _WHOLE, _DECIMAL = r"[0-9]+", r"[-+]?[0-9]+\.[0-9]+(?:[eE][-+]?[0-9]+)?"
 _NUMBER = r"[-+]?[0-9]+(?:\.[0-9]*)?(?:[eE][-+]?[0-9]+)?"
@@ -165,14 +162,9 @@ def _places(names: Sequence[str], texts: Sequence[dict[str, str]]) -> Places:
     """Return the numbers of all names by field; refuse those that are too large."""
     for name, fields in zip(names, texts, strict=True):
         for field, text in fields.items():
-            if _FIELDS[field] == _WHOLE and len(text) > _MAX_DIGITS:
+            if not abs(float(text)) < _MAX_NUMBER:
                 raise BadValue(
-                    f"{name}: its name has a number of more than {_MAX_DIGITS} digits, which is no {field}; "
-                    "give --rows and --columns to take files in order"
-                )
-            if not abs(float(text)) <= _MAX_POSITION:
-                raise BadValue(
-                    f"{name}: its position {text} is beyond {_MAX_POSITION:g}; correct the name, or leave the position "
-                    "out of --pattern"
+                    f"{name}: its name has the number {text}, beyond {_MAX_NUMBER:g}, for {field}; correct it, give "
+                    "--rows and --columns to take files in order, or --pattern without it"
                 )
     return {field: [float(fields[field]) for fields in texts] for field in texts[0]}

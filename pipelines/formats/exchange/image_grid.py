@@ -1,6 +1,7 @@
 """Pictures taken on a regular grid, by the places that names state or by their order."""
 
 import math
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -154,7 +155,10 @@ def find_grid(
     try:
         places = places_by_habit(names) if pattern is None else places_by_pattern(pattern, names)
         nodes, remark = nodes_of(places, running)
-        _refuse_doubles(names, nodes)
+        double = Counter(nodes).most_common(1)[0][0]
+        alike = [name for name, node in zip(names, nodes, strict=True) if node == double]
+        if len(alike) > 1:
+            raise BadValue(f"{alike[1]}: is at node {double} like {alike[0]}; keep one of the two")
         nodes = _count_from_zero(nodes)
         positions = sorted(zip(nodes, places.get("x", []), places.get("y", []), strict=False))
         measured = measured_steps({node: (x, y) for node, x, y in positions}) if len(positions) > 1 else None
@@ -168,14 +172,6 @@ def find_grid(
     grid = ImageGrid(grid_paths, measured, remarks, ordered=by_index, guessed=by_index and running is None)
     _check_size(folder, grid, rows, columns)
     return grid
-
-
-def _refuse_doubles(names: Sequence[str], nodes: Sequence[Node]) -> None:
-    """Refuse two pictures at one node."""
-    first: dict[Node, str] = {}
-    for name, node in zip(names, nodes, strict=True):
-        if first.setdefault(node, name) != name:
-            raise BadValue(f"{name}: is at node {node} like {first[node]}; keep one of the two")
 
 
 def _count_from_zero(nodes: Sequence[Node]) -> list[Node]:
