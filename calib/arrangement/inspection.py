@@ -43,7 +43,7 @@ _NO_SIGN_PX = 0.25
 _AGREE, _SQUARE = 0.35, 0.08
 
 # Standard errors from which the occlusion test decides, and from which it casts doubt on what signs say.
-_SURE_SIDE, _DOUBT = 4.0, 2.5
+_MIN_SIDE_Z, _DOUBTFUL_SIDE_Z = 4.0, 2.5
 
 type DirectionSource = Literal["pictures", "signs", "names"]
 
@@ -179,7 +179,7 @@ def inspect_grid(
         undecided=undecided,
         contradicted=prescribed is not None
         and (
-            side_z < -_SURE_SIDE
+            side_z < -_MIN_SIDE_Z
             or (axes.transposed_z > SURE and axes.transposed != prescribed.transpose)
             or (axes.opposed_z > SURE and axes.opposed != prescribed.opposed)
         ),
@@ -251,11 +251,11 @@ def _direction(
 ) -> tuple[bool, DirectionSource, bool]:
     """Return whether to turn the orientation, what tells so, and whether both are equally likely."""
     least_px, largest_px = range_px
-    if abs(side_z) >= _SURE_SIDE:
+    if abs(side_z) >= _MIN_SIDE_Z:
         return side_z < 0, "pictures", False
-    if largest_px < -no_sign_px and side_z > -_DOUBT:
+    if largest_px < -no_sign_px and side_z > -_DOUBTFUL_SIDE_Z:
         return False, "signs", False
-    if least_px > no_sign_px and opposed and side_z < _DOUBT:
+    if least_px > no_sign_px and opposed and side_z < _DOUBTFUL_SIDE_Z:
         return True, "signs", False
     # All points move with the camera: the order is reversed, or aligned on the nearest point; the names state neither
     return False, "names", opposed or least_px > no_sign_px or largest_px < -no_sign_px

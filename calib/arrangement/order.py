@@ -18,7 +18,7 @@ _VIEWS, _OTHERS, _EXCHANGES = 9, 12, 40
 
 # Scores of both halves of the blocks must agree by this correlation, in so many standard errors: then pictures, not
 # noise, make them differ.
-_REPEATS, _SURE = 0.6, 3.0
+_MIN_REPEATABILITY, _MIN_REPEATABILITY_Z = 0.6, 3.0
 
 # Share of the exchanges that must make the match worse, over that correlation: in light fields nearly all do unless
 # noise decides, in random order half of them.
@@ -91,7 +91,11 @@ def _repeatability(deviations: NDArray[np.float64], free: int) -> float:
     first, second = deviations.T
     power = float(np.sqrt((first**2).sum() * (second**2).sum()))
     correlation = min(float((first * second).sum()) / power, 1 - 1e-9) if power else 0.0
-    return correlation if correlation > _REPEATS and np.arctanh(correlation) * np.sqrt(free - 1) > _SURE else 0.0
+    return (
+        correlation
+        if correlation > _MIN_REPEATABILITY and np.arctanh(correlation) * np.sqrt(free - 1) > _MIN_REPEATABILITY_Z
+        else 0.0
+    )
 
 
 def _exchange(

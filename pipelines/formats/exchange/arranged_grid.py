@@ -28,10 +28,10 @@ _MAX_ODD_SHARE = 0.25
 
 # Rotation in degrees and magnification against the other views that planes cannot use, and those worth a word.
 _MAX_DEG, _MAX_SCALE = 5.0, 0.1
-_SAID_DEG, _SAID_SCALE = 0.3, 0.005
+_NOTABLE_DEG, _NOTABLE_SCALE = 0.3, 0.005
 
 # Spread of light between views, and displacement in px beyond what disparities explain, that are worth a word.
-_SAID_LIGHT, _SAID_PX = 0.1, 1.0
+_NOTABLE_LIGHT, _NOTABLE_PX = 0.1, 1.0
 
 # Share of other pictures that neighbours fit better than, from which no other order is tried in place of a square.
 _CERTAIN_SHARE = 0.95
@@ -113,7 +113,7 @@ def arrange_grid(
     orientation, fits = inspection.orientation, inspection.fits
     arranged = grid.moved(orientation.apply(nodes), transposed=orientation.transpose, omit=fits.odd)
     light = dict(zip(paths, pictures.relative_light.tolist(), strict=True))
-    uneven = inspection.failure is None and np.ptp(pictures.relative_light) > _SAID_LIGHT
+    uneven = inspection.failure is None and np.ptp(pictures.relative_light) > _NOTABLE_LIGHT
     least, largest = inspection.range_px
     record = Arrangement(
         disparity_range_px=None if inspection.failure else (round(least, 2), round(largest, 2)),
@@ -319,14 +319,14 @@ def _warnings(record: Arrangement, inspection: GridInspection, count: int) -> li
     if record.odd_views:
         lines.append(f"fit none of their neighbours, and are left out: {', '.join(record.odd_views)}")
     x_px, y_px = fits.shift_px[int(np.argmax(np.abs(fits.shift_px).max(axis=1)))]
-    if max(abs(x_px), abs(y_px)) > _SAID_PX:
+    if max(abs(x_px), abs(y_px)) > _NOTABLE_PX:
         lines.append(
             f"views are shifted against their neighbours, by up to ({x_px:.1f}, {y_px:.1f}) px: the camera was off the "
             "grid; planes are sharper with calibrated poses (import colmap)"
         )
-    if record.turn_deg > _SAID_DEG:
+    if record.turn_deg > _NOTABLE_DEG:
         lines.append(f"views are turned by up to {record.turn_deg:.2f}°; a grid's camera does not turn")
     magnification = float(np.abs(fits.magnification - 1).max())
-    if magnification > _SAID_SCALE:
+    if magnification > _NOTABLE_SCALE:
         lines.append(f"views are magnified by up to {100 * magnification:.1f} %")
     return lines

@@ -145,7 +145,7 @@ def find_grid(
         if len(paths) != rows * columns:
             raise MissingFile(
                 f"{folder}: holds {len(paths)} pictures, a grid of {rows} x {columns} needs {rows * columns}; "
-                "correct --rows and --columns, or add the missing ones" + "".join(f" ({said})" for said in remarks)
+                "correct --rows and --columns, or add the missing ones" + "".join(f" ({text})" for text in remarks)
             )
         return ImageGrid(dict(zip(grid_nodes(rows, columns), paths, strict=True)), remarks=remarks, ordered=True)
     if pattern is None and len(paths) == 1:
