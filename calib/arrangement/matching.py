@@ -2,52 +2,52 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.calib.arrangement.pictures import Node, Picture
+from faintfield.calib.arrangement.nodes import Node, neighbour
+from faintfield.calib.arrangement.pictures import Picture
+
+# Side of a block, px of the prepared pictures.
+_BLOCK_PX = 16
+
+# Quantile of chance above which a block's match is sure; its correlation must also be at least this.
+_CHANCE_QUANTILE, _LEAST_MATCH = 0.99, 0.3
+
+# Sure blocks that a range needs, and the quantiles of their disparities that it spans.
+MIN_BLOCKS = 12
+_SPAN = (0.005, 0.995)
 
 type Table = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
-class Tables:
+class Correlations:
     """Correlation of the blocks of several views with their neighbours.
 
     Attributes
     ----------
     shifts_px : array (shift,)
         Displacements from one node to the next, symmetric about zero.
-    along : dict of (number, axis) to array (view, block, shift)
-        `number` 0 or 1 tells which number of the names steps by one, `axis` 0 displacement along x, 1 along y.
+    along, chance : dict of (number, axis) to array (view, block, shift)
+        Correlation with the neighbours, and with neighbours turned by 180°. `number` 0 or 1 is the number of the names
+        that steps by one, `axis` 0 displacement along x, 1 along y. NaN for views without neighbours.
     """
 
     shifts_px: NDArray[np.floating]
     along: dict[tuple[int, int], Table]
-    blocks: tuple[int, int]
-
-    @property
-    def numbers(self) -> list[int]:
-        """The numbers along which there are neighbours."""
-        return sorted({number for number, _ in self.along})
-
-
-def neighbour(node: Node, number: int, steps: int) -> Node:
-    """Return the node some steps further along one of its numbers."""
-    return (node[0] + steps, node[1]) if number == 0 else (node[0], node[1] + steps)
+    chance: dict[tuple[int, int], Table]
 
 
 def correlate(
     pictures: Mapping[Node, Picture],
     nodes: Sequence[Node],
     shifts_px: NDArray[np.floating],
-    *,
     distance: int,
-    block_px: int,
-    turned: bool = False,
-) -> Tables:
+) -> Correlations:
     """Correlate the blocks of some views with the views `distance` nodes before and after them.
 
     Parameters
@@ -60,72 +60,94 @@ def correlate(
         Displacements from node to node, symmetric about zero; the view before shows the opposite ones.
     distance : int
         Nodes between the two views of a pair.
-    block_px : int
-        Side of a block.
-    turned : bool
-        Turn the other views by 180°, to see what agrees by chance.
     """
-    others = {node: np.ascontiguousarray(it[::-1, ::-1]) for node, it in pictures.items()} if turned else pictures
-    shape = next(iter(pictures.values())).shape
-    blocks = _blocks(shape, block_px)
-    along: dict[tuple[int, int], list[Table]] = {}
-    for number in (0, 1):
-        for axis in (0, 1):
-            rows = []
-            for node in nodes:
-                sides = [
-                    block_table(pictures[node], others[other], sign * distance * shifts_px, axis, block_px)
+    turned = {node: np.ascontiguousarray(picture[::-1, ::-1]) for node, picture in pictures.items()}
+    along: dict[tuple[int, int], Table] = {}
+    chance: dict[tuple[int, int], Table] = {}
+    for tables, candidates in ((along, pictures), (chance, turned)):
+        for number, axis in product((0, 1), repeat=2):
+            rows = [
+                [
+                    correlate_blocks(pictures[node], candidates[other], sign * distance * shifts_px, axis)
                     for sign in (1, -1)
                     if (other := neighbour(node, number, sign * distance)) in pictures
                 ]
-                empty = np.full((blocks[0] * blocks[1], len(shifts_px)), np.nan, np.float32)
-                rows.append(np.mean(sides, axis=0, dtype=np.float32) if sides else empty)
-            table = np.stack(rows)
-            if np.isfinite(table).any():
-                along[number, axis] = [table]
-    return Tables(shifts_px, {key: tables[0] for key, tables in along.items()}, blocks)
+                for node in nodes
+            ]
+            if any(rows):
+                empty = [np.full_like(next(filter(None, rows))[0], np.nan)]
+                tables[number, axis] = np.stack([np.mean(sides or empty, axis=0, dtype=np.float32) for sides in rows])
+    return Correlations(shifts_px, along, chance)
 
 
-def displaced(picture: Picture, x_px: float, y_px: float) -> Picture:
-    """Return a picture whose pixel p shows what the given one shows at p plus a displacement; 0 beyond its edge."""
-    if x_px == round(x_px) and y_px == round(y_px):
-        return _displaced_by_whole(picture, round(x_px), round(y_px))
-    matrix = np.array([[1, 0, x_px], [0, 1, y_px]], np.float64)
+def correlate_blocks(view: Picture, other: Picture, shifts_px: NDArray[np.floating], axis: int) -> NDArray[np.float32]:
+    """Return the correlation (block, shift) of the blocks of a view with another, displaced along an axis."""
+    blocks = max(view.shape[1] // _BLOCK_PX, 1), max(view.shape[0] // _BLOCK_PX, 1)
+    height, width = (min(count * _BLOCK_PX, side) for count, side in zip(blocks[::-1], view.shape, strict=True))
+
+    def means(picture: Picture) -> NDArray[np.float32]:
+        return np.asarray(cv2.resize(picture[:height, :width], blocks, interpolation=cv2.INTER_AREA)).ravel()
+
+    power = means(view * view)
+    columns = []
+    for shift_px in shifts_px:
+        moved = displace(other, shift_px, axis)
+        columns.append(means(view * moved) / np.sqrt(power * means(moved * moved) + 1e-4))
+    return np.stack(columns, axis=1)
+
+
+def displace(picture: Picture, shift_px: float, axis: int) -> Picture:
+    """Return a picture whose pixel p shows what the given one shows at p + shift along an axis; 0 beyond its edge."""
+    matrix = np.eye(2, 3)
+    matrix[axis, 2] = shift_px
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return np.asarray(cv2.warpAffine(picture, matrix, picture.shape[::-1], flags=flags), np.float32)
 
 
-def _displaced_by_whole(picture: Picture, x_px: int, y_px: int) -> Picture:
-    """Return a picture displaced by whole pixels, which needs no interpolation."""
-    height, width = picture.shape
-    moved = np.zeros_like(picture)
-    if abs(x_px) < width and abs(y_px) < height:
-        to = slice(max(-y_px, 0), height - max(y_px, 0)), slice(max(-x_px, 0), width - max(x_px, 0))
-        of = slice(max(y_px, 0), height - max(-y_px, 0)), slice(max(x_px, 0), width - max(-x_px, 0))
-        moved[to] = picture[of]
-    return moved
+def block_disparities(table: Table, chance: Table, shifts_px: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the disparity (view · block,) of each block, NaN where its match may be chance.
+
+    Parameters
+    ----------
+    table, chance : array (view, block, shift)
+        Correlation with the neighbours, and with neighbours turned by 180°; NaN where there are none.
+    shifts_px : array (shift,)
+        Disparities.
+    """
+    scores = table.reshape(-1, len(shifts_px))
+    by_chance = chance[np.isfinite(chance).all(axis=(1, 2))].max(axis=2)
+    disparities_px = np.full(len(scores), np.nan)
+    if not len(by_chance):
+        return disparities_px
+    # The median, since neighbours may really be turned
+    limit = max(float(np.median(np.quantile(by_chance, _CHANCE_QUANTILE, axis=1))), _LEAST_MATCH)
+    scores = np.where(np.isfinite(scores).all(axis=1, keepdims=True), scores, -1.0)
+    peak = np.argmax(scores, axis=1)
+    sure = np.flatnonzero((scores.max(axis=1) > limit) & (peak > 0) & (peak < len(shifts_px) - 1))
+    at = peak[sure]
+    offset = parabola_peak(scores[sure, at - 1], scores[sure, at], scores[sure, at + 1])
+    disparities_px[sure] = shifts_px[at] + offset * (shifts_px[1] - shifts_px[0])
+    return disparities_px
 
 
-def block_means(picture: Picture, blocks: tuple[int, int], block_px: int) -> NDArray[np.float32]:
-    """Return the means (block,) over the blocks of a picture, row by row."""
-    height, width = min(blocks[0] * block_px, picture.shape[0]), min(blocks[1] * block_px, picture.shape[1])
-    return np.asarray(
-        cv2.resize(picture[:height, :width], blocks[::-1], interpolation=cv2.INTER_AREA), np.float32
-    ).ravel()
+def disparity_range(table: Table, chance: Table, shifts_px: NDArray[np.floating]) -> tuple[float, float] | None:
+    """Return a robust least and largest disparity of the blocks that match beyond chance.
+
+    Where these are few, as in the dark: the least and largest at which all blocks together agree beyond chance; None if
+    there is none.
+    """
+    disparities_px = block_disparities(table, chance, shifts_px)
+    if np.isfinite(disparities_px).sum() >= MIN_BLOCKS:
+        least, largest = np.nanquantile(disparities_px, _SPAN)
+        return float(least), float(largest)
+    level, by_chance = (scores[np.isfinite(scores).all(axis=(1, 2))].mean(axis=(0, 1)) for scores in (table, chance))
+    above = np.flatnonzero(level > max(float(by_chance.max()), 0.25 * float(level.max())))
+    return (float(shifts_px[above[0]]), float(shifts_px[above[-1]])) if len(above) else None
 
 
-def _blocks(shape: tuple[int, ...], block_px: int) -> tuple[int, int]:
-    """Return how many blocks a picture has, down and across."""
-    return max(shape[0] // block_px, 1), max(shape[1] // block_px, 1)
-
-
-def block_table(view: Picture, other: Picture, shifts_px: NDArray[np.floating], axis: int, block_px: int) -> Table:
-    """Return the correlation (block, shift) of a view with another, displaced along an axis."""
-    blocks = _blocks(view.shape, block_px)
-    power = block_means(view * view, blocks, block_px)
-    columns = []
-    for shift_px in shifts_px:
-        moved = displaced(other, shift_px, 0.0) if axis == 0 else displaced(other, 0.0, shift_px)
-        both = block_means(view * moved, blocks, block_px)
-        columns.append(both / np.sqrt(power * block_means(moved * moved, blocks, block_px) + 1e-4))
-    return np.stack(columns, axis=1)
+def parabola_peak(
+    before: NDArray[np.floating], peak: NDArray[np.floating], after: NDArray[np.floating]
+) -> NDArray[np.float64]:
+    """Return the place, -0.5 … 0.5 from the middle one, of the peak of a parabola through three values."""
+    bend = np.minimum(before - 2 * peak + after, -1e-9)
+    return np.asarray(np.clip(0.5 * (before - after) / bend, -0.5, 0.5), np.float64)

@@ -7,14 +7,14 @@ would be blind less that in the other view. Noise and texture are in both, and l
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.calib.arrangement.matching import displaced
-from faintfield.calib.arrangement.pictures import Node, Picture
+from faintfield.calib.arrangement.matching import displace
+from faintfield.calib.arrangement.nodes import Node, neighbour
+from faintfield.calib.arrangement.pictures import Picture
 
 # Half of the window in px in which an edge is looked for, and on either side of which disparities are compared.
 _REACH_PX = 7
@@ -37,39 +37,24 @@ _TILE_PX, _LINE_PX, _MIN_EDGES = 32, 3, 3
 type Errors = NDArray[np.float32]
 
 
-@dataclass(frozen=True)
-class NearAndFar:
-    """The result of the test.
-
-    Attributes
-    ----------
-    z : float
-        Standard errors by which what is hidden lies where the disparity is larger, negative where it is smaller.
-    edges, tiles : int
-        Number of edges, and of the parts of the picture that count as samples.
-    """
-
-    z: float
-    edges: int
-    tiles: int
-
-
-def find_far_side(
+def far_side_z(
     pictures: Mapping[Node, Picture],
     nodes: Sequence[Node],
     shifts_px: NDArray[np.floating],
     *,
     distance: int,
     ratio: float,
-) -> NearAndFar:
+) -> float:
     """Test which sign of disparity is far.
+
+    Return the standard errors by which what is hidden lies where the disparity is larger, negative where it is smaller.
 
     Parameters
     ----------
     pictures : mapping of node to array (row, column)
         Views by row and column; disparities along x and y have one sign.
     nodes : sequence of (int, int)
-        Views whose edges are tested; each needs neighbours on both sides along a row, a column, or both.
+        Views whose edges are tested, if they have neighbours on both sides along a row, a column, or both.
     shifts_px : array (shift,)
         Disparities per node to compare, in ascending order.
     distance : int
@@ -77,141 +62,90 @@ def find_far_side(
     ratio : float
         Disparity along x over disparity along y.
     """
+    scales = (float(distance), distance / ratio)
     tiles: dict[tuple[int, int, int], list[tuple[float, float]]] = {}
     for node in nodes:
-        errors = _errors(pictures, node, shifts_px, distance, ratio)
+        errors = {}
+        for axis in (0, 1):
+            pair = [(sign, neighbour(node, 1 - axis, sign * distance)) for sign in (-1, 1)]
+            if all(other in pictures for _, other in pair):
+                errors[axis] = [
+                    _errors(pictures[node], pictures[other], sign * scales[axis] * shifts_px, axis)
+                    for sign, other in pair
+                ]
         if not errors:
             continue
-        best = _disparities(list(errors.values()))
-        for axis, (before, after) in errors.items():
-            scale = distance * (1.0 if axis == 0 else 1.0 / ratio)
-            if axis == 1:
-                before, after = before.transpose(0, 2, 1), after.transpose(0, 2, 1)
-            index = best if axis == 0 else best.T
-            for place, value, gain in _edges(before, after, index, scale * shifts_px):
-                tiles.setdefault((axis, *place), []).append((value, gain))
-    full = [np.array(values) for values in tiles.values() if len(values) >= _MIN_EDGES]
-    samples = np.array([np.average(values[:, 0], weights=values[:, 1]) for values in full])
-    edges = sum(map(len, tiles.values()))
+        best = _best_disparities(list(errors.values()))
+        for axis, sides in errors.items():
+            before, after = (side if axis == 0 else side.transpose(0, 2, 1) for side in sides)
+            edges = _edges(before, after, best if axis == 0 else best.T, scales[axis] * shifts_px)
+            for row, column, value, gain in edges:
+                tiles.setdefault((axis, int(row) // _TILE_PX, int(column) // _TILE_PX), []).append((value, gain))
+    full = [np.array(edges) for edges in tiles.values() if len(edges) >= _MIN_EDGES]
+    samples = np.array([np.average(values, weights=gains) for values, gains in (edges.T for edges in full)])
     if len(samples) < 4 or not samples.std():
-        return NearAndFar(0.0, edges, len(samples))
-    return NearAndFar(float(samples.mean() / samples.std(ddof=1) * np.sqrt(len(samples))), edges, len(samples))
+        return 0.0
+    return float(samples.mean() / samples.std(ddof=1) * np.sqrt(len(samples)))
 
 
-def _errors(
-    pictures: Mapping[Node, Picture], node: Node, shifts_px: NDArray[np.floating], distance: int, ratio: float
-) -> dict[int, tuple[Errors, Errors]]:
-    """Return the errors (shift, row, column) of the view before and the one after, for each axis that has both."""
-    row, column = node
-    sides = {
-        0: ((row, column - distance), (row, column + distance)),
-        1: ((row - distance, column), (row + distance, column)),
-    }
-    found = {}
-    for axis, pair in sides.items():
-        if not all(node in pictures for node in pair):
-            continue
-        scale = distance * (1.0 if axis == 0 else 1.0 / ratio)
-        both = []
-        for sign, other in zip((-1, 1), pair, strict=True):
-            layers = []
-            for shift_px in sign * scale * shifts_px:
-                moved = displaced(pictures[other], *((shift_px, 0.0) if axis == 0 else (0.0, shift_px)))
-                layers.append(np.minimum(np.abs(pictures[node] - moved), _LARGEST_ERROR))
-            both.append(np.stack(layers))
-        found[axis] = (both[0], both[1])
-    return found
+def _errors(view: Picture, other: Picture, shifts_px: NDArray[np.floating], axis: int) -> Errors:
+    """Return the errors (shift, row, column) of another view, displaced along an axis."""
+    return np.stack([np.minimum(np.abs(view - displace(other, shift, axis)), _LARGEST_ERROR) for shift in shifts_px])
 
 
-def _disparities(pairs: Sequence[tuple[Errors, Errors]]) -> NDArray[np.intp]:
+def _best_disparities(pairs: Sequence[list[Errors]]) -> NDArray[np.intp]:
     """Return the index (row, column) of each pixel's best disparity, by the better of the views on either side."""
-    total = sum(
-        np.stack(
-            [
-                np.minimum(*(cv2.blur(layer, (_WINDOW_PX, _WINDOW_PX)) for layer in layers))
-                for layers in zip(*pair, strict=True)
-            ]
-        )
-        for pair in pairs
-    )
+    total = sum(np.minimum(*(_blur(errors, _WINDOW_PX, _WINDOW_PX) for errors in pair)) for pair in pairs)
     index = np.argmin(np.asarray(total), axis=0)
     return np.asarray(cv2.medianBlur(index.astype(np.float32), 5), np.intp)
 
 
+def _blur(errors: Errors, width: int, height: int) -> Errors:
+    return np.stack([cv2.blur(layer, (width, height)) for layer in np.ascontiguousarray(errors)])
+
+
 def _edges(
     before: Errors, after: Errors, index: NDArray[np.intp], shifts_px: NDArray[np.floating]
-) -> list[tuple[tuple[int, int], float, float]]:
-    """Return tile, value and weight of each edge along the rows of a picture."""
+) -> NDArray[np.float64]:
+    """Return row, column, value and weight (edge, 4) of the edges along the rows of a picture.
+
+    The value is by how much more is hidden on the side of larger disparity. The weight is how clearly there is an edge:
+    the share by which two surfaces explain the window better than either of them alone.
+    """
     reach = _REACH_PX
     height, width = index.shape
     if width < 6 * reach or height < _ALONG_PX:
-        return []
+        return np.zeros((0, 4))
     moved_px = shifts_px[index]
     change = np.zeros((height, width))
-    change[:, reach:-reach] = moved_px[:, 2 * reach :] - moved_px[:, : -2 * reach]
-    size = np.abs(change)
-    steep = size >= cv2.dilate(size, np.ones((1, 2 * reach + 1))) - 1e-9
-    steep &= size >= _MIN_BAND_PX
+    change[:, reach:-reach] = np.abs(moved_px[:, 2 * reach :] - moved_px[:, : -2 * reach])
+    steep = (change >= cv2.dilate(change, np.ones((1, 2 * reach + 1))) - 1e-9) & (change >= _MIN_BAND_PX)
     steep[:, : 3 * reach] = steep[:, -3 * reach :] = False
     steep[np.arange(height) % _LINE_PX > 0] = False
     rows, columns = np.nonzero(steep)
-    values, gains = _values(before, after, index, shifts_px, rows, columns)
-    return [
-        ((int(row) // _TILE_PX, int(column) // _TILE_PX), float(value), float(gain))
-        for row, column, value, gain in zip(rows, columns, values, gains, strict=True)
-        if gain > _LEAST_GAIN
-    ]
-
-
-def _values(
-    before: Errors,
-    after: Errors,
-    index: NDArray[np.intp],
-    shifts_px: NDArray[np.floating],
-    rows: NDArray[np.intp],
-    columns: NDArray[np.intp],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return by how much more is hidden on the side of larger disparity, and how clearly there is an edge.
-
-    An edge is clear if two surfaces explain the window much better than either of them alone.
-    """
-    reach = _REACH_PX
-    offsets = np.arange(-2 * reach, 2 * reach + 1)
     left, right = index[rows, columns - reach], index[rows, columns + reach]
-    blurred = [_along_edges(view) for view in (before, after)]
+    offsets = np.arange(-2 * reach, 2 * reach + 1)
     place = rows[:, np.newaxis], columns[:, np.newaxis] + offsets
     # Errors (edge, offset) if all of the window had the left disparity, or all of it the right one
-    by_left = [view[left[:, np.newaxis], *place] for view in blurred]
-    by_right = [view[right[:, np.newaxis], *place] for view in blurred]
-    split, gain = _split(np.minimum(*by_left), np.minimum(*by_right))
-    sign = np.sign(shifts_px[right] - shifts_px[left])[:, np.newaxis]
-    band_px = np.clip(np.abs(shifts_px[right] - shifts_px[left]), 1, _MAX_BAND_PX).round()[:, np.newaxis]
-    from_split = offsets - offsets[split][:, np.newaxis]
-    on_right = (from_split >= 0) & (from_split < band_px)
-    on_left = (from_split < 0) & (from_split >= -band_px)
-    hidden_right = _mean_where(on_right, sign * (by_right[0] - by_right[1]))
-    hidden_left = _mean_where(on_left, sign * (by_left[0] - by_left[1]))
-    return sign[:, 0] * (hidden_right - hidden_left), gain
-
-
-def _along_edges(errors: Errors) -> Errors:
-    """Return errors averaged over a few pixels down the columns."""
-    return np.stack([cv2.blur(layer, (1, _ALONG_PX)) for layer in np.ascontiguousarray(errors)])
-
-
-def _split(by_left: NDArray[np.float32], by_right: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Return the offset's index (edge,) at which the right surface begins: the least error of both sides together.
-
-    Also return by which share that error is less than one surface's.
-    """
-    first = np.cumsum(by_left, axis=1) - by_left
-    rest = np.cumsum(by_right[:, ::-1], axis=1)[:, ::-1]
-    total = (first + rest)[:, _REACH_PX:-_REACH_PX]
-    alone = np.minimum(by_left.sum(axis=1), by_right.sum(axis=1))
+    views = [_blur(view, 1, _ALONG_PX) for view in (before, after)]
+    by_left, by_right = ([view[side[:, np.newaxis], *place] for view in views] for side in (left, right))
+    # The right surface begins at the offset where the errors of both surfaces together are least
+    left_error, right_error = np.minimum(*by_left), np.minimum(*by_right)
+    before_split = np.cumsum(left_error, axis=1) - left_error
+    total = (before_split + np.cumsum(right_error[:, ::-1], axis=1)[:, ::-1])[:, reach:-reach]
+    split = offsets[np.argmin(total, axis=1) + reach]
+    alone = np.minimum(left_error.sum(axis=1), right_error.sum(axis=1))
     gain = 1 - total.min(axis=1) / np.maximum(alone, 1e-9)
-    return np.asarray(np.argmin(total, axis=1) + _REACH_PX, np.intp), np.asarray(gain, np.float64)
-
-
-def _mean_where(mask: NDArray[np.bool_], values: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the mean (edge,) over the offsets of a mask."""
-    return np.asarray((mask * values).sum(axis=1) / np.maximum(mask.sum(axis=1), 1), np.float64)
+    step_px = (shifts_px[right] - shifts_px[left])[:, np.newaxis]
+    band_px = np.clip(np.abs(step_px), 1, _MAX_BAND_PX).round()
+    from_split = offsets - split[:, np.newaxis]
+    hidden_right, hidden_left = (
+        (inside * (errors[0] - errors[1])).sum(axis=1) / np.maximum(inside.sum(axis=1), 1)
+        for inside, errors in (
+            ((from_split >= 0) & (from_split < band_px), by_right),
+            ((from_split < 0) & (from_split >= -band_px), by_left),
+        )
+    )
+    # Once for which of the views is blind, once for the side of larger disparity, the sign of the step cancels out
+    edges = np.column_stack([rows, columns, hidden_right - hidden_left, gain])
+    return np.asarray(edges[gain > _LEAST_GAIN], np.float64)

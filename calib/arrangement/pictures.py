@@ -1,20 +1,16 @@
-"""The pictures of a grid, prepared for matching: small, without their brightness, at two sizes."""
+"""Pictures of a grid prepared for matching: small, and without their brightness."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-type Node = tuple[int, int]
 type Picture = NDArray[np.float32]
 
 # Longest side of the pictures that are matched finely and coarsely, px.
 _FINE_PX, _COARSE_PX = 448, 144
-
-# Smallest side of pictures that can be matched, px.
-MIN_SIDE_PX = 32
 
 # σ in px of the smoothing of pictures, and of the brightness that is taken off: wider than texture, narrower than
 # shades of light.
@@ -28,18 +24,18 @@ _SIGMA_OF_MEDIAN = 1.4826
 
 
 @dataclass(frozen=True)
-class Views:
-    """Pictures by node, ready to be compared.
+class GridPictures:
+    """Pictures of the views, ready to be compared.
 
     Attributes
     ----------
-    fine, coarse : dict of node to float32 array (row, column)
+    fine, coarse : list of float32 array (row, column)
         Pictures without their local brightness, at two sizes.
-    light : dict of node to float32 array (row, column)
+    brightness : list of float32 array (row, column)
         The fine pictures with their brightness, over their mean, in units of their texture's standard deviation.
     fine_scale, coarse_scale : float
         Pixels of the files per pixel of these.
-    mean : dict of node to float
+    mean : array (view,)
         Mean of each picture in units of its file.
     contrast : float
         Median over the views of the standard deviation within a picture, smoothed, in units of the files.
@@ -47,84 +43,63 @@ class Views:
         Median over the views of the standard deviation of what the smoothing took off, beside edges.
     """
 
-    fine: dict[Node, Picture]
-    coarse: dict[Node, Picture]
-    light: dict[Node, Picture]
+    fine: list[Picture]
+    coarse: list[Picture]
+    brightness: list[Picture]
     fine_scale: float
     coarse_scale: float
-    mean: dict[Node, float]
+    mean: NDArray[np.float64]
     contrast: float
     noise: float
 
     @property
-    def nodes(self) -> list[Node]:
-        """Nodes in the order given."""
-        return list(self.fine)
+    def relative_light(self) -> NDArray[np.float64]:
+        """Mean of each picture (view,) over the median of all."""
+        return self.mean / (float(np.median(self.mean)) or 1.0)
+
+    def copies(self) -> list[tuple[int, int]]:
+        """Return pairs of views whose pictures are the same in every pixel, as noise rules out."""
+        first: dict[bytes, int] = {}
+        contents = [picture.tobytes() if np.ptp(picture) else None for picture in self.brightness]
+        return [
+            (first[content], index)
+            for index, content in enumerate(contents)
+            if content is not None and first.setdefault(content, index) != index
+        ]
 
 
-def prepare(nodes: Sequence[Node], read: Callable[[int], Picture]) -> Views:
-    """Read all pictures once and keep what matching needs.
-
-    Parameters
-    ----------
-    nodes : sequence of (int, int)
-        The two numbers of each view.
-    read : callable
-        Returns the grey picture (row, column) of a view by its place in `nodes`; all have one size.
-    """
-    fine, coarse, light, means, contrasts, noises = {}, {}, {}, {}, [], []
-    scales = (1.0, 1.0)
-    for index, node in enumerate(nodes):
-        picture = np.asarray(read(index), np.float32)
-        means[node] = float(picture.mean())
+def prepare_pictures(pictures: Iterable[Picture]) -> GridPictures:
+    """Keep what matching needs of grey pictures (row, column) of one size; each is used once."""
+    fine, coarse, brightness, means, contrasts, noises, textures = [], [], [], [], [], [], []
+    for picture in pictures:
+        means.append(float(picture.mean()))
         smooth = cv2.GaussianBlur(picture, (0, 0), _NOISE_PX)
         contrasts.append(float(smooth.std()))
         noises.append(_SIGMA_OF_MEDIAN * float(np.median(np.abs(picture - smooth))))
-        small = _shrunk(picture, _FINE_PX)
-        tiny = _shrunk(small, _COARSE_PX)
+        small = _shrink(picture, _FINE_PX)
+        tiny = _shrink(small, _COARSE_PX)
         scales = picture.shape[1] / small.shape[1], picture.shape[1] / tiny.shape[1]
-        fine[node], coarse[node] = _without_brightness(small), _without_brightness(tiny)
-        light[node] = small / np.float32(means[node] or 1.0)
-    texture = (
-        float(np.median([(view - cv2.GaussianBlur(view, (0, 0), _SHADES_PX)).std() for view in light.values()])) or 1.0
+        fine.append(_remove_brightness(small))
+        coarse.append(_remove_brightness(tiny))
+        brightness.append(small / np.float32(means[-1] or 1.0))
+        textures.append((brightness[-1] - cv2.GaussianBlur(brightness[-1], (0, 0), _SHADES_PX)).std())
+    texture = np.float32(np.median(textures) or 1.0)
+    brightness = [picture / texture for picture in brightness]
+    return GridPictures(
+        fine, coarse, brightness, *scales, np.array(means), float(np.median(contrasts)), float(np.median(noises))
     )
-    light = {node: view / np.float32(texture) for node, view in light.items()}
-    return Views(fine, coarse, light, *scales, means, float(np.median(contrasts)), float(np.median(noises)))
 
 
-def copies(views: Views) -> list[tuple[Node, Node]]:
-    """Return pairs of nodes whose pictures are the same in every pixel, as noise rules out."""
-    first: dict[bytes, Node] = {}
-    found = []
-    for node, picture in views.light.items():
-        content = np.ascontiguousarray(picture).tobytes()
-        if content in first and picture.std() > 0:
-            found.append((first[content], node))
-        first.setdefault(content, node)
-    return found
-
-
-def spread(nodes: Sequence[Node], count: int) -> list[Node]:
-    """Return at most `count` nodes, spread evenly over the list."""
-    if not nodes or count < 1:
-        return []
-    chosen = np.unique(np.linspace(0, len(nodes) - 1, min(count, len(nodes))).round().astype(int))
-    return [nodes[index] for index in chosen]
-
-
-def _shrunk(picture: Picture, longest_px: int) -> Picture:
+def _shrink(picture: Picture, longest_px: int) -> Picture:
     """Return a picture reduced by a whole factor until no side is longer."""
     factor = -(-max(picture.shape) // longest_px)
-    if factor == 1:
-        return picture
     height, width = picture.shape[0] // factor, picture.shape[1] // factor
     cut = picture[: height * factor, : width * factor]
     return np.asarray(cv2.resize(cut, (width, height), interpolation=cv2.INTER_AREA), np.float32)
 
 
-def _without_brightness(picture: Picture) -> Picture:
-    """Return a picture less its local mean, over its local contrast: shades and single bright spots count no more."""
+def _remove_brightness(picture: Picture) -> Picture:
+    """Return a picture less its local mean, over its contrast: shades and single bright spots count no more."""
     smooth = cv2.GaussianBlur(picture, (0, 0), _SMOOTHING_PX)
     detail = smooth - cv2.GaussianBlur(picture, (0, 0), _SHADES_PX)
-    scale = float(np.std(detail)) or 1.0
-    return np.asarray(np.clip(detail / scale, -4, 4), np.float32)
+    return np.asarray(np.clip(detail / (float(np.std(detail)) or 1.0), -4, 4), np.float32)

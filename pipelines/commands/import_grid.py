@@ -119,14 +119,13 @@ def import_grid(
     options = {name: value for name, value in locals().items() if name not in ("src", "out", "overwrite")}
     import numpy as np
 
-    from faintfield.calib.arrangement.orientation import Orientation
+    from faintfield.calib.arrangement.nodes import Orientation
     from faintfield.calib.lens import Lens
-    from faintfield.pipelines.formats.exchange.arranged_grid import arranged, grey_picture
-    from faintfield.pipelines.formats.exchange.arrangement_words import show_arrangement
+    from faintfield.pipelines.formats.exchange.arranged_grid import arrange_grid
     from faintfield.pipelines.formats.exchange.hci import described_grid, write_true_depth
     from faintfield.pipelines.formats.exchange.imported_noise import StatedNoise
     from faintfield.pipelines.formats.exchange.imported_set import read_picture, write_imported_set
-    from faintfield.pipelines.formats.exchange.packed_views import found_views
+    from faintfield.pipelines.formats.exchange.packed_views import unpack_views
     from faintfield.pipelines.formats.exchange.tone import asked_tone
     from faintfield.pipelines.formats.units import Units
 
@@ -134,55 +133,49 @@ def import_grid(
     own_scale = pitch_mm is None and fx_px is None and disparity_px is None
     if described is not None:
         pitch_mm, fx_px, disparity_px = described.scale(pitch_mm, fx_px, disparity_px)
-    given = Orientation(transpose, flip_rows, flip_columns) if transpose or flip_rows or flip_columns else None
-    with found_views(src, rows, columns, pattern, described.size if described else None) as found:
-        first = read_picture(next(iter(found.grid.paths.values())))
+    stated = Orientation(transpose, flip_rows, flip_columns)
+    with unpack_views(src, rows, columns, pattern, described.size if described else None) as views:
+        for remark in views.grid.remarks:
+            inform(remark)
+        first = read_picture(next(iter(views.grid.paths.values())))
         height, width = first.pixels_dn.shape[:2]
         white = float(first.saturation_dn or np.iinfo(first.pixels_dn.dtype).max)
-        if found.dn_per_value is not None:
-            white = np.inf  # floats state no white
-        read = partial(grey_picture, size_px=(width, height))
-        result = arranged(found.grid, given, white=white, aligned_stated=bool(disparity_px), read=read)
-        # What was found of the files, then what the pictures say
-        for words in [*found.said, *(line for line in result.grid.said if line not in found.said)]:
-            inform(words)
-        show_arrangement(result)
-        gauge = _gauge(result.arrangement, float(width), pitch_mm, fx_px, disparity_px or 0.0)
-        lens = Lens((width, height), gauge.focal_px, gauge.focal_px, (width - 1) / 2, (height - 1) / 2)
-        grid = result.grid
+        grid, arrangement = arrange_grid(
+            views.grid,
+            stated if stated != Orientation() else None,
+            white=white if views.dn_per_value is None else np.inf,  # floats state no white
+            size_px=(width, height),
+            aligned=bool(disparity_px),
+        )
+        pitch_mm, fx_px, at_infinity_px, in_mm = _scale(arrangement, float(width), pitch_mm, fx_px, disparity_px or 0.0)
+        lens = Lens((width, height), fx_px, fx_px, (width - 1) / 2, (height - 1) / 2)
         write_imported_set(
             out,
-            grid.posed(lens, gauge.pitch_mm, gauge.at_infinity_px, result.arrangement.pitch_ratio),
+            grid.posed(lens, pitch_mm, at_infinity_px, arrangement.pitch_ratio),
             reference=grid.centre,
             noise=StatedNoise(gain_dn_per_e, read_noise_e, offset_dn, dark_current_e_per_s, quantum_efficiency),
             exposure_s=exposure_s,
             tone=asked_tone(linear=linear, srgb=srgb),
             command="import grid",
-            options=options | {"dn_per_value": found.dn_per_value},
+            options=options | {"dn_per_value": views.dn_per_value},
             models=[described.file] if described else [],
-            sources=found.sources,
-            units=Units(depth="mm" if gauge.measured else "disparity_px" if len(grid.paths) > 1 else "relative"),
-            arrangement=result.arrangement,
+            sources=views.sources,
+            units=Units(depth="mm" if in_mm else "disparity_px" if len(grid.paths) > 1 else "relative"),
+            arrangement=arrangement,
             also=partial(write_true_depth, described, grid) if described is not None and own_scale else None,
             overwrite=overwrite,
         )
     inform(f"{out}: {grid.size[0]} x {grid.size[1]} views of {width} x {height} px")
-    return ImportedGrid(str(out), *grid.size, lens.size_px, len(grid.paths), result.arrangement)
+    return ImportedGrid(str(out), *grid.size, lens.size_px, len(grid.paths), arrangement)
 
 
-class _Gauge(msgspec.Struct, frozen=True):
-    """Pitch, focal length and disparity of infinitely far points; `measured` if they give depths in mm."""
-
-    pitch_mm: float
-    focal_px: float
-    at_infinity_px: float
-    measured: bool
-
-
-def _gauge(
+def _scale(
     arrangement: "Arrangement", width_px: float, pitch_mm: float | None, fx_px: float | None, disparity_px: float
-) -> _Gauge:
-    """Return the scale of a set: as given, or a nominal one in which all that was found is in front of the cameras."""
+) -> tuple[float, float, float, bool]:
+    """Return pitch in mm, focal length in px, disparity in px of infinitely far points, and whether depths are in mm.
+
+    Without a scale a nominal one is made in which all that was found is in front of the cameras.
+    """
     focal_px = fx_px or width_px
     aligned = bool(arrangement.aligned) and not disparity_px
     if (pitch_mm is None) != (fx_px is None) or (pitch_mm is not None and aligned):
@@ -191,13 +184,13 @@ def _gauge(
             + (", and --disparity-px as the pictures are aligned on a plane" if aligned else "")
         )
     if pitch_mm is not None and fx_px is not None and (disparity_px or not arrangement.aligned):
-        return _Gauge(pitch_mm, focal_px, disparity_px, measured=True)
+        return pitch_mm, focal_px, disparity_px, True
     if disparity_px:
         # The plane on which the pictures are aligned gets a depth of its own
-        return _Gauge(pitch_mm or _FREE_REFERENCE_DEPTH_MM * disparity_px / focal_px, focal_px, disparity_px, False)
+        return pitch_mm or _FREE_REFERENCE_DEPTH_MM * disparity_px / focal_px, focal_px, disparity_px, False
     at_infinity_px = 0.0
     if arrangement.disparity_range_px is not None:
         least, largest = arrangement.disparity_range_px
         # Ranges are those along columns of nodes, the scale is that along rows
         at_infinity_px = max(largest + _BEYOND_SHARE * (largest - least) + _BEYOND_PX, 0.0) / arrangement.pitch_ratio
-    return _Gauge(pitch_mm or 1.0, focal_px, at_infinity_px, measured=False)
+    return pitch_mm or 1.0, focal_px, at_infinity_px, False

@@ -1,53 +1,62 @@
-"""Views of a grid put in order by what their pictures show, or refused by name."""
+"""Views of a grid put in order by their pictures, with a report of what these show, or refused by name."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.table import Table
 
 from faintfield.calib.arrangement.axes import SURE
-from faintfield.calib.arrangement.look import Look
-from faintfield.calib.arrangement.orientation import Orientation
+from faintfield.calib.arrangement.inspection import MIN_SIDE_PX, GridInspection, inspect_grid
+from faintfield.calib.arrangement.nodes import Node, Orientation
+from faintfield.calib.arrangement.pictures import prepare_pictures
+from faintfield.pipelines.console import console, inform, visible
 from faintfield.pipelines.errors import AmbiguousOrder, CameraTurned, CopiedPicture, NotOneScene, ShuffledPictures
-from faintfield.pipelines.formats.exchange.grid_orders import Grey, look_at_grid
-from faintfield.pipelines.formats.exchange.grid_places import Node
 from faintfield.pipelines.formats.exchange.image_grid import ImageGrid
 from faintfield.pipelines.formats.exchange.imported_set import read_picture
 from faintfield.pipelines.formats.sets.elemental_file import Arrangement
+from faintfield.rig.plan import grid_nodes
 
-# Contrast over white, and mean light over noise, above which pictures in which nothing is seen are not dark, but show
-# no scene in common.
+# Contrast over white, and mean light over noise, above which pictures that share nothing are not dark, but show no
+# scene in common.
 _BRIGHT, _OVER_NOISE = 0.02, 1.2
 
 # Share of views that may be odd; of missing ones, `find_grid` decides.
 _MAX_ODD_SHARE = 0.25
 
-# Rotation in degrees and magnification against the other views that planes cannot use.
+# Rotation in degrees and magnification against the other views that planes cannot use, and those worth a word.
 _MAX_DEG, _MAX_SCALE = 5.0, 0.1
+_NOTABLE_DEG, _NOTABLE_SCALE = 0.3, 0.005
 
-# Spread of light between views that is worth a word.
-_SAID_LIGHT = 0.1
+# Spread of light between views, and displacement in px beyond what disparities explain, that are worth a word.
+_NOTABLE_LIGHT, _NOTABLE_PX = 0.1, 1.0
+
+# Share of other pictures that neighbours fit better than, from which no other order is tried in place of a square.
+_CERTAIN_SHARE = 0.95
+
+# Correlation by which the blocks must agree better in another order of a list.
+_MIN_LEVEL_GAIN = 0.05
+
+# Displacement in px beyond what disparities explain from which names may run back and forth, and the share of it that
+# may remain if they do.
+_DOUBTFUL_PX, _MAX_SHIFT_SHARE = 0.15, 0.5
+
+# Reasons why no scene is seen.
+_FAILURES = {
+    "small": f"the pictures are smaller than {MIN_SIDE_PX} px, too small to be compared",
+    "single": "one picture has no other to be compared with",
+    "even": "all pixels of each picture are alike, so nothing can be found in them",
+    "apart": "no picture has a neighbour to be compared with",
+    "dark": "nothing is seen in single pictures or their averages; they are too dark, or show nothing in common",
+}
+
+type _Inspect = Callable[[Sequence[Node]], GridInspection]
 
 
-@dataclass(frozen=True)
-class ArrangedGrid:
-    """Views by row and column, x to the right and y down, and what was found."""
-
-    grid: ImageGrid
-    found: Look
-    arrangement: Arrangement
-
-
-def grey_picture(path: Path, size_px: tuple[int, int] | None = None) -> NDArray[np.float32]:
-    """Return a picture (row, column) without colours: their mean, of a mosaic that of each period.
-
-    Raises
-    ------
-    WrongSize
-        It has not the width and height of `size_px`, those of the first picture.
-    """
+def _read_grey(path: Path, size_px: tuple[int, int]) -> NDArray[np.float32]:
+    """Return a picture (row, column) without colours: their mean, of a mosaic that of each period."""
     frame = read_picture(path, size_px)
     pixels = frame.pixels_dn.astype(np.float32)
     if pixels.ndim == 3:
@@ -60,136 +69,264 @@ def grey_picture(path: Path, size_px: tuple[int, int] | None = None) -> NDArray[
     return np.asarray(np.repeat(np.repeat(periods.mean(axis=(1, 3)), rows, 0), columns, 1), np.float32)
 
 
-def arranged(
-    grid: ImageGrid, given: Orientation | None, *, white: float, aligned_stated: bool = False, read: Grey = grey_picture
-) -> ArrangedGrid:
-    """Look at the pictures of a grid and put them in order.
+def arrange_grid(
+    grid: ImageGrid, prescribed: Orientation | None, *, white: float, size_px: tuple[int, int], aligned: bool = False
+) -> tuple[ImageGrid, Arrangement]:
+    """Inspect the pictures of a grid, put them in order, and print what they show.
 
     Parameters
     ----------
     grid : ImageGrid
         Pictures by the two numbers of their names, or by their place in a list.
-    given : Orientation, optional
+    prescribed : Orientation, optional
         The order, if options state it; the pictures are then only measured.
     white : float
         Value of a white pixel.
-    aligned_stated : bool
+    size_px : (int, int)
+        Width and height of the pictures.
+    aligned : bool
         A person stated that the pictures are aligned, so that disparities may have any sign.
-    read : callable
-        Returns the grey picture (row, column) of a file.
 
     Raises
     ------
     NotOneScene, CopiedPicture, ShuffledPictures, AmbiguousOrder, CameraTurned
         The pictures are no views of one scene from a grid, or do not tell which.
     """
-    grid, found = look_at_grid(grid, given, read)
     paths = list(grid.paths.values())
-    _refuse_copies(found, paths)
-    if found.unseen == "dark" and found.contrast > _BRIGHT * white and found.mean > _OVER_NOISE * found.noise:
-        raise NotOneScene(
-            f"{paths[0].parent}: neighbouring pictures share nothing ({found.match_z:.1f} standard errors, "
-            f"{SURE:g} are needed); give views of one scene, taken from neighbouring places"
-        )
-    _refuse_odd(found, paths)
-    if found.order.verdict == "denied" and given is None:
-        raise ShuffledPictures(
-            f"{paths[0].parent}: neighbours by the names fit better than only {found.order.share:.0%} of other "
-            "pictures, in a light field they fit better than nearly all; give views of one scene in the order of the "
-            "grid, by their names, by --pattern, or by --rows and --columns"
-        )
-    if found.undecided and not (aligned_stated and not _opposed(found.orientation)):
-        raise AmbiguousOrder(_two_orders(found, paths[0].parent))
-    _refuse_turns(found, paths)
-    nodes = found.orientation.of(list(grid.paths))
-    arranged_grid = grid.turned(found.orientation).without([nodes[index] for index in found.odd])
-    return ArrangedGrid(arranged_grid, found, _arrangement(arranged_grid, found, paths, nodes, given is not None))
-
-
-def _refuse_copies(found: Look, paths: Sequence[Path]) -> None:
-    """Refuse a picture that is there twice."""
-    if found.copies:
-        first, second = (paths[index] for index in found.copies[0])
-        count = len({index for pair in found.copies for index in pair})
+    pictures = prepare_pictures(_read_grey(path, size_px) for path in paths)
+    if copies := pictures.copies():
+        first, second = (paths[index] for index in copies[0])
+        count = len({index for pair in copies for index in pair})
         raise CopiedPicture(
             f"{second}: is the same picture as {first.name}; {count} of {len(paths)} pictures are copies of others, "
             "which views from different places cannot be; leave out all but one, or give the right pictures"
         )
-
-
-def _refuse_odd(found: Look, paths: Sequence[Path]) -> None:
-    """Refuse a set of which many views fit no other."""
-    if len(found.odd) > _MAX_ODD_SHARE * len(paths):
-        names = ", ".join(paths[index].name for index in found.odd[:4])
+    inspect = partial(inspect_grid, pictures=pictures, prescribed=prescribed)
+    nodes, inspection = _choose_order(grid, inspect, fixed=prescribed is not None or grid.measured is not None)
+    bright = pictures.contrast > _BRIGHT * white and float(np.median(pictures.mean)) > _OVER_NOISE * pictures.noise
+    if inspection.failure == "dark" and bright:
         raise NotOneScene(
-            f"{paths[0].parent}: {len(found.odd)} of {len(paths)} pictures fit none of their neighbours ({names} …); "
+            f"{paths[0].parent}: neighbouring pictures share nothing ({inspection.axes.match_z:.1f} standard errors, "
+            f"{SURE:g} are needed); give views of one scene, taken from neighbouring places"
+        )
+    _refuse_unfit(inspection, paths, prescribed=prescribed is not None, aligned=aligned)
+    orientation, fits = inspection.orientation, inspection.fits
+    arranged = grid.moved(orientation.apply(nodes), transposed=orientation.transpose, omit=fits.odd)
+    light = dict(zip(paths, pictures.relative_light.tolist(), strict=True))
+    uneven = inspection.failure is None and np.ptp(pictures.relative_light) > _NOTABLE_LIGHT
+    least, largest = inspection.range_px
+    record = Arrangement(
+        disparity_range_px=None if inspection.failure else (round(least, 2), round(largest, 2)),
+        told_by="options" if prescribed else inspection.direction,
+        transposed=orientation.transpose,
+        rows_flipped=orientation.flip_rows,
+        columns_flipped=orientation.flip_columns,
+        aligned=inspection.aligned,
+        pitch_ratio=round(inspection.ratio, 4),
+        missing=tuple(node for node in grid_nodes(*arranged.size) if node not in arranged.paths),
+        odd_views=tuple(paths[index].name for index in fits.odd),
+        turn_deg=round(float(np.degrees(np.abs(fits.turn_rad).max())), 3),
+        relative_light=tuple(round(light[path], 4) for path in arranged.paths.values()) if uneven else (),
+    )
+    _print_table(arranged, record, inspection)
+    for warning in _warnings(record, inspection, len(paths)):
+        inform(warning)
+    return arranged, record
+
+
+def _choose_order(grid: ImageGrid, inspect: _Inspect, *, fixed: bool) -> tuple[list[Node], GridInspection]:
+    """Inspect a grid and, where its order is doubtful, others; return the nodes by which the pictures agree."""
+    nodes = list(grid.paths)
+    inspection = inspect(nodes)
+    rows, columns = grid.size
+    if fixed or min(rows, columns) == 1:
+        return nodes, inspection
+    if grid.guessed and not _is_certain(inspection) and (line := _line_of_views(grid, inspection, inspect)):
+        return line
+    if grid.ordered and rows != columns:
+        by_column = [(place % rows, place // rows) for place in range(len(nodes))]
+        other = inspect(by_column)
+        # The order as documented unless the other agrees clearly more
+        if other.failure is None and other.axes.level > inspection.axes.level + _MIN_LEVEL_GAIN:
+            nodes, inspection = by_column, other
+    remark = ""
+    if inspection.fits.shift_rms_px > _DOUBTFUL_PX:
+        for kind, reversed_nodes in _back_and_forth(nodes).items():
+            other = inspect(reversed_nodes)
+            if (
+                other.order.verdict == "fits"
+                and len(other.fits.odd) <= len(inspection.fits.odd)
+                and other.axes.level >= inspection.axes.level
+                and other.fits.shift_rms_px < _MAX_SHIFT_SHARE * inspection.fits.shift_rms_px
+            ):
+                nodes, inspection = reversed_nodes, other
+                remark = f"names run back and forth: the pictures agree if every other {kind} is reversed"
+    if remark:
+        inform(remark)
+    return nodes, inspection
+
+
+def _line_of_views(
+    grid: ImageGrid, square: GridInspection, inspect: _Inspect
+) -> tuple[list[Node], GridInspection] | None:
+    """Return a grid that was guessed to be a square as one line of views, if the neighbours fit in that only.
+
+    Raises
+    ------
+    AmbiguousOrder
+        They fit in both.
+    """
+    (rows, columns), count = grid.size, len(grid.paths)
+    nodes = [(0, place) for place in range(count)]
+    line = inspect(nodes)
+    # The views of a square whose rows run back and forth make a line, too
+    if line.order.verdict != "fits" or any(
+        _is_certain(inspect(other)) for other in _back_and_forth(list(grid.paths)).values()
+    ):
+        return None
+    if square.failure or square.order.verdict == "denied":
+        inform(f"the pictures show one line of {count} views, not {rows} x {columns}")
+        return nodes, line
+    if square.order.verdict == "fits" and square.order.share < line.order.share:
+        raise AmbiguousOrder(
+            f"{next(iter(grid.paths.values())).parent}: the views may be a grid of {rows} x {columns}, whose "
+            f"neighbours fit better than {square.order.share:.0%} of other pictures, or one line of {count}, whose "
+            f"neighbours fit better than {line.order.share:.0%}; give --rows {rows} --columns {columns}, "
+            f"--rows 1 --columns {count}, or --rows {count} --columns 1"
+        )
+    return None
+
+
+def _is_certain(inspection: GridInspection) -> bool:
+    return inspection.order.verdict == "fits" and inspection.order.share > _CERTAIN_SHARE
+
+
+def _back_and_forth(nodes: list[Node]) -> dict[str, list[Node]]:
+    """Return nodes with every other row reversed, as gantries move, and with every other column."""
+    last_row, last_column = np.max(nodes, axis=0).tolist()
+    return {
+        "row": [(row, last_column - column if row % 2 else column) for row, column in nodes],
+        "column": [(last_row - row if column % 2 else row, column) for row, column in nodes],
+    }
+
+
+def _refuse_unfit(inspection: GridInspection, paths: Sequence[Path], *, prescribed: bool, aligned: bool) -> None:
+    """Refuse pictures in no order or in two, sets of which many views fit no other, and views that are turned."""
+    folder, fits = paths[0].parent, inspection.fits
+    if len(fits.odd) > _MAX_ODD_SHARE * len(paths):
+        names = ", ".join(paths[index].name for index in fits.odd[:4])
+        raise NotOneScene(
+            f"{folder}: {len(fits.odd)} of {len(paths)} pictures fit none of their neighbours ({names} …); "
             "give views of one scene in the order of the grid"
         )
-
-
-def _refuse_turns(found: Look, paths: Sequence[Path]) -> None:
-    """Refuse views that are turned or magnified more than planes can use."""
-    for what, values, limit, unit in (
-        ("turned", np.degrees(found.turn_rad), _MAX_DEG, "°"),
-        ("magnified", 100 * (found.scale - 1), 100 * _MAX_SCALE, " %"),
+    if inspection.order.verdict == "denied" and not prescribed:
+        raise ShuffledPictures(
+            f"{folder}: neighbours by the names fit better than only {inspection.order.share:.0%} of other pictures, "
+            "in a light field they fit better than nearly all; give views of one scene in the order of the grid, by "
+            "their names, by --pattern, or by --rows and --columns"
+        )
+    (least, largest), orientation = inspection.range_px, inspection.orientation
+    if inspection.undecided and not prescribed and not (aligned and not orientation.opposed):
+        options, other = _options(orientation), _options(orientation.turned())
+        remedy = f"give {other}, or --disparity-px if they are aligned on a plane nearer than the scene"
+        if orientation.opposed:
+            remedy = f"give {options} or {other}"
+        raise AmbiguousOrder(
+            f"{folder}: two orders of the views are equally likely: disparities of {least:.2f} … {largest:.2f} px with "
+            f"{options or 'the order of the names'}, or {-largest:.2f} … {-least:.2f} px with "
+            f"{other or 'the order of the names'}, and no hidden parts tell near from far "
+            f"({inspection.side_z:.1f} standard errors); {remedy}"
+        )
+    for participle, values, limit, unit in (
+        ("turned", np.degrees(fits.turn_rad), _MAX_DEG, "°"),
+        ("magnified", 100 * (fits.magnification - 1), 100 * _MAX_SCALE, " %"),
     ):
         worst = int(np.argmax(np.abs(values)))
         if abs(values[worst]) > limit:
             raise CameraTurned(
-                f"{paths[worst]}: is {what} by {values[worst]:.1f}{unit} against the other views, at most "
+                f"{paths[worst]}: is {participle} by {values[worst]:.1f}{unit} against the other views, at most "
                 f"{limit:g}{unit} is possible on a grid; calibrate the cameras (import colmap), or leave it out"
             )
 
 
-def _two_orders(found: Look, folder: Path) -> str:
-    """Return the message that shows two orders that are equally likely."""
-    least, largest = found.disparity_px or (0.0, 0.0)
-    other = found.orientation.turned()
-    if _opposed(found.orientation):
-        remedy = f"give {options_of(found.orientation)} or {options_of(other)}"
-    else:
-        remedy = f"give {options_of(other)}, or --disparity-px if they are aligned on a plane nearer than the scene"
-    return (
-        f"{folder}: two orders of the views are equally likely: disparities of {least:.2f} … {largest:.2f} px with "
-        f"{options_of(found.orientation) or 'the order of the names'}, or {-largest:.2f} … {-least:.2f} px with "
-        f"{options_of(other) or 'the order of the names'}, and no hidden parts tell near from far "
-        f"({found.side_z:.1f} standard errors); {remedy}"
-    )
-
-
-def _opposed(orientation: Orientation) -> bool:
-    """Tell whether one of rows and columns is reversed."""
-    return orientation.flip_rows != orientation.flip_columns
-
-
-def options_of(orientation: Orientation) -> str:
+def _options(orientation: Orientation) -> str:
     """Return the options that state an orientation."""
-    flags = {"--transpose": orientation.transpose, "--flip-rows": orientation.flip_rows}
-    flags["--flip-columns"] = orientation.flip_columns
-    return " ".join(option for option, wanted in flags.items() if wanted)
+    flags = {"transpose": "--transpose", "flip_rows": "--flip-rows", "flip_columns": "--flip-columns"}
+    return " ".join(option for name, option in flags.items() if getattr(orientation, name))
 
 
-def _arrangement(
-    grid: ImageGrid, found: Look, paths: Sequence[Path], nodes: Sequence[Node], by_options: bool
-) -> Arrangement:
-    """Return the record of what was found."""
-    light = dict(zip(nodes, found.light.tolist(), strict=True))
-    uneven = found.seen and float(np.ptp(found.light)) > _SAID_LIGHT
-    return Arrangement(
-        disparity_range_px=_rounded(found.disparity_px),
-        told_by="options" if by_options else found.direction,
-        transposed=found.orientation.transpose,
-        rows_flipped=found.orientation.flip_rows,
-        columns_flipped=found.orientation.flip_columns,
-        aligned=found.aligned,
-        pitch_ratio=round(found.ratio, 4),
-        missing=tuple(grid.missing),
-        odd_views=tuple(paths[index].name for index in found.odd),
-        turn_deg=round(float(np.degrees(np.abs(found.turn_rad).max())), 3) if found.seen else 0.0,
-        relative_light=tuple(round(light[node], 4) for node in grid.paths) if uneven else (),
-    )
+def _print_table(grid: ImageGrid, record: Arrangement, inspection: GridInspection) -> None:
+    """Print what the pictures show."""
+    rows, columns = grid.size
+    lines = {"grid": f"{_count(rows, 'row')} x {_count(columns, 'column')}, {_count(len(grid.paths), 'view')}"}
+    if record.disparity_range_px is None:
+        lines["order"] = "as in the names: the pictures do not tell"
+    else:
+        options = _options(inspection.orientation)
+        sources = {
+            "pictures": f"hidden parts tell near from far, {abs(inspection.side_z):.0f} standard errors",
+            "signs": "near points move against the camera",
+            "names": "the pictures do not tell it from its opposite",
+            "options": "as the options state",
+        }
+        order = f"not as in the names: {options}" if options else "as in the names: right and down"
+        lines["order"] = f"{order} ({sources[record.told_by]})"
+        least, largest = record.disparity_range_px
+        lines["disparities"] = f"{least:.2f} … {largest:.2f} px from node to node"
+        plane = "on a plane in the scene" if least <= 0 else "on a plane nearer than all that is seen"
+        lines["aligned"] = {None: "not known", False: "no", True: plane}[record.aligned]
+        if record.pitch_ratio != 1.0:
+            lines["pitch"] = f"columns {record.pitch_ratio:.3f} times as far apart as rows"
+        if record.relative_light:
+            lines["light"] = f"{min(record.relative_light):.2f} … {max(record.relative_light):.2f} of the typical view"
+        if record.missing:
+            lines["missing"] = ", ".join(f"({row}, {column})" for row, column in record.missing)
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    for heading, text in lines.items():
+        table.add_row(visible(heading), visible(text))
+    console.print(table)
 
 
-def _rounded(range_px: tuple[float, float] | None) -> tuple[float, float] | None:
-    """Return a range to the hundredth of a pixel, which is less than its margin."""
-    return None if range_px is None else (round(range_px[0], 2), round(range_px[1], 2))
+def _count(count: int, noun: str) -> str:
+    return f"{count} {noun}{'s' * (count != 1)}"
+
+
+def _warnings(record: Arrangement, inspection: GridInspection, count: int) -> list[str]:
+    """Return what a person should know before using the set."""
+    fits, order = inspection.fits, inspection.order
+    if inspection.failure:
+        return [f"{_FAILURES[inspection.failure]}; the order of the names is kept"]
+    lines = []
+    if inspection.contradicted:
+        lines.append(
+            "the pictures contradict the order that the options state; without them it is found from the pictures"
+        )
+    if order.verdict != "fits" and inspection.still:
+        lines.append("all views show the same; no depth can be found")
+    elif order.verdict == "open":
+        lines.append(
+            "all pictures fit one another equally well: they show the same, or are too dark to check their order"
+        )
+    elif order.verdict == "few":
+        lines.append(f"{count} pictures are too few for their order to be checked")
+    elif order.verdict == "denied":
+        lines.append(
+            f"neighbours fit better than only {order.share:.0%} of other pictures, so the order may be wrong: in a "
+            "light field they fit better than nearly all"
+        )
+    if record.told_by == "names":
+        lines.append("the pictures do not tell where rows and columns begin; the order of the names is kept")
+    if record.odd_views:
+        lines.append(f"fit none of their neighbours, and are left out: {', '.join(record.odd_views)}")
+    x_px, y_px = fits.shift_px[int(np.argmax(np.abs(fits.shift_px).max(axis=1)))]
+    if max(abs(x_px), abs(y_px)) > _NOTABLE_PX:
+        lines.append(
+            f"views are shifted against their neighbours, by up to ({x_px:.1f}, {y_px:.1f}) px: the camera was off the "
+            "grid; planes are sharper with calibrated poses (import colmap)"
+        )
+    if record.turn_deg > _NOTABLE_DEG:
+        lines.append(f"views are turned by up to {record.turn_deg:.2f}°; a grid's camera does not turn")
+    magnification = float(np.abs(fits.magnification - 1).max())
+    if magnification > _NOTABLE_SCALE:
+        lines.append(f"views are magnified by up to {100 * magnification:.1f} %")
+    return lines

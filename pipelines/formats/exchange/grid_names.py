@@ -3,18 +3,16 @@
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+
+import numpy as np
 
 from faintfield.pipelines.errors import BadValue
 
-# Digits of the largest row, column or running number: times and serial numbers have more.
-MAX_DIGITS = 9
+# Largest row, column, running number or position: times and serial numbers are larger.
+_MAX_NUMBER = 1e9
 
 # Digits up to which a constant number before the one that varies may be the row of a grid of one row.
 _ROW_DIGITS = 2
-
-# Largest position in a name, in any unit.
-_MAX_POSITION = 1e9
 
 _WHOLE, _DECIMAL = r"[0-9]+", r"[-+]?[0-9]+\.[0-9]+(?:[eE][-+]?[0-9]+)?"
 _NUMBER = r"[-+]?[0-9]+(?:\.[0-9]*)?(?:[eE][-+]?[0-9]+)?"
@@ -39,15 +37,8 @@ _WITH_POSITIONS = [
 ]
 
 
-@dataclass(frozen=True)
-class Place:
-    """Place of a picture as its name states it; None for what the name does not state."""
-
-    row: int | None = None
-    column: int | None = None
-    index: int | None = None
-    x: float | None = None
-    y: float | None = None
+# Numbers of all names by field: row, column, index, x and y; a field that names do not state is missing.
+type Places = dict[str, list[float]]
 
 
 def by_number(name: str) -> list[tuple[int, str]]:
@@ -56,8 +47,8 @@ def by_number(name: str) -> list[tuple[int, str]]:
     return [(int(part), part) if part.isascii() and part.isdigit() else (-1, part) for part in parts]
 
 
-def places_by_pattern(pattern: str, names: Sequence[str]) -> list[Place]:
-    """Return what names say by a pattern such as "{name}_{row}_{column}_{y}_{x}.png".
+def places_by_pattern(pattern: str, names: Sequence[str]) -> Places:
+    """Return the numbers of names by a pattern such as "{name}_{row}_{column}_{y}_{x}.png".
 
     Parameters
     ----------
@@ -74,23 +65,23 @@ def places_by_pattern(pattern: str, names: Sequence[str]) -> list[Place]:
         The pattern says neither row and column, nor x and y, nor index; or a name does not match it.
     """
     expression = _expression(pattern)
-    found = [expression.fullmatch(name) or expression.fullmatch(name.rpartition(".")[0]) for name in names]
-    unlike = [name for name, match in zip(names, found, strict=True) if match is None]
+    matches = [expression.fullmatch(name) or expression.fullmatch(name.rpartition(".")[0]) for name in names]
+    unlike = [name for name, match in zip(names, matches, strict=True) if match is None]
     if unlike:
         raise BadValue(
             f"--pattern '{pattern}': {unlike[0]} does not match it, {len(names) - len(unlike)} of {len(names)} "
             "pictures do; correct the pattern, or move the other files away"
         )
-    return [_place(name, match.groupdict()) for name, match in zip(names, found, strict=True) if match is not None]
+    return _places(names, [match.groupdict() for match in matches if match is not None])
 
 
 def _expression(pattern: str) -> re.Pattern[str]:
     """Return a pattern as a regular expression with a group for each field but `name`."""
-    parts, end, used = [], 0, []
+    parts, end, used = [], 0, set[str]()
     for field in _FIELD.finditer(pattern):
+        name, digits, star = field.groups()
         parts.append(re.escape(pattern[end : field.start()]))
         end = field.end()
-        name, digits, star = field.groups()
         if star or name == "name":
             parts.append(".*?")
             continue
@@ -99,9 +90,9 @@ def _expression(pattern: str) -> re.Pattern[str]:
                 f"--pattern '{pattern}': {field[0]} is no field, or is there twice; use each of "
                 f"{', '.join(f'{{{field}}}' for field in _FIELDS)} at most once, and * for anything"
             )
-        used.append(name)
+        used.add(name)
         parts.append(f"(?P<{name}>{f'[0-9]{{{digits}}}' if digits else _FIELDS[name]})")
-    if not any(set(needed) <= set(used) for needed in (("row", "column"), ("x", "y"), ("index",))):
+    if not ({"row", "column"} <= used or {"x", "y"} <= used or "index" in used):
         raise BadValue(
             f"--pattern '{pattern}': says neither {{row}} and {{column}}, nor {{x}} and {{y}}, nor {{index}}, so no "
             "picture gets a place; name them"
@@ -109,8 +100,8 @@ def _expression(pattern: str) -> re.Pattern[str]:
     return re.compile("".join(parts) + re.escape(pattern[end:]), re.DOTALL)
 
 
-def places_by_habit(names: Sequence[str]) -> list[Place]:
-    """Return what names say by the habits of archives and cameras.
+def places_by_habit(names: Sequence[str]) -> Places:
+    """Return the numbers of names by the habits of archives and cameras.
 
     In this order: row, column and position as in `out_00_01_-381.909_1124.376_.png`; a position alone; letters or words
     for row and column; the two numbers that vary from name to name; one number that varies, which is an index. A number
@@ -123,80 +114,57 @@ def places_by_habit(names: Sequence[str]) -> list[Place]:
     """
     stems = [name.rpartition(".")[0] or name for name in names]
     for expression in (*_WITH_POSITIONS, *_LETTERED):
-        found = [expression.search(stem) for stem in stems]
-        if all(found):
-            return [
-                _place(name, match.groupdict()) for name, match in zip(names, found, strict=True) if match is not None
-            ]
+        matches = [match for stem in stems if (match := expression.search(stem))]
+        if len(matches) == len(names):
+            return _places(names, [match.groupdict() for match in matches])
     numbers = [re.findall(_WHOLE, stem) for stem in stems]
-    lacking = next((name for name, its in zip(names, numbers, strict=True) if not its), None)
-    if lacking is not None:
-        raise BadValue(f"{lacking}: its name has no row and column; give --rows and --columns to take files in order")
-    if len(set(map(len, numbers))) == 1 and len(varying := _varying(numbers)) in (1, 2):
-        if len(varying) == 2:
-            row, column = varying
-            return [
-                _place(name, {"row": numbers_of_name[row], "column": numbers_of_name[column]})
-                for name, numbers_of_name in zip(names, numbers, strict=True)
-            ]
-        return _places_of_one_number(names, stems, numbers, varying[0])
-    if min(map(len, numbers)) == 1:
-        lacking = next(name for name, its in zip(names, numbers, strict=True) if len(its) == 1)
+    counts = [len(texts) for texts in numbers]
+    varying = [place for place, texts in enumerate(zip(*numbers, strict=False)) if len(set(map(int, texts))) > 1]
+    alike = min(counts) == max(counts)
+    if alike and len(varying) == 2:
+        fields = {"row": varying[0], "column": varying[1]}
+    elif alike and len(varying) == 1:
+        fields = _fields_of_one_number(names, numbers[0], varying[0])
+    elif min(counts) >= 2:
+        fields = {"row": -2, "column": -1}
+    else:
         raise BadValue(
-            f"{lacking}: its name has no row and column, while others have; give --rows and --columns to take files in "
-            "order, or --pattern"
+            f"{names[int(np.argmin(counts))]}: its name has no row and column; give --rows and --columns to take files "
+            "in order, or --pattern"
         )
-    return [_place(name, {"row": its[-2], "column": its[-1]}) for name, its in zip(names, numbers, strict=True)]
+    return _places(names, [{field: texts[place] for field, place in fields.items()} for texts in numbers])
 
 
-def _varying(numbers: Sequence[Sequence[str]]) -> list[int]:
-    """Return which of the numbers of each name are not the same in all names."""
-    return [index for index, its in enumerate(zip(*numbers, strict=True)) if len(set(map(int, its))) > 1]
+def _fields_of_one_number(names: Sequence[str], numbers: Sequence[str], varying: int) -> dict[str, int]:
+    """Return the places of the fields among the numbers of names in which one number varies.
 
-
-def _places_of_one_number(
-    names: Sequence[str], stems: Sequence[str], numbers: Sequence[Sequence[str]], varying: int
-) -> list[Place]:
-    """Return the places of names in which one number varies: an index, a column of one row, or a row of one column.
-
-    A short constant number right beside it may be the row or the column of all.
+    A short constant number right beside it may be the row or the column of all; otherwise the number is an index.
     """
-    beside = [other for other in (varying - 1, varying + 1) if 0 <= other < len(numbers[0])]
-    short = [other for other in beside if len(numbers[0][other]) <= _ROW_DIGITS and _adjacent(stems[0], other, varying)]
-    if not short:
-        return [_place(name, {"index": its[varying]}) for name, its in zip(names, numbers, strict=True)]
-    side = math.isqrt(len(names))
-    shape = f"1 x {len(names)}" if short[0] < varying else f"{len(names)} x 1"
-    if side**2 == len(names):
-        raise BadValue(
-            f"{names[0]}: only one number varies from name to name, which fits a grid of {shape} as well as one of "
-            f"{side} x {side}; say which by --rows and --columns"
-        )
-    row, column = sorted((short[0], varying))
-    return [_place(name, {"row": its[row], "column": its[column]}) for name, its in zip(names, numbers, strict=True)]
+    between = re.split(_WHOLE, names[0])[1:]
+    for constant in (varying - 1, varying + 1):
+        first, second = sorted((constant, varying))
+        if first < 0 or second == len(numbers) or len(numbers[constant]) > _ROW_DIGITS:
+            continue
+        # Nothing but signs such as _ or x stands between them
+        if re.fullmatch(r"[^a-z0-9]*x?[^a-z0-9]*", between[first], re.IGNORECASE):
+            side = math.isqrt(len(names))
+            if side**2 == len(names):
+                shape = f"1 x {len(names)}" if constant < varying else f"{len(names)} x 1"
+                raise BadValue(
+                    f"{names[0]}: only one number varies from name to name, which fits a grid of {shape} as well as "
+                    f"one of {side} x {side}; say which by --rows and --columns"
+                )
+            return {"row": first, "column": second}
+    return {"index": varying}
 
 
-def _adjacent(stem: str, one: int, other: int) -> bool:
-    """Return whether nothing but signs such as _ or x stands between two numbers of a name."""
-    first, second = sorted((one, other))
-    spans = [found.span() for found in re.finditer(_WHOLE, stem)]
-    return re.fullmatch(r"[^a-z0-9]*x?[^a-z0-9]*", stem[spans[first][1] : spans[second][0]], re.IGNORECASE) is not None
-
-
-def _place(name: str, said: dict[str, str]) -> Place:
-    """Return a place from the texts of its numbers."""
-    whole = {field: text for field, text in said.items() if _FIELDS[field] == _WHOLE}
-    for field, text in whole.items():
-        if len(text) > MAX_DIGITS:
-            raise BadValue(
-                f"{name}: its name has a number of more than {MAX_DIGITS} digits, which is no {field}; "
-                "give --rows and --columns to take files in order"
-            )
-    position = {field: float(text) for field, text in said.items() if field not in whole}
-    if any(not abs(value) <= _MAX_POSITION for value in position.values()):
-        raise BadValue(
-            f"{name}: its position {tuple(position.values())} is beyond {_MAX_POSITION:g}; correct the name, or leave "
-            "the position out of --pattern"
-        )
-    numbers = {field: int(text) for field, text in whole.items()}
-    return Place(numbers.get("row"), numbers.get("column"), numbers.get("index"), position.get("x"), position.get("y"))
+def _places(names: Sequence[str], texts: Sequence[dict[str, str]]) -> Places:
+    """Return the numbers of all names by field; refuse those that are too large."""
+    for name, fields in zip(names, texts, strict=True):
+        for field, text in fields.items():
+            if not abs(float(text)) < _MAX_NUMBER:
+                raise BadValue(
+                    f"{name}: its name has the number {text}, beyond {_MAX_NUMBER:g}, for {field}; correct it, give "
+                    "--rows and --columns to take files in order, or --pattern without it"
+                )
+    return {field: [float(fields[field]) for fields in texts] for field in texts[0]}

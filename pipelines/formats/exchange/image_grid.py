@@ -1,25 +1,36 @@
-"""Pictures taken on a regular grid, found by their names or by their order."""
+"""Pictures taken on a regular grid, by the places that names state or by their order."""
 
+import math
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from math import dist, gcd
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from faintfield.calib.arrangement.orientation import Orientation
+from faintfield.calib.arrangement.nodes import Node
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.errors import BadValue, MissingFile
-from faintfield.pipelines.formats.exchange.grid_names import Place, by_number, places_by_habit, places_by_pattern
-from faintfield.pipelines.formats.exchange.grid_places import Node, Steps, measured_steps, nodes_of
+from faintfield.pipelines.formats.exchange.grid_names import Places, places_by_habit, places_by_pattern
 from faintfield.pipelines.formats.exchange.imported_set import PosedImage
 from faintfield.pipelines.formats.exchange.picture_folder import pictures_in
 from faintfield.rig.plan import centre_node, grid_nodes
 
-# Largest ratio of missing pictures to those found; beyond it, the numbers in the names are not rows and columns.
-_MAX_MISSING_RATIO = 10
-
 # Largest step of numbers, such as 2 for every second view; times and serial numbers may have larger ones.
 _MAX_STEP = 8
+
+# Positions in the same row or column differ by less than this share of the largest distance between neighbours.
+_SAME_LINE = 0.4
+
+# Largest rms by which measured positions may leave the regular grid, in steps: beyond it they belong to other nodes.
+_MAX_RMS_STEPS = 0.4
+
+# Smallest distance between rows, in distances between columns: rows at one place are none.
+_MIN_STEP = 0.05
+
+# Displacement of a camera from the first node, right and down, in steps of the grid's columns.
+type Steps = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -31,10 +42,10 @@ class ImageGrid:
     paths : dict of node to Path
         The pictures.
     measured : dict of node to (float, float), optional
-        Where each camera was measured to be, right and down of the first node in steps of the grid's columns; None for
-        a regular grid.
-    said : list of str
-        What a person should know of how the pictures were found: files left out, sizes guessed.
+        Measured places of the cameras, right and down of the first node in steps of the grid's columns; None for a
+        regular grid.
+    remarks : list of str
+        Files left out and sizes guessed, in words.
     ordered : bool
         Names tell no more than an order, which may run by row or by column, and back and forth.
     guessed : bool
@@ -43,7 +54,7 @@ class ImageGrid:
 
     paths: dict[Node, Path]
     measured: dict[Node, Steps] | None = None
-    said: list[str] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
     ordered: bool = False
     guessed: bool = False
 
@@ -57,38 +68,19 @@ class ImageGrid:
     def centre(self) -> int:
         """Index of the picture at the centre node, or at the nearest one that has a picture."""
         middle, nodes = centre_node(*self.size), list(self.paths)
-        return min(range(len(nodes)), key=lambda index: dist(nodes[index], middle))
+        return min(range(len(nodes)), key=lambda index: math.dist(nodes[index], middle))
 
-    @property
-    def missing(self) -> list[Node]:
-        """Nodes without a picture."""
-        return [node for node in grid_nodes(*self.size) if node not in self.paths]
-
-    def steps_from_centre(self) -> dict[Node, Steps]:
-        """Return how far each camera is right and down of the one at `centre`, in steps of the grid."""
-        centre = list(self.paths)[self.centre]
-        places = self.measured or {(row, column): (float(column), float(row)) for row, column in self.paths}
-        right_0, down_0 = places[centre]
-        return {node: (right - right_0, down - down_0) for node, (right, down) in places.items()}
-
-    def turned(self, by: Orientation) -> "ImageGrid":
-        """Return the grid with rows and columns exchanged first, then counted from the other end.
+    def moved(self, nodes: Sequence[Node], *, transposed: bool = False, omit: Collection[int] = ()) -> "ImageGrid":
+        """Return the grid with its pictures at other nodes, some left out by their places in the list.
 
         Measured positions go with their cameras; the distance between columns remains their unit, or takes its place.
         """
-        moved = dict(zip(self.paths, by.of(list(self.paths)), strict=True))
-        paths = {moved[node]: path for node, path in self.paths.items()}
-        measured = None
-        if self.measured is not None:
-            positions = {moved[node]: steps[::-1] if by.transpose else steps for node, steps in self.measured.items()}
-            measured = measured_steps({node: positions[node] for node in sorted(positions)})
-        return replace(self, paths={node: paths[node] for node in sorted(paths)}, measured=measured)
-
-    def without(self, left_out: list[Node]) -> "ImageGrid":
-        """Return the grid without the pictures of some nodes."""
-        paths = {node: path for node, path in self.paths.items() if node not in left_out}
-        measured = self.measured and {node: self.measured[node] for node in paths}
-        return replace(self, paths=paths, measured=measured)
+        moves = sorted((to, node) for i, (node, to) in enumerate(zip(self.paths, nodes, strict=True)) if i not in omit)
+        measured = self.measured
+        if measured is not None:
+            places = {to: measured[node] for to, node in moves}
+            measured = measured_steps({to: (y, x) if transposed else (x, y) for to, (x, y) in places.items()})
+        return replace(self, paths={to: self.paths[node] for to, node in moves}, measured=measured)
 
     def posed(self, lens: Lens, pitch_mm: float, disparity_px: float, ratio: float = 1.0) -> list[PosedImage]:
         """Return the pictures at measured poses where positions were measured, else at nominal ones.
@@ -106,12 +98,11 @@ class ImageGrid:
             Pitch along columns over pitch along rows, if positions were not measured; `pitch_mm` and `disparity_px`
             are those along rows.
         """
-        steps = self.steps_from_centre()
+        places = self.measured or {(row, column): (ratio * column, float(row)) for row, column in self.paths}
+        right_0, down_0 = places[list(self.paths)[self.centre]]
         images = []
         for node, path in self.paths.items():
-            right, down = steps[node]
-            if self.measured is None:
-                right *= ratio
+            right, down = places[node][0] - right_0, places[node][1] - down_0
             pose = np.array([0, 0, 0, -pitch_mm * right, -pitch_mm * down, 0])
             moved = replace(lens, cx_px=lens.cx_px + disparity_px * right, cy_px=lens.cy_px + disparity_px * down)
             images.append(PosedImage(path, moved, pose, node))
@@ -131,12 +122,12 @@ def find_grid(
     Parameters
     ----------
     folder : Path
-        Where they lie.
+        Folder of the pictures.
     rows, columns : int, optional
         Size of the grid; the pictures are then taken in the order of their names. When both are None, names tell, see
         `grid_names`.
     pattern : str, optional
-        What the names say, such as "{name}_{row}_{column}_{y}_{x}.png".
+        Pattern of the names, such as "{name}_{row}_{column}_{y}_{x}.png".
     running : (int, int), optional
         Rows and columns of the grid, for names with running numbers, if a file beside the pictures states them.
 
@@ -147,111 +138,143 @@ def find_grid(
     BadValue
         A name has no row and column, two pictures have the same, or a pattern matches not all names.
     """
-    paths, said = pictures_in(folder, every=pattern is not None)
+    paths, remarks = pictures_in(folder, every=pattern is not None)
     names = [path.name for path in paths]
-    if pattern is not None:
-        places = places_by_pattern(pattern, names)
-        running = running or ((rows, columns) if rows and columns else None)
-    elif rows is not None or columns is not None:
-        return _in_order(folder, paths, rows or 1, columns or 1, said)
-    elif len(paths) == 1:
-        return ImageGrid({(0, 0): paths[0]}, said=said)
-    else:
-        places = _of(folder, names)
+    if pattern is None and (rows or columns):
+        rows, columns = rows or 1, columns or 1
+        if len(paths) != rows * columns:
+            raise MissingFile(
+                f"{folder}: holds {len(paths)} pictures, a grid of {rows} x {columns} needs {rows * columns}; "
+                "correct --rows and --columns, or add the missing ones" + "".join(f" ({text})" for text in remarks)
+            )
+        return ImageGrid(dict(zip(grid_nodes(rows, columns), paths, strict=True)), remarks=remarks, ordered=True)
+    if pattern is None and len(paths) == 1:
+        return ImageGrid({(0, 0): paths[0]}, remarks=remarks)
+    if running is None and pattern is not None and rows and columns:
+        running = rows, columns
     try:
-        nodes, how = nodes_of(places, *(running or (None, None)))
+        places = places_by_habit(names) if pattern is None else places_by_pattern(pattern, names)
+        nodes, remark = nodes_of(places, running)
+        double = Counter(nodes).most_common(1)[0][0]
+        alike = [name for name, node in zip(names, nodes, strict=True) if node == double]
+        if len(alike) > 1:
+            raise BadValue(f"{alike[1]}: is at node {double} like {alike[0]}; keep one of the two")
+        nodes = _count_from_zero(nodes)
+        positions = sorted(zip(nodes, places.get("x", []), places.get("y", []), strict=False))
+        measured = measured_steps({node: (x, y) for node, x, y in positions}) if len(positions) > 1 else None
     except BadValue as failure:
         raise BadValue(f"{folder}: {failure}") from failure
-    named: dict[Node, Path] = {}
-    for node, path in zip(nodes, paths, strict=True):
-        if node in named:
-            raise BadValue(f"{path}: is at node {node} like {named[node].name}; keep one of the two")
-        named[node] = path
-    grid = _counted_from_zero(folder, named)
-    if (rows or grid.size[0], columns or grid.size[1]) != grid.size:
-        raise BadValue(
-            f"{folder}: --pattern makes a grid of {grid.size[0]} x {grid.size[1]}, --rows and --columns say otherwise; "
-            "give one of them, or correct them"
-        )
-    measured = _measured(folder, named, dict(zip(nodes, places, strict=True)))
+    remarks += [remark] if remark else []
     if measured:
-        said = [*said, f"names state positions ({names[0]}): the cameras are placed by them"]
-    by_index = _by_index(places)
-    said = [*said, how] if how else said
-    return replace(grid, measured=measured, said=said, ordered=by_index, guessed=by_index and running is None)
+        remarks.append(f"names state positions ({names[0]}): the cameras are placed by them")
+    by_index = places.keys() == {"index"}
+    grid_paths = dict(sorted(zip(nodes, paths, strict=True)))
+    grid = ImageGrid(grid_paths, measured, remarks, ordered=by_index, guessed=by_index and running is None)
+    _check_size(folder, grid, rows, columns)
+    return grid
 
 
-def _by_index(places: list[Place]) -> bool:
-    """Return whether names tell no more than an order."""
-    return all(place.index is not None and place.row is None and place.x is None for place in places)
+def _count_from_zero(nodes: Sequence[Node]) -> list[Node]:
+    """Return nodes counted in the common steps of rows and of columns: every second view is a grid."""
+    numbers = np.array(nodes) - np.min(nodes, axis=0)
+    steps = [step if 0 < (step := math.gcd(*line)) <= _MAX_STEP else 1 for line in numbers.T.tolist()]
+    return [(row, column) for row, column in (numbers // steps).tolist()]
 
 
-def _of(folder: Path, names: list[str]) -> list[Place]:
-    """Return what names say by habit; a failure names the folder."""
-    try:
-        return places_by_habit(names)
-    except BadValue as failure:
-        raise BadValue(f"{folder}/{failure}") from failure
-
-
-def _measured(folder: Path, named: dict[Node, Path], places: dict[Node, Place]) -> dict[Node, Steps] | None:
-    """Return the measured positions by node counted from zero, None if not all names state one."""
-    counted = _counted(named)
-    positions = {
-        counted[node]: (place.x, place.y)
-        for node, place in sorted(places.items(), key=lambda item: item[0])
-        if place.x is not None and place.y is not None
-    }
-    if len(positions) < max(len(places), 2):
-        return None
-    try:
-        return measured_steps(positions)
-    except BadValue as failure:
-        raise BadValue(f"{folder}: {failure}") from failure
-
-
-def _in_order(folder: Path, paths: list[Path], rows: int, columns: int, said: list[str]) -> ImageGrid:
-    """Return pictures in the order of their names as a grid of the size given."""
-    if len(paths) != rows * columns:
-        raise MissingFile(
-            f"{folder}: holds {len(paths)} pictures, a grid of {rows} x {columns} needs {rows * columns}; "
-            "correct --rows and --columns, or add the missing ones" + "".join(f" ({remark})" for remark in said)
-        )
-    in_order = sorted(paths, key=lambda path: by_number(path.name))
-    return ImageGrid(dict(zip(grid_nodes(rows, columns), in_order, strict=True)), said=said, ordered=True)
-
-
-def _counted(named: dict[Node, Path]) -> dict[Node, Node]:
-    """Return each node counted from zero in the common steps of rows and of columns: every second view is a grid."""
-    row_0, column_0 = (min(node[axis] for node in named) for axis in (0, 1))
-    by_rows = _step([row - row_0 for row, _ in named])
-    by_columns = _step([column - column_0 for _, column in named])
-    return {(row, column): ((row - row_0) // by_rows, (column - column_0) // by_columns) for row, column in named}
-
-
-def _step(numbers: list[int]) -> int:
-    """Return the common step of numbers that begin at zero, 1 if it is too large to be every n-th view."""
-    step = gcd(*numbers)
-    return step if 0 < step <= _MAX_STEP else 1
-
-
-def _counted_from_zero(folder: Path, named: dict[Node, Path]) -> ImageGrid:
-    """Return pictures with their nodes counted from zero; refuse a grid of which half is missing."""
-    counted = _counted(named)
-    grid = ImageGrid({counted[node]: named[node] for node in sorted(named)})
-    rows, columns = grid.size
-    missing = rows * columns - len(named)
-    if missing > _MAX_MISSING_RATIO * len(named):
-        example = next(iter(grid.paths.values())).name
-        raise BadValue(
-            f"{folder}: numbers in names like {example} would make a grid of {rows} x {columns} "
-            f"of {len(named)} pictures, so they are not row and column; "
-            "give --rows and --columns to take files in order, or --pattern"
-        )
-    if missing >= len(named):
-        row, column = grid.missing[0]
+def _check_size(folder: Path, grid: ImageGrid, rows: int | None, columns: int | None) -> None:
+    """Refuse a grid of which half is missing, or of another size than stated."""
+    size = grid.size
+    missing = size[0] * size[1] - len(grid.paths)
+    if missing >= len(grid.paths):
+        row, column = next((r, c) for r in range(size[0]) for c in range(size[1]) if (r, c) not in grid.paths)
         raise MissingFile(
             f"{folder}: the view in row {row} and column {column}, counted from 0, is missing, "
-            f"{missing} of {rows * columns} in all; add it, or give --rows and --columns for a smaller grid"
+            f"{missing} of {size[0] * size[1]} in all; add it, or give --rows and --columns, or --pattern, if numbers "
+            f"in names like {next(iter(grid.paths.values())).name} are not row and column"
         )
-    return grid
+    if (rows or size[0], columns or size[1]) != size:
+        raise BadValue(
+            f"{folder}: --pattern makes a grid of {size[0]} x {size[1]}, --rows and --columns say otherwise; "
+            "give one of them, or correct them"
+        )
+
+
+def nodes_of(places: Places, size: tuple[int, int] | None = None) -> tuple[list[Node], str]:
+    """Return row and column of each picture, and a sentence on how they follow, empty where the names say them.
+
+    Parameters
+    ----------
+    places : dict of str to list of float
+        Numbers of the names.
+    size : (int, int), optional
+        Rows and columns for running numbers, if known; otherwise a square number of pictures makes a square.
+
+    Raises
+    ------
+    BadValue
+        Running numbers have gaps, or no known size.
+    """
+    if {"row", "column"} <= places.keys():
+        return [(int(row), int(column)) for row, column in zip(places["row"], places["column"], strict=True)], ""
+    if {"x", "y"} <= places.keys():
+        across, down = np.array(places["x"]), np.array(places["y"])
+        gap = _SAME_LINE * max(float(np.diff(np.sort(values)).max(initial=0.0)) for values in (across, down))
+        nodes = list(zip(_lines(down, gap), _lines(across, gap), strict=True))
+        return nodes, "rows and columns follow from the positions in the names: x along a row, y along a column"
+    indices = [int(index) for index in places["index"]]
+    first, last, count = min(indices), max(indices), len(indices)
+    side = math.isqrt(count)
+    rows, columns = size or (side, side)
+    if len(set(indices)) != count:
+        double = next(index for index in indices if indices.count(index) > 1)
+        raise BadValue(
+            f"two pictures have the number {double}; keep one of them, or give --pattern, or --rows and --columns"
+        )
+    if rows * columns != count or last - first != count - 1:
+        gaps = sorted(set(range(first, last + 1)) - set(indices))[:1] if last - first < 2 * count else []
+        lacks = f" without {gaps[0]}" if gaps else ""
+        raise BadValue(
+            f"names count {count} pictures by one number, from {first} to {last}{lacks}, which is no square grid "
+            "and no row and column; give --rows and --columns to take files in order, or --pattern"
+        )
+    remark = f"names count {count} pictures by one number; they are taken as {side} x {side}, row by row"
+    return [divmod(index - first, columns) for index in indices], "" if size else remark
+
+
+def _lines(values: NDArray[np.float64], gap: float) -> list[int]:
+    """Return the number of the row or column of each position: a new one begins after a gap."""
+    order = np.argsort(values)
+    numbers = np.empty(len(values), int)
+    numbers[order] = np.append(0, np.cumsum(np.diff(values[order]) > gap))
+    return [int(number) for number in numbers]
+
+
+def measured_steps(positions: Mapping[Node, tuple[float, float]]) -> dict[Node, Steps]:
+    """Return measured positions (x, y) of cameras in steps of the grid's columns, right and down.
+
+    The unit and the directions of the positions are not known, so these are taken from the nodes: right is where
+    columns grow, down where rows grow, and the mean distance between columns is 1. The distance between rows follows in
+    that unit. Where there is one row, or one column, the direction across it is not known and deviations are dropped.
+
+    Raises
+    ------
+    BadValue
+        The positions do not follow rows and columns.
+    """
+    nodes = np.array(list(positions), float)
+    places = np.array(list(positions.values()), float)
+    centred, moved = nodes - nodes.mean(axis=0), places - places.mean(axis=0)
+    slopes = np.linalg.lstsq(centred, moved, rcond=None)[0]  # (row, column) by (x, y)
+    along = np.array([slopes[1, 0], slopes[0, 1]])  # x per column, y per row
+    extent = np.ptp(nodes[:, ::-1], axis=0)  # columns, rows
+    unit = float(abs(along[0]) if extent[0] else abs(along[1]))
+    fits = unit > 0 and np.sqrt(np.mean((moved - centred @ slopes) ** 2)) <= _MAX_RMS_STEPS * unit
+    apart = np.abs(along) >= _MIN_STEP * unit
+    if not fits or np.abs(np.diag(slopes)).max() > _MAX_RMS_STEPS * unit or not (apart | (extent == 0)).all():
+        raise BadValue(
+            "the positions in the names do not follow their rows and columns (x along a row, y along a column); "
+            "exchange {x} and {y} in --pattern, or put * in their place to do without"
+        )
+    steps = moved * np.sign(along) / unit * (extent > 0)
+    first = steps[int(np.argmin(nodes.sum(axis=1)))]
+    return {node: (float(right), float(down)) for node, (right, down) in zip(positions, steps - first, strict=True)}

@@ -2,9 +2,9 @@
 
 import math
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
@@ -23,12 +23,12 @@ from faintfield.rig.plan import grid_nodes
 # DN of the largest value of float pictures: below the end of 16 bits, so that no pixel counts as saturated.
 _LARGEST_DN = 65534.0
 
-type _Views = Callable[[], Iterator[tuple[Path, NDArray[Any]]]]
+type _Views = Callable[[], Iterable[tuple[Path, NDArray[Any]]]]
 
 
 @dataclass(frozen=True)
-class FoundViews:
-    """The views of a folder or a file.
+class UnpackedViews:
+    """Views of a folder or a file.
 
     Attributes
     ----------
@@ -43,17 +43,16 @@ class FoundViews:
     grid: ImageGrid
     sources: list[Path]
     dn_per_value: float | None = None
-    said: list[str] = field(default_factory=list)
 
 
 @contextmanager
-def found_views(
+def unpack_views(
     src: Path,
     rows: int | None = None,
     columns: int | None = None,
     pattern: str | None = None,
     running: tuple[int, int] | None = None,
-) -> Iterator[FoundViews]:
+) -> Iterator[UnpackedViews]:
     """Find the views of a folder, see `find_grid`, or of one file; unpack what is no 8- or 16-bit picture by itself.
 
     Parameters
@@ -74,43 +73,33 @@ def found_views(
     folder = Path(mkdtemp(prefix="faintfield-views-"))
     try:
         if is_file(src):
-            yield _of_one_file(src, folder, rows, columns)
+            grid, views = _divide_file(src, folder, rows, columns)
+            yield _unpack(UnpackedViews(grid, [src]), views, folder)
             return
         grid = find_grid(src, rows, columns, pattern, running=running)
-        paths = list(grid.paths.values())
-        found = FoundViews(grid, paths, said=grid.said)
-        if read_frame(paths[0]).pixels_dn.dtype.kind == "f":
-            written, factor = _whole_numbers(lambda: ((path, read_frame(path).pixels_dn) for path in paths), folder)
-            found = replace(
-                found,
-                grid=replace(grid, paths=dict(zip(grid.paths, written, strict=True))),
-                dn_per_value=factor,
-                said=[*grid.said, _scaled(factor)],
-            )
-        yield found
+        packed = UnpackedViews(grid, list(grid.paths.values()))
+        if read_frame(packed.sources[0]).pixels_dn.dtype.kind == "f":
+            yield _unpack(packed, lambda: ((path, read_frame(path).pixels_dn) for path in packed.sources), folder)
+        else:
+            yield packed
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _of_one_file(src: Path, folder: Path, rows: int | None, columns: int | None) -> FoundViews:
-    """Return the views in one file, unpacked into a folder."""
-    suffix = src.suffix.lower()
-    if suffix not in IMAGE_SUFFIXES:
+def _divide_file(src: Path, folder: Path, rows: int | None, columns: int | None) -> tuple[ImageGrid, _Views]:
+    """Return the grid of the views in one file, as files of their own that are not written yet, and these views."""
+    readable = IMAGE_SUFFIXES - RAW_SUFFIXES
+    if src.suffix.lower() not in readable:
         raise BadValue(
-            f"{src}: files of {suffix or 'no kind'} are not read (read are {', '.join(sorted(IMAGE_SUFFIXES))}); "
-            "convert it to PNG or TIFF, a picture for each view"
+            f"{src}: is no file that views are unpacked from (these are {', '.join(sorted(readable))}); name a folder "
+            "of pictures, a TIFF with a picture for each view, or a picture that holds them in rows and columns"
         )
-    if suffix in RAW_SUFFIXES:
-        raise BadValue(
-            f"{src}: is no file that views are unpacked from; name a folder of pictures, a TIFF with a picture for "
-            "each view, or a picture that holds them in rows and columns"
-        )
-    count, said = pages_in(src), []
+    count, remarks = pages_in(src), []
     side = math.isqrt(count)
     guessed = count > 1 and rows is None and columns is None and side**2 == count
     if guessed:
         rows, columns = side, side
-        said.append(f"{src.name} holds {count} pictures; they are taken as {side} x {side}, row by row")
+        remarks.append(f"{src.name} holds {count} pictures; they are taken as {side} x {side}, row by row")
     if rows is None and columns is None:
         holds = f"holds {count} pictures, which are no square grid" if count > 1 else "holds one picture"
         raise BadValue(f"{src}: {holds}; give --rows and --columns of the views in it")
@@ -120,18 +109,11 @@ def _of_one_file(src: Path, folder: Path, rows: int | None, columns: int | None)
             f"{src}: holds {count} pictures, a grid of {rows} x {columns} needs {rows * columns}; correct --rows and "
             "--columns"
         )
-    names = [folder / f"{src.stem}_r{row}_c{column}.tiff" for row, column in grid_nodes(rows, columns)]
-
-    def pages() -> Iterator[tuple[Path, NDArray[Any]]]:
-        return ((name, read_frame(src, page=index).pixels_dn) for index, name in enumerate(names))
-
-    def tiles() -> Iterator[tuple[Path, NDArray[Any]]]:
-        return zip(names, _tiles(src, rows, columns), strict=True)
-
-    paths, factor = _unpacked(pages if count > 1 else tiles, rows * columns, folder)
-    said += [_scaled(factor)] if factor is not None else []
-    grid = ImageGrid(dict(zip(grid_nodes(rows, columns), paths, strict=True)), guessed=guessed)
-    return FoundViews(grid, [src], factor, said)
+    paths = {node: folder / f"{src.stem}_r{node[0]}_c{node[1]}.tiff" for node in grid_nodes(rows, columns)}
+    grid = ImageGrid(paths, remarks=remarks, guessed=guessed)
+    if count > 1:
+        return grid, lambda: ((path, read_frame(src, page=page).pixels_dn) for page, path in enumerate(paths.values()))
+    return grid, lambda: zip(paths.values(), _tiles(src, rows, columns), strict=True)
 
 
 def _tiles(src: Path, rows: int, columns: int) -> list[NDArray[Any]]:
@@ -143,25 +125,29 @@ def _tiles(src: Path, rows: int, columns: int) -> list[NDArray[Any]]:
             f"{src}: is {width} x {height} px, which {columns} columns and {rows} rows do not divide; correct --rows "
             "and --columns, or crop the margins away"
         )
-    tall, wide = height // rows, width // columns
-    return [picture[r * tall : (r + 1) * tall, c * wide : (c + 1) * wide] for r, c in grid_nodes(rows, columns)]
+    return [tile for line in np.split(picture, rows) for tile in np.split(line, columns, axis=1)]
 
 
-def _unpacked(views: _Views, count: int, folder: Path) -> tuple[list[Path], float | None]:
-    """Write views as files of their own; return these, and the factor of float ones."""
-    _, first = next(views())
-    require_room(folder, count * 2 * first.size)
-    if first.dtype.kind == "f":
-        return _whole_numbers(views, folder)
+def _unpack(packed: UnpackedViews, views: _Views, folder: Path) -> UnpackedViews:
+    """Write views as files of their own; floats become 16-bit numbers, linear, all by one factor."""
+    grid = packed.grid
+    _, first = next(iter(views()))
+    require_room(folder, len(grid.paths) * 2 * first.size)
+    factor = _dn_per_value(views) if first.dtype.kind == "f" else None
     paths = []
     for path, pixels in views():
-        write_frame(path, pixels)
-        paths.append(path)
-    return paths, None
+        paths.append(folder / f"{path.stem}.tiff")
+        whole = pixels if factor is None else np.rint(np.maximum(pixels, 0) * factor).astype(np.uint16)
+        write_frame(paths[-1], whole)
+    remarks = grid.remarks.copy()
+    if factor is not None:
+        remarks.append(f"float values became 16-bit numbers, linear, {factor:.6g} DN for 1")
+    grid = replace(grid, paths=dict(zip(grid.paths, paths, strict=True)), remarks=remarks)
+    return UnpackedViews(grid, packed.sources, factor)
 
 
-def _whole_numbers(views: _Views, folder: Path) -> tuple[list[Path], float]:
-    """Write float pictures as 16-bit ones, linear, all by one factor; return the files and the factor.
+def _dn_per_value(views: _Views) -> float:
+    """Return the factor by which float pictures become 16-bit ones.
 
     Raises
     ------
@@ -170,7 +156,7 @@ def _whole_numbers(views: _Views, folder: Path) -> tuple[list[Path], float]:
     WrongBitDepth
         A picture does not hold floats.
     """
-    least, largest, darkest = 0.0, 0.0, folder
+    least, largest, darkest = 0.0, 0.0, Path()
     for path, pixels in views():
         if pixels.dtype.kind != "f":
             raise WrongBitDepth(
@@ -187,12 +173,4 @@ def _whole_numbers(views: _Views, folder: Path) -> tuple[list[Path], float]:
             f"{darkest}: holds {least:g}, and the largest value of all pictures is {largest:g}; light is not negative: "
             "add one number to all pictures, and state it by --offset-dn, in DN as the import scales them"
         )
-    paths = []
-    for path, pixels in views():
-        paths.append(folder / f"{path.stem}.tiff")
-        write_frame(paths[-1], np.rint(np.maximum(pixels, 0) * factor).astype(np.uint16))
-    return paths, factor
-
-
-def _scaled(factor: float) -> str:
-    return f"float values became 16-bit numbers, linear, {factor:.6g} DN for 1"
+    return factor

@@ -28,16 +28,16 @@ def asked_tone(*, linear: bool, srgb: bool) -> Tone | None:
     return "linear" if linear else "srgb" if srgb else None
 
 
-def tone_of(path: Path, first: Frame, asked: Tone | None) -> Tone:
+def tone_of(path: Path, first: Frame, requested: Tone | None) -> Tone:
     """Return the tone curve of pictures, as asked for; say what is assumed.
 
     By default it is that of sRGB for 8 bits, unless a PNG states a gamma of 1, and none for others.
     """
-    if asked == "srgb" and path.suffix.lower() in RAW_SUFFIXES:
+    if requested == "srgb" and path.suffix.lower() in RAW_SUFFIXES:
         raise BadValue(f"{path}: is a raw file, which has no tone curve; leave --srgb out")
     curved = first.pixels_dn.dtype == np.uint8 and not _states_linear(path)
-    tone: Tone = asked or ("srgb" if curved else "linear")
-    if asked is None and tone == "srgb":
+    tone: Tone = requested or ("srgb" if curved else "linear")
+    if requested is None and tone == "srgb":
         inform(
             "8-bit pictures are taken to have the tone curve of sRGB, which is undone; give --linear if their values "
             "are proportional to light"

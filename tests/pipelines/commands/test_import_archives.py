@@ -12,7 +12,7 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
-from faintfield.calib.arrangement.orientation import Orientation
+from faintfield.calib.arrangement.nodes import Orientation
 from faintfield.pipelines.formats.exchange.image_grid import find_grid
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.sets.elemental_set import load_set
@@ -74,7 +74,8 @@ def test_turned_grid_takes_positions_along(transpose: bool, tmp_path: Path) -> N
     places = {(r, c): (60.0 * c + r, 50.0 * r - 0.5 * c * c) for r in range(2) for c in range(3)}
     names = [f"out_{r:02}_{c:02}_{y:.3f}_{x:.3f}_.png" for (r, c), (x, y) in places.items()]
     grid = find_grid(folder_of(tmp_path / "src", names))
-    turned = grid.turned(Orientation(transpose, not transpose, transpose))
+    orientation = Orientation(transpose, not transpose, transpose)
+    turned = grid.moved(orientation.apply(list(grid.paths)), transposed=transpose)
     assert turned.size == ((3, 2) if transpose else (2, 3))
     nodes = {path.name: node for node, path in grid.paths.items()}
     assert grid.measured is not None

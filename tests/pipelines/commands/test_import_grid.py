@@ -36,7 +36,7 @@ def _grid_names(rows: Iterable[int], columns: Iterable[int]) -> list[str]:
 
 
 def test_nodes_are_last_two_numbers_of_names(tmp_path: Path, done: Command) -> None:
-    src = _pictures(tmp_path / "src", _grid_names((8, 9), (9, 10, 11)))
+    src = _pictures(tmp_path / "src", _grid_names((8, 10), (9, 12, 15)))
     result = json.loads(done("--json", "import", "grid", src, tmp_path / "out", "--pitch-mm", 50, "--linear").stdout)
     assert (result["rows"], result["columns"], result["size_px"]) == (2, 3, [8, 6])
     elemental_set = load_set(tmp_path / "out")
@@ -51,7 +51,7 @@ def test_nodes_are_last_two_numbers_of_names(tmp_path: Path, done: Command) -> N
 @pytest.mark.parametrize(
     ("names", "options", "failure", "words"),
     [
-        ([], (), "MissingFile", "is empty; name the folder that holds the pictures"),
+        ([], (), "MissingFile", "holds nothing; convert pictures to PNG or TIFF"),
         (["r0_c0.tiff", "r1_c1.tiff"], (), "MissingFile", "the view in row 0 and column 1, counted from 0, is missing"),
         (["a1_1.tiff", "b1_1.tiff"], (), "BadValue", "is at node (1, 1) like a1_1.tiff"),
         (["a.tiff", "b.tiff"], ("--rows", 3), "MissingFile", "holds 2 pictures, a grid of 3 x 1 needs 3"),

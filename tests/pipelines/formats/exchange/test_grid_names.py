@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from faintfield.calib.arrangement.nodes import Node
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.exchange.grid_names import by_number, places_by_habit, places_by_pattern
-from faintfield.pipelines.formats.exchange.grid_places import Node, measured_steps, nodes_of
+from faintfield.pipelines.formats.exchange.image_grid import measured_steps, nodes_of
 
 NODES = [(row, column) for row in range(3) for column in range(4)]
 
@@ -88,11 +89,10 @@ def test_pattern_reads_names(pattern: str, names: list[str], nodes: list[Node]) 
 
 
 def test_positions_are_those_of_their_fields() -> None:
-    (place,) = places_by_pattern("{name}_{row}_{column}_{y}_{x}.png", ["s_7_3_4_-1.5_2e1.png"])
-    assert (place.x, place.y) == (20.0, -1.5)
+    places = places_by_pattern("{name}_{row}_{column}_{y}_{x}.png", ["s_7_3_4_-1.5_2e1.png"])
+    assert places == {"row": [3], "column": [4], "y": [-1.5], "x": [20]}
     stanford = places_by_habit(["out_00_01_-381.909_1124.376_.png", "out_16_02_-777.25_1000.5.png"])
-    expected = [(0, 1, -381.909, 1124.376), (16, 2, -777.25, 1000.5)]
-    assert [(place.row, place.column, place.y, place.x) for place in stanford] == expected
+    assert stanford == {"row": [0, 16], "column": [1, 2], "y": [-381.909, -777.25], "x": [1124.376, 1000.5]}
 
 
 def test_unfit_pattern_is_refused() -> None:
