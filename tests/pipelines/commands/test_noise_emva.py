@@ -13,7 +13,6 @@ from faintfield.pipelines.commands.noise import noise
 from faintfield.pipelines.formats.results.noise import NoiseRecord
 from faintfield.pipelines.formats.results.noise_emva import EmvaRecord
 from faintfield.pipelines.formats.results.noise_fit import Measured
-from faintfield.pipelines.pages import noise_page
 from faintfield.pipelines.pages.emva_page import EMVA_PAGE
 from tests.calib.noise.darkroom import specimen
 from tests.pipelines.noise_sets import measure_sensor, take_set, write_frames
@@ -31,7 +30,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, NoiseRecor
         (np.minimum(pixels, TOP_DN).astype(np.uint16), keys) for pixels, keys in take_set(chip, rng, photons=light)
     ]
     write_frames(folder, frames, saturation_dn=float(TOP_DN))
-    with mock.patch(f"{noise_page.__name__}.draw_page", return_value=b"page"):
+    with mock.patch("faintfield.pipelines.workflows.noise.draw_page", return_value=b"page"):
         return folder, noise(folder)
 
 
@@ -81,7 +80,7 @@ def test_page_shows_quantities_and_loads_nothing(measured: tuple[Path, NoiseReco
 
 def test_without_flats_missing_numbers_have_reasons(tmp_path: Path) -> None:
     chip, rng = specimen(5, dark_current_e_per_s=5.0)
-    with mock.patch(f"{noise_page.__name__}.draw_page", return_value=b"page"):
+    with mock.patch("faintfield.pipelines.workflows.noise.draw_page", return_value=b"page"):
         record = noise(write_frames(tmp_path, take_set(chip, rng, frames=6)))
     emva = emva_of(record)
     assert emva.dark_noise_exposure_s == 0
