@@ -156,10 +156,13 @@ def _bright_image(darks: list[Series], calibration: NoiseCalibration) -> MeanIma
         return None
     span = _end_dn(calibration) - offset
 
-    def off(one: Series) -> float:
-        return abs((float(one.levels_dn.mean()) - offset) / span - _BRIGHT_SHARE)
+    def distance(flat: Series) -> float:
+        return abs((float(flat.levels_dn.mean()) - offset) / span - _BRIGHT_SHARE)
 
-    flat = min(several, key=lambda flat: (-flat.frames, off(flat)) if off(flat) < _BRIGHT_WITHIN else (0, off(flat)))
+    def rank(flat: Series) -> tuple[int, float]:
+        return -flat.frames if distance(flat) < _BRIGHT_WITHIN else 0, distance(flat)
+
+    flat = min(several, key=rank)
     dark = _dark_image(darks, calibration, flat.conditions.exposure_s, nearest=True)
     if dark is None:
         return None

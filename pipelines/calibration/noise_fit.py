@@ -36,27 +36,27 @@ def _measured(estimate: Estimate) -> Measured:
     return Measured(estimate.value, estimate.se, estimate.ci95, estimate.why)
 
 
-def _left_out(one: Series, why: str) -> GoodnessRecord:
+def _left_out(series: Series, why: str) -> GoodnessRecord:
     """Return the record of a series that was left out."""
-    is_of = one.conditions
-    return GoodnessRecord(is_of.kind, is_of.exposure_s, is_of.level, one.frames, left_out=why)
+    conditions = series.conditions
+    return GoodnessRecord(conditions.kind, conditions.exposure_s, conditions.level, series.frames, left_out=why)
 
 
-def _goodness(one: SeriesGoodness) -> GoodnessRecord:
+def _goodness(fit: SeriesGoodness) -> GoodnessRecord:
     """Return the record of a series that was used."""
-    is_of = one.series.conditions
+    conditions = fit.series.conditions
     return GoodnessRecord(
-        is_of.kind,
-        is_of.exposure_s,
-        is_of.level,
-        one.series.frames,
-        noise_excess=one.noise_excess,
-        noise_se=one.noise_se,
-        level_residual_dn=one.level_residual_dn,
-        blocks=_per_freedom(one.blocks),
-        rows=_per_freedom(one.rows),
-        columns=_per_freedom(one.columns),
-        by_frame=_per_freedom(one.frames),
+        conditions.kind,
+        conditions.exposure_s,
+        conditions.level,
+        fit.series.frames,
+        noise_excess=fit.noise_excess,
+        noise_se=fit.noise_se,
+        level_residual_dn=fit.level_residual_dn,
+        blocks=_per_freedom(fit.blocks),
+        rows=_per_freedom(fit.rows),
+        columns=_per_freedom(fit.columns),
+        by_frame=_per_freedom(fit.frames),
     )
 
 

@@ -162,11 +162,11 @@ def _inform_of(record: "PredictionRecord") -> None:
     time = f"unknown: {record.time_s.why}" if known_s is None else f"{format_duration(known_s)} without prompts"
     shape = f"{record.rows} x {record.columns} nodes {record.pitch_mm:g} mm apart"
     inform(f"{record.rig}: {shape}, frames at each: {record.frames_per_node}, {_exposures(record)}; {time}")
-    noise, dark = _words(record.read_noise_e, "e⁻"), _words(record.dark_current_e_per_s, "e⁻/s")
+    noise, dark = _number_text(record.read_noise_e, "e⁻"), _number_text(record.dark_current_e_per_s, "e⁻/s")
     inform(f"noise: read noise {noise}; dark current {dark}; from {record.noise_from}")
-    light = f"{_words(record.light_e, 'e⁻')} per pixel in a frame, photons: {_words(record.photons)}"
+    light = f"{_number_text(record.light_e, 'e⁻')} per pixel in a frame, photons: {_number_text(record.photons)}"
     inform(f"light: {light}; {record.light_from}")
-    snrs = f"SNR {_words(record.snr)} by eq. (4), {_words(record.snr_linear)} by eq. (7)"
+    snrs = f"SNR {_number_text(record.snr)} by eq. (4), {_number_text(record.snr_linear)} by eq. (7)"
     inform(f"one elemental image of an even object: {snrs}")
     for depth in record.depths:
         _inform_of_depth(depth, record)
@@ -187,16 +187,18 @@ def _inform_of_depth(depth: "DepthPrediction", record: "PredictionRecord") -> No
     if everywhere is not None:
         part = f"{everywhere[0]:.0f} x {everywhere[1]:.0f} mm" if min(everywhere) > 0 else "no part"
         views = f"its middle is seen by {depth.views} of {count} views, {part} by all"
-    inform(f"{name}: {views}; sigma {_words(depth.sigma_e, 'e⁻')}")
-    across, blur = _words(depth.mm_per_px, "mm"), _words(depth.blur_mm, "mm")
-    inform(f"  a pixel: {across}; blur: {blur}; a pixel of parallax: {_words(depth.depth_step_mm, 'mm')} of depth")
+    inform(f"{name}: {views}; sigma {_number_text(depth.sigma_e, 'e⁻')}")
+    across, blur = _number_text(depth.mm_per_px, "mm"), _number_text(depth.blur_mm, "mm")
+    inform(
+        f"  a pixel: {across}; blur: {blur}; a pixel of parallax: {_number_text(depth.depth_step_mm, 'mm')} of depth"
+    )
     for feature in depth.features:
-        side = f"{feature.side_px:.3g} px ({_words(feature.side_mm, 'mm')})"
-        contrast = _words(feature.smallest_contrast)
+        side = f"{feature.side_px:.3g} px ({_number_text(feature.side_mm, 'mm')})"
+        contrast = _number_text(feature.smallest_contrast)
         hidden = (feature.smallest_contrast.value or 0.0) > 1
         contrast += ", so none is" if hidden else ""
         inform(f"  square of {side}: visible (k = {record.rose_k:g}) from contrast {contrast}")
-        inform(f"    depth of a black one: +- {_words(feature.depth_sigma_mm, 'mm')}")
+        inform(f"    depth of a black one: +- {_number_text(feature.depth_sigma_mm, 'mm')}")
 
 
 def _inform_of_table(record: "PredictionRecord") -> None:
@@ -228,7 +230,7 @@ def _asked(row: "Alternative") -> str:
     return f"{1e3 * row.exposure_s:>7g} ms {shape:>9} {row.frames_per_node:>6}"
 
 
-def _words(number: "Measured", unit: str = "") -> str:
+def _number_text(number: "Measured", unit: str = "") -> str:
     """Return a number with its unit and interval, or why it is unknown."""
     if number.value is None:
         return f"unknown: {number.why}"

@@ -48,9 +48,9 @@ def is_folder(path: Path) -> bool:
     return _is_there(path, Path.is_dir)
 
 
-def _is_there(path: Path, look: Callable[[Path], bool]) -> bool:
+def _is_there(path: Path, test: Callable[[Path], bool]) -> bool:
     try:
-        return look(path)
+        return test(path)
     except ValueError:  # a name with a NUL
         return False
     except OSError as failure:

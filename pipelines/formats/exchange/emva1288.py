@@ -179,9 +179,9 @@ def _measurement(keyword: str, rest: str, levels: dict[float, int]) -> NoiseFram
     return NoiseFrame("", "flat", exposure_s, None, level, numbers[1])
 
 
-def image_path(descriptor: Path, stated: str) -> Path:
+def image_path(descriptor: Path, name: str) -> Path:
     """Return the path of an image that a descriptor names with slashes of either kind."""
-    path = inside(descriptor.parent, PureWindowsPath(stated).as_posix(), f"{descriptor}: image")
+    path = inside(descriptor.parent, PureWindowsPath(name).as_posix(), f"{descriptor}: image")
     if not is_file(path):
         raise MissingFile(f"{path}: is named by {descriptor} but missing; unpack all of the data set")
     return path
