@@ -76,8 +76,7 @@ def register_commands(app: App) -> None:
         )
         for place, example in enumerate(examples, start=1):
             name = example.split()[1]
-            module = "import_grid" if name == "grid" else f"{verb}s"
-            _register(app[verb], name, f"{module}:{verb}_{name}", example, place)
+            _register(app[verb], name, f"{verb}s:{verb}_{name}", example, place)
 
 
 def _register(app: App, name: str, target: str, example: str, place: int, group: Group | None = None) -> None:

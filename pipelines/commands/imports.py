@@ -1,18 +1,48 @@
-"""`faintfield import`: sets of images, or of frames, from files of other programs; grids of pictures: `import_grid`."""
+"""`faintfield import`: sets of images, or of frames, from pictures and files of other programs."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from faintfield.pipelines.arguments import ImportOptions, Positive
+from faintfield.pipelines.arguments import Positive
+from faintfield.pipelines.formats.exchange.options import GridOptions, ImportOptions
 
 if TYPE_CHECKING:
     from faintfield.pipelines.formats.exchange.emva1288 import ImportedFrames
     from faintfield.pipelines.formats.exchange.imported_set import ImportedSet
+    from faintfield.pipelines.formats.exchange.picture_grid import ImportedGrid
 
-_DEFAULTS = ImportOptions()
+_DEFAULTS, _GRID_DEFAULTS = ImportOptions(), GridOptions()
 
 type Result = ImportedSet
 type Frames = ImportedFrames
+type Grid = ImportedGrid
+
+
+def import_grid(src: Path, out: Path, /, *, options: GridOptions = _GRID_DEFAULTS) -> Grid:
+    """Make an elemental set from pictures taken on a regular grid.
+
+    Names tell where each picture belongs: view_r3_c12.jpg, or two numbers that vary, row before column; names with
+    positions such as out_00_01_-381.909_1124.376_.png also place the cameras. One running number counts row by row. For
+    other names give --pattern, or --rows and --columns to take files in order. Row 0 is the top, column 0 the left,
+    unless the pictures show that it is otherwise: a camera that moves right sees points move left, near ones more, and
+    near things hide far ones. What they show is printed and recorded; what they leave open is taken from the names.
+
+    A parameters.cfg of the HCI 4D benchmark beside the pictures gives the scale. Pictures of 16 bits are copied as they
+    are, and floats become 16 bits by one factor. Those of 8 bits are taken to have the tone curve of sRGB, as
+    photographs have; it is undone, and they become 16-bit TIFF. Gain and noise that are not given are estimated from
+    the views.
+
+    Parameters
+    ----------
+    src
+        Folder of pictures: TIFF, PNG, JPEG, BMP, PGM, PPM, PFM, OpenEXR or raw. Or one file: a TIFF with a picture for
+        each view, row by row, or one picture with all views side by side, in --rows and --columns of equal tiles.
+    out
+        Folder to write.
+    """
+    from faintfield.pipelines.formats.exchange.picture_grid import import_pictures
+
+    return import_pictures(src, out, options)
 
 
 def import_colmap(src: Path, out: Path, /, *, options: ImportOptions = _DEFAULTS) -> Result:

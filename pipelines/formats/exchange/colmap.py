@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from faintfield.calib.lens import Lens
-from faintfield.pipelines.arguments import ImportOptions
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.exchange.imported_set import (
     ExportedSet,
@@ -25,6 +24,7 @@ from faintfield.pipelines.formats.exchange.imported_set import (
     import_posed,
     lens_of_each_view,
 )
+from faintfield.pipelines.formats.exchange.options import ImportOptions
 from faintfield.pipelines.formats.files import write_whole, writing_folder
 from faintfield.pipelines.formats.reading import is_file, read_content
 from faintfield.pipelines.formats.sets.session_set import load_set_or_session

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.lens import Lens
-from faintfield.pipelines.arguments import ImportOptions
 from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.errors import BadValue, MissingFile, WrongBitDepth, WrongSize
 from faintfield.pipelines.formats.exchange.imported_noise import NoiseOrigin, Pictures, StatedNoise, complete_noise
+from faintfield.pipelines.formats.exchange.options import ImportOptions
 from faintfield.pipelines.formats.exchange.tone import Tone, asked_tone, tone_of, without_curve
 from faintfield.pipelines.formats.files import sha256, write_json, writing_folder
 from faintfield.pipelines.formats.frames import RAW_SUFFIXES, Frame, exif_exposure_s, read_frame

@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 
 from faintfield.calib.lens import Lens
 from faintfield.calib.mrcal_loader import load_mrcal
-from faintfield.pipelines.arguments import ImportOptions
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.exchange.imported_set import (
     ExportedSet,
@@ -23,6 +22,7 @@ from faintfield.pipelines.formats.exchange.imported_set import (
     import_posed,
     lens_of_each_view,
 )
+from faintfield.pipelines.formats.exchange.options import ImportOptions
 from faintfield.pipelines.formats.files import write_whole, writing_folder
 from faintfield.pipelines.formats.frames import IMAGE_SUFFIXES
 from faintfield.pipelines.formats.reading import is_file, read_content

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.lens import Lens
-from faintfield.pipelines.arguments import ImportOptions
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.exchange.camera_to_world import rt_cam_world, turn_and_centre
 from faintfield.pipelines.formats.exchange.imported_set import (
@@ -24,6 +23,7 @@ from faintfield.pipelines.formats.exchange.imported_set import (
     import_posed,
     lens_of_each_view,
 )
+from faintfield.pipelines.formats.exchange.options import ImportOptions
 from faintfield.pipelines.formats.exchange.picture_folder import picture_named
 from faintfield.pipelines.formats.files import write_json, writing_folder
 from faintfield.pipelines.formats.frames import read_frame

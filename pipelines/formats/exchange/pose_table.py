@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from faintfield.calib.lens import Lens
-from faintfield.pipelines.arguments import ImportOptions
 from faintfield.pipelines.errors import BadValue, WrongUsage
 from faintfield.pipelines.formats.exchange.camera_to_world import rt_cam_world
 from faintfield.pipelines.formats.exchange.imported_set import (
@@ -20,6 +19,7 @@ from faintfield.pipelines.formats.exchange.imported_set import (
     import_posed,
     read_picture,
 )
+from faintfield.pipelines.formats.exchange.options import ImportOptions
 from faintfield.pipelines.formats.exchange.picture_folder import picture_named
 from faintfield.pipelines.formats.reading import read_text
 

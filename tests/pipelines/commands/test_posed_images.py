@@ -11,12 +11,12 @@ import pytest
 import tifffile
 from scipy.spatial.transform import Rotation
 
-from faintfield.pipelines.arguments import ImportOptions
 from faintfield.pipelines.commands.exports import export_colmap
 from faintfield.pipelines.commands.imports import import_colmap
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.exchange.colmap import ColmapImage, ColmapModel, read_model, write_model
 from faintfield.pipelines.formats.exchange.imported_set import relative
+from faintfield.pipelines.formats.exchange.options import ImportOptions
 from faintfield.pipelines.formats.files import sha256
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from tests.pipelines.conftest import Command, Edit, SetMaker, assert_refused
