@@ -159,7 +159,7 @@ def lab_experiment(settings: SimulatedSettings) -> SimulatedExperiment:
 SET_POINT_C = -20.0
 
 # What the cooler's control leaves: three waves of this amplitude, and the range of their periods.
-_RIPPLE_K, _WAVES, _PERIODS_S = 0.03, 3, (40.0, 200.0)
+_RIPPLE_K, _RIPPLES, _PERIODS_S = 0.03, 3, (40.0, 200.0)
 
 
 class Cooling:
@@ -174,8 +174,8 @@ class Cooling:
         self._set_point_c = set_point_c
         self._time_s = time_s
         generator = np.random.default_rng([seed, 2])
-        self._per_s = 2.0 * np.pi / generator.uniform(*_PERIODS_S, _WAVES)
-        self._phase = generator.uniform(0.0, 2.0 * np.pi, _WAVES)
+        self._per_s = 2.0 * np.pi / generator.uniform(*_PERIODS_S, _RIPPLES)
+        self._phase = generator.uniform(0.0, 2.0 * np.pi, _RIPPLES)
 
     def temperature_c(self, after_s: float) -> float:
         """Return the temperature at a time after the camera was switched on."""
