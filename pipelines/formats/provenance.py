@@ -3,6 +3,7 @@
 import platform
 from collections.abc import Mapping
 from contextlib import suppress
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -49,6 +50,7 @@ def provenance[Options](
     return Provenance(units=units, command=command, options=options, inputs=inputs, versions=versions())
 
 
+@cache  # finding them takes 10 ms
 def versions() -> dict[str, str]:
     """Return the versions of the packages that compute results, by name; one that is not installed is left out."""
     found = {"python": platform.python_version()}

@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.cli import run
 from faintfield.pipelines.formats.image_files import encoded
+from faintfield.pipelines.pages import report_calibration, report_sets, report_viewer
+from faintfield.pipelines.pages.page import LOSSLESS, data_uri
 from faintfield.pipelines.reconstruction.depth import search as surface_depths
 from faintfield.pipelines.reconstruction.options import Options
 from faintfield.pipelines.reconstruction.planes import penalised
@@ -103,15 +105,17 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
 
 
 @contextmanager
-def drawing_nothing() -> Iterator[None]:
-    """Leave drawings empty: text takes most of the time of a page."""
+def drawing_nothing() -> Iterator[pytest.MonkeyPatch]:
+    """Leave drawings empty, and pictures as they are: text and compression take most of the time of a page."""
 
     def save(_: Figure, file: Any, format: str, **__: object) -> None:
         file.write("<svg></svg>" if format == "svg" else encoded(np.zeros((4, 4), np.uint8), ".png"))
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Figure, "savefig", save)
-        yield
+        for module in (report_calibration, report_sets, report_viewer):
+            patch.setattr(module, "smaller_uri", lambda content, quality=LOSSLESS: data_uri(content, ".png"))
+        yield patch
 
 
 def run_undrawn(*words: object) -> None:
@@ -120,11 +124,11 @@ def run_undrawn(*words: object) -> None:
         assert run([str(word) for word in words]) == 0
 
 
-@pytest.fixture
-def undrawn() -> Iterator[None]:
-    """Pages with empty drawings, for tests of something else."""
-    with drawing_nothing():
-        yield
+@pytest.fixture(autouse=True)
+def undrawn() -> Iterator[pytest.MonkeyPatch]:
+    """Pages with empty drawings; a test of drawings calls `undo`."""
+    with drawing_nothing() as patch:
+        yield patch
 
 
 @pytest.fixture(scope="session")

@@ -40,7 +40,6 @@ def test_wrong_usage_ends_with_code_2(
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_output_is_a_report_or_one_json(scene: Path, tmp_path: Path, done: Command) -> None:
     out = tmp_path / "out"
     words = ("reconstruct", scene, "--out", out, "--depth-mm", 500, "--method", "backprojection")

@@ -103,7 +103,6 @@ def test_noise_and_exposure_are_those_of_options(tmp_path: Path, done: Command) 
     assert json.loads((tmp_path / "out" / "provenance.json").read_text())["noise"] == {"how": "stated"}
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_point_is_sharp_at_its_disparity(tmp_path: Path, done: Command) -> None:
     (tmp_path / "src").mkdir()
     for row, column in np.ndindex(3, 3):

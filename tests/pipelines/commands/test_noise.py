@@ -22,7 +22,6 @@ from tests.pipelines.forms import check_layout, read_record
 from tests.pipelines.noise_sets import measure_sensor, take_set, write_frames
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_numbers_maps_and_page_are_written(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     chip, rng = specimen(1, hot_fraction=0.005, prnu=0.01)
     folder = write_frames(tmp_path / "set", take_set(chip, rng, photons=(4000.0, 20000.0)), saturation_dn=65535.0)

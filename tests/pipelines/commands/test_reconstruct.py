@@ -17,9 +17,6 @@ from faintfield.recon.solver.penalties import total_variation
 from tests.pipelines.conftest import Command, Edit, run_undrawn
 from tests.pipelines.forms import read_record
 
-pytestmark = pytest.mark.usefixtures("undrawn")
-
-
 DEPTHS = ("--depth-mm", 500, "--depth-mm", 700)
 ONE_STEP_LATE = ("--method", "pmlem-osl", "--penalty-weight")
 METHODS = ("backprojection", "mlem", "pmlem-osl", "pmlem")

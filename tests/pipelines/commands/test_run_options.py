@@ -16,8 +16,6 @@ from tests.pipelines.forms import read_record
 from tests.pipelines.sessions import steps_run
 from tests.pipelines.surfaces import Searches
 
-pytestmark = pytest.mark.usefixtures("undrawn")
-
 _SEARCHED_MM = (400.0, 900.0)
 _FAIL = mock.Mock(side_effect=NothingInFocus("begun"))
 _FAST = Options(method=["backprojection"], pitch_mm=16.0)

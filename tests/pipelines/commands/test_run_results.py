@@ -26,8 +26,6 @@ from faintfield.rig.session.verify import verify
 from tests.pipelines.forms import flip_last_bit
 from tests.pipelines.sessions import SWEEPS, captured, rig_toml, steps_run
 
-pytestmark = pytest.mark.usefixtures("undrawn")
-
 PLANE = Options(depth_mm=[700.0], method=["backprojection"])
 OTHER_PLANE = replace(PLANE, depth_mm=[500.0])
 REFUSE = mock.Mock(side_effect=BadValue("begun; wait"))

@@ -22,8 +22,6 @@ WITH_PLANE = replace(ASKED, depth_mm=[700.0], method=["backprojection"], pitch_m
 OTHER_PLANE = replace(WITH_PLANE, depth_mm=[500.0])
 OTHER_RANGE = replace(ASKED, depth_range_mm="400:1000")
 
-pytestmark = pytest.mark.usefixtures("undrawn")
-
 
 def test_only_outdated_surface_is_made_again(seen: Searches, session: Path) -> None:
     out = session / "reconstructions"

@@ -195,7 +195,7 @@ def test_truth_of_surfaces_is_depth_and_light(colour: str, tmp_path: Path, done:
     assert seen.mean() == pytest.approx(light[inside].mean(), rel=0.01)
 
 
-def test_set_of_surfaces_has_no_metrics_of_planes(tmp_path: Path, done: Command, undrawn: None) -> None:
+def test_set_of_surfaces_has_no_metrics_of_planes(tmp_path: Path, done: Command) -> None:
     folder, out = tmp_path / "set", tmp_path / "planes"
     done("simulate", folder, "--objects", "surfaces", *SMALL)
     done("reconstruct", folder, "--depth-mm", 600, "--method", "backprojection", "--out", out)

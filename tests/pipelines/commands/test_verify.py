@@ -18,8 +18,6 @@ from tests.pipelines.by_hand import write_by_hand
 from tests.pipelines.conftest import Command, assert_refused, run_undrawn
 from tests.pipelines.forms import files_in, flip_last_bit
 
-pytestmark = pytest.mark.usefixtures("undrawn")
-
 PLANES = 5
 SWEEP = ("--sweep-mm", f"500:700:{PLANES}", "--passes", "2", "--penalty-weight", "0.1", "--uncertainty")
 

@@ -117,7 +117,6 @@ def imported(with_scale: Path, tmp_path: Path, done: Command) -> tuple[Path, str
     return without_scale(tmp_path / "set", "disparity_px", "relative"), ended.stdout + ended.stderr
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_planes_are_written_in_units_of_set(tmp_path: Path, done: Command) -> None:
     """The same set in DN, and relative to white, gives the same planes times the gain, and times that over white."""
     scene, planes, records = tmp_path / "scene", {}, {}

@@ -22,8 +22,6 @@ from tests.pipelines.conftest import Command, assert_refused, run_undrawn
 from tests.pipelines.forms import read_record
 from tests.pipelines.surfaces import write_example
 
-pytestmark = pytest.mark.usefixtures("undrawn")
-
 METHOD_TITLES = {"backprojection": "back-projection", "pmlem-osl": "PMLEM (one-step-late, TV)"}
 VOID = {"meta", "img", "input", "br", "hr", "link"}
 

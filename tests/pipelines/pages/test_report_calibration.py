@@ -49,18 +49,12 @@ def drawn(simulated_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 
 @pytest.fixture
-def session_to_draw(drawn: Path, tmp_path: Path) -> Path:
+def session(drawn: Path, tmp_path: Path) -> Path:
     """A folder as a session is: calibrations in it, planes two folders down."""
     shutil.copytree(drawn, tmp_path / "session" / "reconstructions" / "scene")
     (tmp_path / "session" / "noise.json").write_text(json.dumps(NOISE))
     (tmp_path / "session" / "geometry.json").write_text(json.dumps(_geometry()))
     return tmp_path / "session"
-
-
-@pytest.fixture
-def session(session_to_draw: Path, undrawn: None) -> Path:
-    """The same, with empty drawings on its pages."""
-    return session_to_draw
 
 
 @pytest.mark.parametrize(
@@ -167,8 +161,8 @@ def test_photon_budget_is_that_of_papers_equations() -> None:
     assert {number for row in budget.light for number in (row.photons, row.flux, row.all_views)} == {None}
 
 
-def test_weights_tried_and_certificates_are_shown(session_to_draw: Path, done: Command) -> None:
-    session = session_to_draw
+def test_weights_tried_and_certificates_are_shown(session: Path, done: Command, undrawn: pytest.MonkeyPatch) -> None:
+    undrawn.undo()
     path = session / "reconstructions" / "scene" / "reconstruction.json"
     content = json.loads(path.read_text())
     curve = [{"weight": 0.1 * 2**k, "held_out": 50.0 + (k - 2) ** 2} for k in range(5)]
@@ -188,7 +182,8 @@ def test_weights_tried_and_certificates_are_shown(session_to_draw: Path, done: C
     assert "0.823 %: stopped early" in part
 
 
-def test_large_views_are_cropped_pixel_for_pixel(session: Path, done: Command) -> None:
+def test_large_views_are_cropped_pixel_for_pixel(session: Path, done: Command, undrawn: pytest.MonkeyPatch) -> None:
+    undrawn.undo()
     folder = session / "reconstructions" / "scene"
     picture = np.random.default_rng(1).integers(0, 256, (700, 900), np.uint8)
     write_png(folder / "reference_view.png", picture)

@@ -85,7 +85,6 @@ def test_figures_2_and_3_show_sharpness_and_darkness(made: Path) -> None:
 
 
 @pytest.mark.deep
-@pytest.mark.usefixtures("undrawn")
 def test_figures_that_are_not_asked_for_stay(made: Path, tmp_path: Path, done: Command) -> None:
     out = Path(shutil.copytree(made, tmp_path / "out"))
     for path in {*out.glob("figure4*")} - {out / "figure4.png"}:

@@ -54,7 +54,6 @@ def test_sweep_is_in_mm_and_milliradians(sweep: Path, tmp_path: Path, done: Comm
     )
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_large_colour_planes_have_several_resolutions(
     colour_set: Path, tmp_path: Path, done: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -80,7 +79,6 @@ def test_large_colour_planes_have_several_resolutions(
             assert translation[axis] + scale[axis] * index == pytest.approx(middle)
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_only_planes_in_equal_steps_are_stacked(
     simulated_scene: Path, tmp_path: Path, done: Command, faintfield: Command
 ) -> None:

@@ -22,8 +22,6 @@ from tests.pipelines.forms import GOLDEN as GOLDEN
 from tests.pipelines.forms import form_of_result
 from tests.pipelines.surfaces import FOUND_CONFIDENCE, Searches
 
-pytestmark = pytest.mark.usefixtures("undrawn")
-
 # By the beginning of the file's name.
 KINDS: dict[str, type[msgspec.Struct]] = {
     "noise": NoiseRecord,

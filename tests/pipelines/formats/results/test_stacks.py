@@ -42,7 +42,6 @@ def test_sweep_is_imagej_stack_of_angles(sweep: Path) -> None:
         np.testing.assert_array_equal(plane, tifffile.imread(sweep / f"plane_{depth:07.1f}.tiff"))
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_planes_of_one_pitch_are_stacked_in_mm(scene: Path, tmp_path: Path, done: Command) -> None:
     words = ("--sweep-mm", "600:600.4:3", "--pitch-mm", 5, "--method", "backprojection")
     done("reconstruct", scene, *words, "--out", tmp_path)
@@ -56,7 +55,6 @@ def test_planes_of_one_pitch_are_stacked_in_mm(scene: Path, tmp_path: Path, done
     assert not (tmp_path / "one" / "stack.tiff").exists()
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_colour_sweep_is_composite(colour_set: Path, tmp_path: Path, done: Command) -> None:
     words = ("--sweep-mm", "500:600:3", "--method", "backprojection")
     done("reconstruct", colour_set, *words, "--out", tmp_path / "out")
@@ -99,7 +97,6 @@ def viewers(monkeypatch: pytest.MonkeyPatch) -> list[_Viewer]:
     return _Viewer.opened
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_planes_open_in_mm(viewers: list[_Viewer], scene: Path, tmp_path: Path, done: Command) -> None:
     methods = ("--method", "backprojection", "--method", "mlem", "--passes", 2)
     done("reconstruct", scene, "--depth-mm", 500, "--depth-mm", 700, *methods, "--out", tmp_path / "out")
