@@ -117,20 +117,20 @@ def _start(guesses: Array, squares_px: Array) -> Array:
     return state
 
 
-def _windows(image: Pixels, guesses: Array, found: Array, squares_px: Array, clear: float) -> _Windows:
-    """Return a cross of pixels along the edges about each position `found` (corner, 2), relative to the guesses."""
+def _windows(image: Pixels, guesses: Array, positions: Array, squares_px: Array, clear: float) -> _Windows:
+    """Return a cross of pixels along the edges about each position `positions` (corner, 2), relative to the guesses."""
     sides = np.linalg.norm(squares_px, axis=2)
     heights = np.abs(np.linalg.det(squares_px))[:, np.newaxis] / sides
     along = np.minimum(_MAX_ALONG_SQUARES * sides, _MAX_ALONG_PX)
     across = np.clip(clear * heights - _BLUR_OF_MARKERS_PX, _MIN_ACROSS_PX, _MAX_ACROSS_PX)
     reach = np.arange(-int(along.max()) - 1, int(along.max()) + 2)
     offsets = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 2)
-    whole = np.rint(guesses + np.clip(found, -_MAX_SHIFT_PX, _MAX_SHIFT_PX)).astype(int)[:, np.newaxis] + offsets
+    whole = np.rint(guesses + np.clip(positions, -_MAX_SHIFT_PX, _MAX_SHIFT_PX)).astype(int)[:, np.newaxis] + offsets
     limits = np.array(image.shape[::-1]) - 1
     columns, rows = np.moveaxis(np.clip(whole, 0, limits), -1, 0)
     places = whole - guesses[:, np.newaxis]
     cos, sin = np.moveaxis(squares_px / sides[..., np.newaxis], -1, 0)[..., np.newaxis]
-    x, y = np.moveaxis(places - found[:, np.newaxis], -1, 0)[:, :, np.newaxis]
+    x, y = np.moveaxis(places - positions[:, np.newaxis], -1, 0)[:, :, np.newaxis]
     beside = (np.abs(x * cos + y * sin) <= along[..., np.newaxis]) & (
         np.abs(y * cos - x * sin) <= across[..., np.newaxis]
     )

@@ -87,10 +87,10 @@ def detect_boards(image: NDArray[Any], boards: Sequence[Board]) -> list[BoardCor
     """
     light = np.asarray(image, np.float32)
     step = max(int(_MIN_PERIMETER * max(light.shape) / 4 / _MIN_MARKER_PX), 1)
-    looks = [_look(light, boards, step)]
+    parts = [_part(light, boards, step)]
     if step > 1:
-        looks += _second_looks(light, boards, looks[0])
-    found = (_detect_board(light, max(looks, key=lambda look: look.markers(board).ids.size), board) for board in boards)
+        parts += _second_parts(light, boards, parts[0])
+    found = (_detect_board(light, max(parts, key=lambda part: part.markers(board).ids.size), board) for board in boards)
     return [corners for corners in found if corners is not None]
 
 
@@ -148,7 +148,7 @@ class _Markers:
 
 
 @dataclass(frozen=True)
-class _Look:
+class _Part:
     """A part of the image, perhaps reduced, and the markers in it.
 
     Attributes
@@ -185,7 +185,7 @@ class _Look:
 type _Window = tuple[slice, slice]
 
 
-def _look(light: NDArray[np.float32], boards: Sequence[Board], step: int, window: _Window | None = None) -> _Look:
+def _part(light: NDArray[np.float32], boards: Sequence[Board], step: int, window: _Window | None = None) -> _Part:
     """Look for the markers of boards in an image or in a window of it, reduced by `step`."""
     rows, columns = window or (slice(0, light.shape[0]), slice(0, light.shape[1]))
     part = light[rows, columns]
@@ -203,19 +203,19 @@ def _look(light: NDArray[np.float32], boards: Sequence[Board], step: int, window
         numbers = np.empty(0, int) if indices is None else np.ravel(indices)
         found[dictionary] = _Markers(corners, np.array(ids, np.int32)[numbers].reshape(-1, 1))
         unknown += [outline.reshape(4, 2) for outline in others]
-    return _Look(stretched, step, (columns.start, rows.start), found, unknown)
+    return _Part(stretched, step, (columns.start, rows.start), found, unknown)
 
 
-def _second_looks(light: NDArray[np.float32], boards: Sequence[Board], first: _Look) -> list[_Look]:
+def _second_parts(light: NDArray[np.float32], boards: Sequence[Board], first: _Part) -> list[_Part]:
     """Look again at full size: at boards of which markers are missing, and for all others where anything may be one."""
     whole = slice(0, light.shape[0]), slice(0, light.shape[1])
-    looks, unseen, hulls = [], [], []
+    parts, unseen, hulls = [], [], []
     for board in boards:
         markers = first.markers(board)
         if not markers.ids.size:
             unseen.append(board)
         elif markers.ids.size < min(_MIN_TELLING, board.marker_count):
-            looks.append(_look(light, [board], 1, whole))
+            parts.append(_part(light, [board], 1, whole))
         else:
             outlines, hull = _places(first, markers, board)
             hulls.append(hull)
@@ -223,20 +223,20 @@ def _second_looks(light: NDArray[np.float32], boards: Sequence[Board], first: _L
             inside = (low >= _BORDER_PX) & (high <= -_BORDER_PX)
             window = _window(hull, light.shape)
             if markers.ids.size < inside.sum() and light[window].size:
-                looks.append(_look(light, [board], 1, window))
+                parts.append(_part(light, [board], 1, window))
     quads = [first.in_image(quad) for quad in first.unknown]
     odd = [quad for quad in quads if not any(_holds(hull, quad.mean(axis=0)) for hull in hulls)]
     if unseen and odd:
-        looks.append(_look(light, unseen, 1, _window(np.concatenate(odd), light.shape)))
-    return looks
+        parts.append(_part(light, unseen, 1, _window(np.concatenate(odd), light.shape)))
+    return parts
 
 
-def _places(look: _Look, markers: _Markers, board: Board) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _places(part: _Part, markers: _Markers, board: Board) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return where all markers of a board (marker, 4, 2) and its outline (4, 2) should be in the image."""
     printed = board.opencv_board()
     squares = np.array(printed.getObjPoints())[..., :2] / printed.getSquareLength()
     flat = squares[np.ravel(markers.ids) - board.first_marker_id].reshape(-1, 2)
-    homography = _homography(flat, look.in_image(np.reshape(markers.corners, (-1, 2))))
+    homography = _homography(flat, part.in_image(np.reshape(markers.corners, (-1, 2))))
     ends = np.array([[[0, 0], [board.columns, 0], [board.columns, board.rows], [0, board.rows]]], float)
     placed = cv2.perspectiveTransform(np.concatenate([squares, ends]).astype(float), homography)
     return placed[:-1], placed[-1]
@@ -256,29 +256,29 @@ def _window(places: NDArray[np.float64], shape: tuple[int, ...]) -> _Window:
     return slice(top, min(bottom, shape[0])), slice(left, min(right, shape[1]))
 
 
-def _detect_board(light: NDArray[np.float32], look: _Look, board: Board) -> BoardCorners | None:
+def _detect_board(light: NDArray[np.float32], part: _Part, board: Board) -> BoardCorners | None:
     """Return the corners of one board; None if none of its markers is seen."""
-    markers = look.markers(board)
+    markers = part.markers(board)
     count = markers.ids.size
     if not count:
         return None
     for legacy in (False, True) if board.rows % 2 == 0 else (False,):
         detector = _detector(board, legacy)
-        found, ids, _, _ = detector.detectBoard(look.stretched, markerCorners=markers.corners, markerIds=markers.ids)
+        found, ids, _, _ = detector.detectBoard(part.stretched, markerCorners=markers.corners, markerIds=markers.ids)
         if found is not None and len(found):  # the wrong layout gives no corners
             break
     else:
         return BoardCorners(board.name, np.empty(0, int), np.empty((0, 2)), np.empty(0), count, legacy=False)
-    guesses, ids = look.in_image(np.reshape(found, (-1, 2)).astype(float)), np.ravel(ids).astype(int)
-    squares_px = look.step * _squares_px(board.opencv_board(legacy=legacy), markers, ids)
+    guesses, ids = part.in_image(np.reshape(found, (-1, 2)).astype(float)), np.ravel(ids).astype(int)
+    squares_px = part.step * _squares_px(board.opencv_board(legacy=legacy), markers, ids)
     pixels, sigma_px = refine_corners(light, guesses, squares_px, (1 - board.marker_mm / board.square_mm) / 2)
     kept = np.isfinite(sigma_px)
     return BoardCorners(board.name, ids[kept], pixels[kept], sigma_px[kept], count, legacy)
 
 
-def _homography(flat: NDArray[np.float64], seen: NDArray[Any]) -> NDArray[np.float64]:
+def _homography(flat: NDArray[np.float64], pixels: NDArray[Any]) -> NDArray[np.float64]:
     """Return the homography from points of a board (point, 2) in squares to their images (point, 2)."""
-    homography, _ = cv2.findHomography(flat, seen, cv2.RANSAC, _MAX_MARKER_ERROR_PX)
+    homography, _ = cv2.findHomography(flat, pixels, cv2.RANSAC, _MAX_MARKER_ERROR_PX)
     return np.asarray(homography)
 
 
@@ -296,10 +296,10 @@ def _squares_px(printed: Any, markers: _Markers, corners: NDArray[np.intp]) -> N
 
 
 @lru_cache(maxsize=32)  # windows ask for perimeters of their own
-def _marker_detector(dictionary: str, wanted: tuple[int, ...], min_perimeter: float) -> Any:
+def _marker_detector(dictionary: str, marker_ids: tuple[int, ...], min_perimeter: float) -> Any:
     """Return a detector of the wanted markers only, since each candidate is compared with all markers that it knows."""
     whole = predefined_dictionary(dictionary)
-    few = cv2.aruco.Dictionary(whole.bytesList[list(wanted)], whole.markerSize, whole.maxCorrectionBits)
+    few = cv2.aruco.Dictionary(whole.bytesList[list(marker_ids)], whole.markerSize, whole.maxCorrectionBits)
     parameters = cv2.aruco.DetectorParameters()
     parameters.minMarkerPerimeterRate = min_perimeter
     return cv2.aruco.ArucoDetector(few, parameters)

@@ -24,14 +24,14 @@ logger.addHandler(logging.NullHandler())  # without --log, nothing is printed
 
 
 @contextmanager
-def logged(path: Path | None, words: Sequence[str], one_line: tuple[type[BaseException], ...]) -> Iterator[None]:
+def logged(path: Path | None, arguments: Sequence[str], one_line: tuple[type[BaseException], ...]) -> Iterator[None]:
     """Record in a file what happens while the block runs; do nothing if `path` is None.
 
     Parameters
     ----------
     path : Path, optional
         The file to append to; its folder must exist.
-    words : sequence of str
+    arguments : sequence of str
         The command and its arguments.
     one_line : tuple of exception types
         Failures that are recorded by their message; any other is recorded with its traceback.
@@ -51,7 +51,7 @@ def logged(path: Path | None, words: Sequence[str], one_line: tuple[type[BaseExc
     logging.captureWarnings(capture=True)
     begun_s = time.monotonic()
     try:
-        logger.info("begins: faintfield %s (in %s)", " ".join(words), os.getcwd())
+        logger.info("begins: faintfield %s (in %s)", " ".join(arguments), os.getcwd())
         logger.info("versions: %s", ", ".join(f"{name} {number}" for name, number in versions().items()))
         yield
         logger.info("done in %.1f s", time.monotonic() - begun_s)

@@ -141,32 +141,33 @@ def _lattices(
     views: Sequence[BoardObservation], corner_shapes: dict[str, tuple[int, int]]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return `pixels` and `weights` of the views' corners, see `Observations`."""
-    shape = np.max([corner_shapes[seen.target.board] for seen in views], axis=0)
+    shape = np.max([corner_shapes[observation.target.board] for observation in views], axis=0)
     pixels, weights = np.zeros((len(views), *shape, 2)), np.full((len(views), *shape), -1.0)
-    typical_px = float(np.median(np.concatenate([seen.sigma_px for seen in views])))
-    for view, seen in enumerate(views):
-        rows, columns = corner_shapes[seen.target.board]
-        row, column = np.divmod(seen.corners, columns)
+    typical_px = float(np.median(np.concatenate([observation.sigma_px for observation in views])))
+    for view, observation in enumerate(views):
+        rows, columns = corner_shapes[observation.target.board]
+        row, column = np.divmod(observation.corners, columns)
         if row.max() >= rows:
             raise ValueError(
-                f"board '{seen.target.board}' has no corner {seen.corners.max()}; give the board as printed"
+                f"board '{observation.target.board}' has no corner {observation.corners.max()}; "
+                "give the board as printed"
             )
-        pixels[view, row, column] = seen.pixels
-        weights[view, row, column] = typical_px / seen.sigma_px
+        pixels[view, row, column] = observation.pixels
+        weights[view, row, column] = typical_px / observation.sigma_px
     return pixels, weights
 
 
-def _determines_pose(seen: BoardObservation, corner_shapes: dict[str, tuple[int, int]]) -> bool:
+def _determines_pose(observation: BoardObservation, corner_shapes: dict[str, tuple[int, int]]) -> bool:
     """Return whether the corners lie on two rows and two columns at least, and so determine the pose of the board."""
-    row, column = np.divmod(seen.corners, corner_shapes[seen.target.board][1])
+    row, column = np.divmod(observation.corners, corner_shapes[observation.target.board][1])
     return len(set(row.tolist())) > 1 and len(set(column.tolist())) > 1
 
 
 def _connected_nodes(observations: Sequence[BoardObservation], reference: Node) -> list[Node]:
     """Return the nodes that chains of common boards connect to the reference, the reference first."""
     nodes_of: dict[Target, set[Node]] = {}
-    for seen in observations:
-        nodes_of.setdefault(seen.target, set()).add(seen.node)
+    for observation in observations:
+        nodes_of.setdefault(observation.target, set()).add(observation.node)
     reached = {reference} if any(reference in nodes for nodes in nodes_of.values()) else set()
     waiting = list(reached)
     while waiting:

@@ -136,7 +136,7 @@ def _homing_record(shift: HomingShift) -> HomingRecord:
     return HomingRecord(shift.before, shift.after, (x, y, z), (sigmas[0], sigmas[1], sigmas[2]))
 
 
-def files_beside(measured: MeasuredGeometry) -> dict[str, bytes | str]:
+def geometry_files(measured: MeasuredGeometry) -> dict[str, bytes | str]:
     """Return the files beside geometry.json by name: covariance, corners, and a camera model for each node.
 
     The covariance is of fx, fy, cx, cy, the distortion, then rt_cam_ref of every node. The corners are those of the

@@ -122,32 +122,32 @@ def compare_noise(first: Path, second: Path) -> NoiseComparison:
     )
 
 
-def _check_alike(first: Path, one: NoiseRecord, second: Path, other: NoiseRecord) -> None:
+def _check_alike(first_path: Path, first: NoiseRecord, second_path: Path, second: NoiseRecord) -> None:
     """Refuse records of sensors of different sizes or colour filters."""
-    if one.size_px != other.size_px:
+    if first.size_px != second.size_px:
         sizes = [
             " x ".join(map(str, record.size_px)) + " px" if record.size_px else "of no stated size"
-            for record in (one, other)
+            for record in (first, second)
         ]
         raise WrongSize(
-            f"{second}: is {sizes[1]}, {first} is {sizes[0]}: they are not of one camera in one mode; name two "
-            "measurements of the same"
+            f"{second_path}: is {sizes[1]}, {first_path} is {sizes[0]}: they are not of one camera in one mode; name "
+            "two measurements of the same"
         )
-    if (one.mosaic or None) != (other.mosaic or None):
-        filters = ["/".join(record.mosaic) if record.mosaic else "none" for record in (one, other)]
+    if (first.mosaic or None) != (second.mosaic or None):
+        filters = ["/".join(record.mosaic) if record.mosaic else "none" for record in (first, second)]
         raise BadValue(
-            f"{second}: has the colour filters {filters[1]}, {first} has {filters[0]}: they are not of one camera; "
-            "name two measurements of the same"
+            f"{second_path}: has the colour filters {filters[1]}, {first_path} has {filters[0]}: they are not of one "
+            "camera; name two measurements of the same"
         )
 
 
-def _phases(one: NoiseRecord, other: NoiseRecord) -> Iterator[tuple[str, Quantities, Quantities]]:
+def _phases(first: NoiseRecord, second: NoiseRecord) -> Iterator[tuple[str, Quantities, Quantities]]:
     """Yield the quantities of both, phase by phase of the mosaic."""
-    if not one.planes or not other.planes:
-        yield "", one, other
+    if not first.planes or not second.planes:
+        yield "", first, second
         return
-    others = {plane.phase: plane for plane in other.planes}
-    for plane in one.planes:
+    others = {plane.phase: plane for plane in second.planes}
+    for plane in first.planes:
         if plane.phase in others:
             yield _name(plane), plane, others[plane.phase]
 
@@ -157,10 +157,10 @@ def _name(plane: PhaseRecord) -> str:
     return f"{plane.colour}_r{plane.phase[0]}c{plane.phase[1]}"
 
 
-def _quantities(one: NoiseRecord, other: NoiseRecord) -> Iterator[Change]:
+def _quantities(first: NoiseRecord, second: NoiseRecord) -> Iterator[Change]:
     """Yield every quantity of both, without verdict yet."""
-    for plane, first, second in _phases(one, other):
-        known = _measured(first), _measured(second)
+    for plane, of_first, of_second in _phases(first, second):
+        known = _measured(of_first), _measured(of_second)
         for name in known[0]:
             yield _change(name, plane, known[0][name], known[1][name])
 
@@ -213,29 +213,34 @@ def _limit_sigma(level: float) -> float:
     return float(stats.norm.isf(level / 2))
 
 
-def _pixel_change(kind: str, one: NoiseRecord, other: NoiseRecord) -> PixelChange:
+def _pixel_change(kind: str, first: NoiseRecord, second: NoiseRecord) -> PixelChange:
     """Return how the unusable pixels of a kind differ."""
-    first, second = (set(map(tuple, getattr(record, f"{kind}_pixels"))) for record in (one, other))
-    return PixelChange(kind, len(first - second), len(second - first), len(first & second))
+    first_pixels, second_pixels = (set(map(tuple, getattr(record, f"{kind}_pixels"))) for record in (first, second))
+    return PixelChange(
+        kind, len(first_pixels - second_pixels), len(second_pixels - first_pixels), len(first_pixels & second_pixels)
+    )
 
 
-def _maps(first: Path, one: NoiseRecord, second: Path, other: NoiseRecord) -> Iterator[tuple[MapChange, float | None]]:
+def _maps(
+    first_path: Path, first: NoiseRecord, second_path: Path, second: NoiseRecord
+) -> Iterator[tuple[MapChange, float | None]]:
     """Yield the comparison of the offset maps of each phase, and the probability of its difference; None without."""
     name, names = "offset_dn", ("offset_dn", "offset_variance_dn2", "mask")
-    if one.size_px is None:
+    if first.size_px is None:
         return
-    shape = one.size_px[::-1]
+    shape = first.size_px[::-1]
     maps = [
-        read_maps(path.with_name(NOISE_MAPS), record, shape, names) for path, record in ((first, one), (second, other))
+        read_maps(path.with_name(NOISE_MAPS), record, shape, names)
+        for path, record in ((first_path, first), (second_path, second))
     ]
     lacking = [which for which, names_of_maps in zip("AB", maps, strict=True) if set(names_of_maps) != set(names)]
     if lacking:
         why = f"{' and '.join(lacking)}: no offset map with its errors lies beside {NOISE_FILE}"
         yield MapChange(name, 0, None, None, "not comparable", why=why), None
         return
-    period = mosaic_period(one.mosaic or None)
+    period = mosaic_period(first.mosaic or None)
     usable = ~(maps[0]["mask"].astype(bool) | maps[1]["mask"].astype(bool))
-    for plane, phase in [(_name(plane), plane.phase) for plane in one.planes or []] or [("", (0, 0))]:
+    for plane, phase in [(_name(plane), plane.phase) for plane in first.planes or []] or [("", (0, 0))]:
         used = at_phase(usable, phase, period)
         values = [_of(maps_of[key], phase, period, used) for maps_of in maps for key in names[:2]]
         if used.sum() < 2:
@@ -260,12 +265,12 @@ def _judged_map(change: MapChange, probability: float | None, level: float) -> M
     return msgspec.structs.replace(change, verdict="changed")
 
 
-def _notes(one: NoiseRecord, other: NoiseRecord) -> Iterator[str]:
+def _notes(first: NoiseRecord, second: NoiseRecord) -> Iterator[str]:
     """Yield what else differs between the measurements, which may be the reason for a change."""
-    warmth = [record.temperature_c.mean if record.temperature_c else None for record in (one, other)]
+    warmth = [record.temperature_c.mean if record.temperature_c else None for record in (first, second)]
     if None in warmth:
         yield "a temperature is not stated: dark current may have changed by 10 % per kelvin"
     elif warmth[0] != warmth[1]:
         yield f"A was measured at {warmth[0]:.1f} °C, B at {warmth[1]:.1f} °C; dark current changes by 10 % per kelvin"
-    if one.likelihood != other.likelihood:
-        yield f"the likelihoods differ: {one.likelihood or 'not stated'}, then {other.likelihood or 'not stated'}"
+    if first.likelihood != second.likelihood:
+        yield f"the likelihoods differ: {first.likelihood or 'not stated'}, then {second.likelihood or 'not stated'}"

@@ -85,7 +85,7 @@ def read_series(folder: Path, settings: NoiseSet) -> Readout:
     readout = _layout(next(iter(groups.values()))[0], settings)
     frames = [(conditions, path) for conditions, paths in groups.items() for path in paths]
     sums: list[SeriesSums] = []
-    read = read_ahead(frames, lambda it: read_frame(it[1], readout.size_px, of="the other frames"))
+    read = read_ahead(frames, lambda entry: read_frame(entry[1], readout.size_px, of="the other frames"))
     for index, ((conditions, path), frame) in enumerate(progress(read, "reading frames", len(frames))):
         if index == 0 or conditions != frames[index - 1][0]:
             sums = [SeriesSums(conditions, readout.saturation_dn) for _ in readout.phases]

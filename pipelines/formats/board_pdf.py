@@ -53,8 +53,8 @@ def _scale_bar(x_mm: float, y_mm: float) -> list[str]:
     return [*drawing, _text(x_mm + 1, y_mm + 4, 3.0, f"{_SCALE_BAR_MM:g} mm")]
 
 
-def _text(x_mm: float, y_mm: float, size_mm: float, words: str) -> str:
-    escaped = words.replace("\\", r"\\").replace("(", r"\(").replace(")", r"\)")
+def _text(x_mm: float, y_mm: float, size_mm: float, caption: str) -> str:
+    escaped = caption.replace("\\", r"\\").replace("(", r"\(").replace(")", r"\)")
     return f"BT /F1 {size_mm:g} Tf {x_mm:.3f} {y_mm:.3f} Td ({escaped}) Tj ET"
 
 

@@ -223,11 +223,11 @@ def _pixels_like(elemental_set: ElementalSet, reference: NDArray[Any], path: Pat
     return pixels
 
 
-def write_overview(glance: SetAtAGlance, out: Path) -> None:
+def write_overview(overview: SetAtAGlance, out: Path) -> None:
     """Write the pictures of a set and `overview.json` into `out`."""
-    for name, picture in glance.pictures.items():
+    for name, picture in overview.pictures.items():
         write_whole(out / name, picture)
-    write_record(out / OVERVIEW_FILE, glance.record)
+    write_record(out / OVERVIEW_FILE, overview.record)
 
 
 def _bright_views(elemental_set: ElementalSet, region: Region | None) -> dict[str, Picture]:

@@ -6,7 +6,12 @@ from pathlib import Path
 import msgspec
 
 from faintfield.calib.geometry import GeometrySettings
-from faintfield.pipelines.calibration.geometry import MeasuredGeometry, files_beside, geometry_record, measure_geometry
+from faintfield.pipelines.calibration.geometry import (
+    MeasuredGeometry,
+    geometry_files,
+    geometry_record,
+    measure_geometry,
+)
 from faintfield.pipelines.choices import LensName
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.results.geometry import (
@@ -54,7 +59,7 @@ def measure_stage(
     options = GeometryOptions(lens, tuple(depth_mm or DEFAULT_DEPTHS_MM), limit_px)
     measured = measure_geometry(board_set, GeometrySettings(lens, options.depth_mm, limit_px))
     record = geometry_record(measured, options)
-    write_geometry(out, record, {**files_beside(measured), GEOMETRY_PAGE: geometry_page(record)})
+    write_geometry(out, record, {**geometry_files(measured), GEOMETRY_PAGE: geometry_page(record)})
     _inform_of(measured, record)
     figures = {name: getattr(record, name) for name in GeometrySummary.__struct_fields__[2:]}
     return GeometrySummary(str(out), str(out / GEOMETRY_PAGE), **figures)

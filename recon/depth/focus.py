@@ -88,7 +88,7 @@ def sharp_depths_mm(depths_mm: Sequence[float], curve: Sequence[FocusMeasure]) -
     return [_vertex(depth, detail, peak) for peak in peaks]
 
 
-def places_of_focus(found: DepthEstimate, planes: int) -> list[NDArray[np.bool_]]:
+def places_of_focus(depths: DepthEstimate, planes: int) -> list[NDArray[np.bool_]]:
     """Return the samples (row, column) of each depth at which much of the picture lies, in the order of depths.
 
     These are the peaks of the sure samples' distribution over depth that stand out by a tenth of the highest and hold
@@ -96,18 +96,20 @@ def places_of_focus(found: DepthEstimate, planes: int) -> list[NDArray[np.bool_]
 
     Parameters
     ----------
-    found : DepthEstimate
+    depths : DepthEstimate
         Depths from a sweep.
     planes : int
         Number of planes of the sweep.
     """
-    sure = found.confidence >= SURE
+    sure = depths.confidence >= SURE
     if np.count_nonzero(sure) < MIN_SAMPLES:
         return []
-    counts = np.convolve(np.bincount(np.rint(found.index[sure]).astype(int), minlength=planes), (0.25, 0.5, 0.25))[1:-1]
+    counts = np.convolve(np.bincount(np.rint(depths.index[sure]).astype(int), minlength=planes), (0.25, 0.5, 0.25))[
+        1:-1
+    ]
     fewest = max(MIN_SAMPLES, _MIN_SHARE * np.count_nonzero(sure))
     peaks = [peak for peak in range(planes) if prominence(counts, peak) > _MIN_PROMINENCE * counts.max()]
-    places = [sure & (np.abs(found.index - peak) <= _REACH) for peak in peaks]
+    places = [sure & (np.abs(depths.index - peak) <= _REACH) for peak in peaks]
     return [place for place in places if np.count_nonzero(place) >= fewest]
 
 

@@ -58,15 +58,15 @@ class RunningPlane:
         self._light = np.zeros((2, *shape), np.float32)
         self._coverage = np.zeros((2, *shape), np.float32)
 
-    def add(self, seen: SeenByView, half: int) -> None:
+    def add(self, view: SeenByView, half: int) -> None:
         """Add what a view says to one half, 0 or 1."""
-        self._light[half] += seen.light
-        self._coverage[half] += seen.coverage
+        self._light[half] += view.light
+        self._coverage[half] += view.coverage
 
-    def remove(self, seen: SeenByView, half: int) -> None:
+    def remove(self, view: SeenByView, half: int) -> None:
         """Take away what was added before; what rounding leaves is a part in ten million."""
-        self._light[half] -= seen.light
-        self._coverage[half] -= seen.coverage
+        self._light[half] -= view.light
+        self._coverage[half] -= view.coverage
 
     @property
     def covered(self) -> NDArray[np.bool_]:

@@ -39,7 +39,7 @@ class Significance:
 
 
 def disagreement(
-    light_e: NDArray[np.floating], seen: NDArray[np.bool_], places: NDArray[np.intp], known_variance_e2: float
+    light_e: NDArray[np.floating], visible: NDArray[np.bool_], places: NDArray[np.intp], known_variance_e2: float
 ) -> float:
     """Return the mean over samples of how much the views disagree at the best depth of each.
 
@@ -50,14 +50,14 @@ def disagreement(
     ----------
     light_e : float array (place, view, depth, sample)
         What each view shows of each sample if it was taken from each place.
-    seen : bool array (place, depth, sample)
+    visible : bool array (place, depth, sample)
         Whether the sample is in view from there.
     places : int array (view,)
         The place of each view.
     known_variance_e2 : float
         Variance of a number without that of the light.
     """
-    weight = seen[places].astype(np.float32)
+    weight = visible[places].astype(np.float32)
     light = light_e[places, np.arange(len(places))]
     views = weight.sum(axis=0)
     mean = np.einsum("vds,vds->ds", light, weight) / np.maximum(views, 1)
@@ -73,7 +73,7 @@ def disagreement(
     return float(least[known].mean(dtype=np.float64)) if known.any() else float("inf")
 
 
-def significance(stated: float, shuffled: Sequence[float]) -> Significance:
+def significance(statistic: float, shuffled: Sequence[float]) -> Significance:
     """Return how a statistic that is small where views agree compares with those of shuffled views.
 
     Equal values count as agreeing as well: where shuffling changes nothing, p is 1.
@@ -81,12 +81,12 @@ def significance(stated: float, shuffled: Sequence[float]) -> Significance:
     >>> significance(1.0, [2.0, 3.0, 1.0]).p_value
     0.5
     """
-    if not np.isfinite(stated):  # nothing is seen by enough views
+    if not np.isfinite(statistic):  # nothing is seen by enough views
         return Significance(1.0, 0.0, len(shuffled))
     values = np.asarray(shuffled, float)
-    as_good = int(np.count_nonzero(values <= stated + _EQUAL * abs(stated)))
+    as_good = int(np.count_nonzero(values <= statistic + _EQUAL * abs(statistic)))
     known = values[np.isfinite(values)]
     z = 0.0
-    if np.isfinite(stated) and known.size:
-        z = float((known.mean() - stated) / max(float(known.std()), _EQUAL * abs(stated), 1e-30))
+    if np.isfinite(statistic) and known.size:
+        z = float((known.mean() - statistic) / max(float(known.std()), _EQUAL * abs(statistic), 1e-30))
     return Significance((1 + as_good) / (1 + len(values)), z, len(values))

@@ -47,7 +47,7 @@ class Evidence(NamedTuple):
         Covariance of y.
     coverage : float array (row, column)
         `H_zᵀ H_z 1`; zero where no view sees the plane, and y and u are zero there.
-    others : float array (row, column), optional
+    other_colours : float array (row, column), optional
         What the plane shows in other colours, as blurred as y.
     """
 
@@ -55,7 +55,7 @@ class Evidence(NamedTuple):
     pilot: Image
     noise: Noise
     coverage: Image
-    others: Image | None = None
+    other_colours: Image | None = None
 
 
 def evidence_of_planes(
@@ -64,7 +64,7 @@ def evidence_of_planes(
     samples: Image,
     views: ViewSelection = None,
     *,
-    others: Image | None = None,
+    other_colours: Image | None = None,
 ) -> list[Evidence]:
     """Return the evidence of each plane of a scene, `y_z = u_z + H_zᵀ(g − b − H f) / H_zᵀ H_z 1`.
 
@@ -76,7 +76,7 @@ def evidence_of_planes(
         f ≥ 0, in electrons.
     views : sequence of int, optional
         The views that count; all by default.
-    others : float array (samples), optional
+    other_colours : float array (samples), optional
         The planes in other colours.
     """
     seen = operator.adjoint_of_forward(samples, views)
@@ -93,16 +93,20 @@ def evidence_of_planes(
         pilot, change = (_divided(array, coverage) for array in (of_pilot, of_residual))
         noise = _noise(coverage, of_variance, [of_draw])
         found.append(Evidence(pilot + change, pilot, noise, coverage))
-    if others is not None:
-        shown = map(_divided, _alone(operator, others, operator.adjoint_of_forward(others, views), views), coverages)
-        found = [one._replace(others=light) for one, light in zip(found, shown, strict=True)]
+    if other_colours is not None:
+        shown = map(
+            _divided,
+            _alone(operator, other_colours, operator.adjoint_of_forward(other_colours, views), views),
+            coverages,
+        )
+        found = [one._replace(other_colours=light) for one, light in zip(found, shown, strict=True)]
     return found
 
 
-def _alone(operator: SceneOperator, samples: Image, seen: Image, views: ViewSelection) -> list[Image]:
-    """Return `H_zᵀ H_z f_z` (row, column) of each plane z alone; `seen` is Hᵀ H f."""
+def _alone(operator: SceneOperator, samples: Image, projected: Image, views: ViewSelection) -> list[Image]:
+    """Return `H_zᵀ H_z f_z` (row, column) of each plane z alone; `projected` is Hᵀ H f."""
     if len(operator.grids) == 1:
-        return operator.planes_of(seen)
+        return operator.planes_of(projected)
     found = []
     for index, light in enumerate(operator.planes_of(samples)):
         alone = np.zeros_like(samples)

@@ -45,34 +45,34 @@ def scores(candidates: Sequence[Image], picture: Image, weight: Image) -> Scores
     return Scores(gram, towards)
 
 
-def best_mixture(found: Scores) -> NDArray[np.float64]:
+def best_mixture(scores: Scores) -> NDArray[np.float64]:
     """Return the weights a ≥ 0, Σ a = 1 of least error: (candidate,).
 
     Convex with few unknowns, so every set of candidates with positive weight is tried. Where the error falls no
     further, fewer candidates are preferred.
     """
-    count = found.towards.size
+    count = scores.towards.size
     best: NDArray[np.float64] = np.eye(count)[0]
-    least = found.loss(best)
-    scale = max(float(np.trace(found.gram)), 1e-300)
+    least = scores.loss(best)
+    scale = max(float(np.trace(scores.gram)), 1e-300)
     for size in range(1, count + 1):
         for chosen in combinations(range(count), size):
-            weights = _mixture_of(found, list(chosen))
-            if weights is not None and found.loss(weights) < least - 1e-12 * scale:
-                best, least = weights, found.loss(weights)
+            weights = _mixture_of(scores, list(chosen))
+            if weights is not None and scores.loss(weights) < least - 1e-12 * scale:
+                best, least = weights, scores.loss(weights)
     return best
 
 
-def _mixture_of(found: Scores, chosen: list[int]) -> NDArray[np.float64] | None:
+def _mixture_of(scores: Scores, chosen: list[int]) -> NDArray[np.float64] | None:
     """Return the weights of least error with sum one of some candidates; None if one of them is negative."""
     # The first of them takes what the others leave of one: so the sum is exact whatever the scale of the errors
     first, *others = chosen
-    differences = np.eye(found.towards.size)[others] - np.eye(found.towards.size)[first]
-    curvature = differences @ found.gram @ differences.T
-    slope = differences @ (found.towards - found.gram[first])
+    differences = np.eye(scores.towards.size)[others] - np.eye(scores.towards.size)[first]
+    curvature = differences @ scores.gram @ differences.T
+    slope = differences @ (scores.towards - scores.gram[first])
     shares = np.linalg.lstsq(curvature, slope, rcond=None)[0]
     if (shares < 0).any() or shares.sum() > 1:
         return None
-    weights: NDArray[np.float64] = np.zeros(found.towards.size)
+    weights: NDArray[np.float64] = np.zeros(scores.towards.size)
     weights[others], weights[first] = shares, 1 - shares.sum()
     return weights

@@ -21,10 +21,10 @@ def patch_candidates(evidence: Evidence) -> dict[str, Image]:
     groups that keep. A plane smaller than a patch has its pilot only. Patches are alike if they are so in the sum of
     the pilot and of what other colours show.
     """
-    picture, pilot, noise, _, others = evidence
+    picture, pilot, noise, _, other_colours = evidence
 
     def guide(pilot: Image) -> Image:
-        return pilot if others is None else pilot + others
+        return pilot if other_colours is None else pilot + other_colours
 
     found = {"tv": pilot}
     if min(pilot.shape) >= _LARGE.size:

@@ -73,7 +73,7 @@ def propose(
     penalty_weight: float,
     candidates: Candidates,
     *,
-    others: Image | None = None,
+    other_colours: Image | None = None,
 ) -> list[PlaneProposal]:
     """Return a proposal for each plane of a scene: a mixture of candidates, with weights from held-out views.
 
@@ -93,7 +93,7 @@ def propose(
     candidates : callable
         Returns the candidates for one plane by name, given its evidence: always the same names. The first is chosen
         where all predict alike.
-    others : float array (samples), optional
+    other_colours : float array (samples), optional
         The planes in other colours, for the evidence of the folds.
 
     Raises
@@ -110,7 +110,7 @@ def propose(
     for fold in range(max(_MIN_FOLDS, folds_to_predict(problem))):
         held_out = views[validation_views(len(views), fold)]
         planes = _planes_of_fold(problem, samples, penalty_weight, np.setdiff1d(views, held_out))
-        found = _fold_scores(problem, planes, held_out, candidates, regions, others)
+        found = _fold_scores(problem, planes, held_out, candidates, regions, other_colours)
         totals = [_summed(*of_plane) for of_plane in zip(totals, found, strict=True)]
     mixtures = [[best_mixture(of_region) for of_region in of_plane] for of_plane in totals]
     pictures = operator.planes_of(samples)
@@ -144,12 +144,12 @@ def _fold_scores(
     held_out: NDArray[np.intp],
     candidates: Candidates,
     regions: list[Regions],
-    others: Image | None,
+    other_colours: Image | None,
 ) -> list[list[Scores]]:
     """Return the scores of each plane's candidates from the training views, by region."""
     operator, images = problem.operator, problem.images
     training = np.setdiff1d(operator.seeing_views, held_out)
-    known = evidence_of_planes(operator, images, planes, training, others=others)
+    known = evidence_of_planes(operator, images, planes, training, other_colours=other_colours)
     made = [list(candidates(evidence).values()) for evidence in known]
     truths = evidence_of_planes(operator, images, planes, held_out)
     return [

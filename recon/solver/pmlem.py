@@ -172,7 +172,7 @@ class _Pmlem:
             del plane, gradient
             plane = self._minimum(accepted.plane, point, metric, dual)
 
-    def _minimum(self, here: Image, point: Image, metric: Image, dual: DualField) -> Image:
+    def _minimum(self, start: Image, point: Image, metric: Image, dual: DualField) -> Image:
         """Return the minimum of quadratic and penalty; start from a dual field and replace it by that of the minimum.
 
         The quadratic has its own minimum at `point` and the curvature `scale · metric`; both parts are divided by that
@@ -181,17 +181,17 @@ class _Pmlem:
         if self._weight == 0:
             plane = np.maximum(point, 0)
         else:
-            size = norm(here, metric)
+            size = norm(start, metric)
 
             def gap_tolerance(plane: Image) -> float:
-                step = distance(plane, here, metric)
+                step = distance(plane, start, metric)
                 return 0.5 * max(_INNER_OF_STEP * step, _INNER_OF_TOLERANCE * self._tolerance * size) ** 2
 
             found = dual.prox(point, metric, self._weight / self._scale, self._penalty, gap_tolerance, _MAX_INNER_STEPS)
             plane = found.plane
             self._inner_steps += found.steps
         if not self._fit.may_reach_zero:
-            np.maximum(plane, here.dtype.type(_MIN_FALL) * here, out=plane)
+            np.maximum(plane, start.dtype.type(_MIN_FALL) * start, out=plane)
         return plane
 
     def _certificate(self, plane: Image, gradient: Image, metric: Image, dual: DualField) -> Certificate:

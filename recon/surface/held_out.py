@@ -71,7 +71,10 @@ def squared_errors(evidence: DepthEvidence, expected: Image, views: NDArray[np.i
 
 
 def predicted(
-    evidence: DepthEvidence, index: NDArray[np.floating], views: NDArray[np.intp], beside: Sequence[NDArray[np.intp]]
+    evidence: DepthEvidence,
+    index: NDArray[np.floating],
+    views: NDArray[np.intp],
+    neighbours: Sequence[NDArray[np.intp]],
 ) -> Prediction:
     """Return how well a surface predicts views that the evidence leaves out, and how well its rivals do.
 
@@ -83,7 +86,7 @@ def predicted(
         The surface, as fractional index of the depths.
     views : int array (view,)
         The views that were left out.
-    beside : sequence of int array
+    neighbours : sequence of int array
         For each of them, the views next to it that were not left out.
     """
     limits = np.quantile(index, np.arange(1, _PLANES) / _PLANES)
@@ -102,33 +105,33 @@ def predicted(
         _mean(by_surface, seen),
         _mean(by_planes, seen),
         scatter / max(pixels, 1) ** 0.5,
-        _by_neighbours(evidence, views, beside, seen),
+        _by_neighbours(evidence, views, neighbours, seen),
     )
 
 
 def _by_neighbours(
     evidence: DepthEvidence,
     views: NDArray[np.intp],
-    beside: Sequence[NDArray[np.intp]],
-    seen: NDArray[np.bool_],
+    neighbours: Sequence[NDArray[np.intp]],
+    counted: NDArray[np.bool_],
 ) -> float | None:
     """Return the deviance of views predicted by the mean of those beside them, under the best blur."""
-    if not beside or min(map(len, beside)) == 0:
+    if not neighbours or min(map(len, neighbours)) == 0:
         return None
     light = evidence.views.light_e
-    counts = [np.asarray((light[near] > UNKNOWN).sum(axis=0), np.float32) for near in beside]
-    sums = [np.where(light[near] > UNKNOWN, light[near], 0).sum(axis=0, dtype=np.float32) for near in beside]
+    counts = [np.asarray((light[near] > UNKNOWN).sum(axis=0), np.float32) for near in neighbours]
+    sums = [np.where(light[near] > UNKNOWN, light[near], 0).sum(axis=0, dtype=np.float32) for near in neighbours]
     return min(
         _mean(
             squared_errors(
                 evidence, np.stack([blurred_mean(*of_view, blur) for of_view in zip(sums, counts, strict=True)]), views
             ),
-            seen,
+            counted,
         )
         for blur in _BLURS
     )
 
 
-def _mean(squares: NDArray[np.float32], seen: NDArray[np.bool_]) -> float:
+def _mean(squares: NDArray[np.float32], counted: NDArray[np.bool_]) -> float:
     """Return the mean of the errors of pixels that count, NaN of none."""
-    return float(np.mean(squares[seen], dtype=np.float64)) if seen.any() else float("nan")
+    return float(np.mean(squares[counted], dtype=np.float64)) if counted.any() else float("nan")

@@ -105,51 +105,54 @@ class NoiseOrigin(msgspec.Struct, frozen=True, omit_defaults=True):
     blocks: int = 0
 
 
-def complete_noise(stated: StatedNoise, pictures: Pictures) -> tuple[Noise, NoiseOrigin]:
+def complete_noise(stated_noise: StatedNoise, pictures: Pictures) -> tuple[Noise, NoiseOrigin]:
     """Return the noise of a set whose pictures are written, and where it comes from; say what nobody stated."""
-    if stated.offset_dn is None and pictures.first.black_dn is None:
-        stated = replace(stated, offset_dn=0.0)
+    if stated_noise.offset_dn is None and pictures.first.black_dn is None:
+        stated_noise = replace(stated_noise, offset_dn=0.0)
 
     def noise(gain_dn_per_e: float, read_noise_e: float, *, estimated: bool) -> Noise:
         return Noise(
             gain_dn_per_e,
             read_noise_e,
-            stated.offset_dn,
-            stated.dark_current_e_per_s,
-            stated.quantum_efficiency,
+            stated_noise.offset_dn,
+            stated_noise.dark_current_e_per_s,
+            stated_noise.quantum_efficiency,
             pictures.saturation_dn,
             estimated,
         )
 
-    if stated.gain_dn_per_e is not None and stated.read_noise_e is not None:
-        return noise(stated.gain_dn_per_e, stated.read_noise_e, estimated=False), NoiseOrigin("stated")
+    if stated_noise.gain_dn_per_e is not None and stated_noise.read_noise_e is not None:
+        return noise(stated_noise.gain_dn_per_e, stated_noise.read_noise_e, estimated=False), NoiseOrigin("stated")
     try:
-        found = _found(stated, pictures)
+        estimate = _estimated(stated_noise, pictures)
     except NotIdentifiable as failure:
-        gain, read_e = _assumed(stated, pictures.tone)
+        gain, read_e = _assumed(stated_noise, pictures.tone)
         inform(
             f"gain and noise are not stated and cannot be estimated ({failure}); it is assumed that "
-            f"{_variance_words(gain, gain * read_e, pictures.tone)}; correct [noise] in elemental.toml if you know them"
+            f"{_describe_variance(gain, gain * read_e, pictures.tone)}; correct [noise] in elemental.toml if you know "
+            "them"
         )
         return noise(gain, read_e, estimated=True), NoiseOrigin("assumed", str(failure))
-    gain, read_dn = found.gain_dn.value, found.read_noise_dn.value
-    inform(_words(found, pictures.tone))
+    gain, read_dn = estimate.gain_dn.value, estimate.read_noise_dn.value
+    inform(_describe_estimate(estimate, pictures.tone))
     read_e = (
-        np.sqrt(max(read_dn**2 - _ROUNDING_DN2, 0.0)) / gain if stated.read_noise_e is None else stated.read_noise_e
+        np.sqrt(max(read_dn**2 - _ROUNDING_DN2, 0.0)) / gain
+        if stated_noise.read_noise_e is None
+        else stated_noise.read_noise_e
     )
-    return noise(gain, float(read_e), estimated=True), _origin(found)
+    return noise(gain, float(read_e), estimated=True), _origin(estimate)
 
 
-def _assumed(stated: StatedNoise, tone: Tone) -> tuple[float, float]:
+def _assumed(stated_noise: StatedNoise, tone: Tone) -> tuple[float, float]:
     """Return gain and read noise in electrons where nothing tells them: of 8-bit pictures with a curve the rounding."""
     if tone == "srgb":
         dark, bright = rounding_variance_dn2(np.array([0.0, WHITE_DN]), tone, 8)
-        gain = stated.gain_dn_per_e or float(bright - dark) / WHITE_DN
-        return gain, float(np.sqrt(dark)) / gain if stated.read_noise_e is None else stated.read_noise_e
-    return stated.gain_dn_per_e or 1.0, stated.read_noise_e or 0.0
+        gain = stated_noise.gain_dn_per_e or float(bright - dark) / WHITE_DN
+        return gain, float(np.sqrt(dark)) / gain if stated_noise.read_noise_e is None else stated_noise.read_noise_e
+    return stated_noise.gain_dn_per_e or 1.0, stated_noise.read_noise_e or 0.0
 
 
-def _found(stated: StatedNoise, pictures: Pictures) -> "ViewNoise":
+def _estimated(stated_noise: StatedNoise, pictures: Pictures) -> "ViewNoise":
     """Return the noise that neighbouring views show."""
     from faintfield.calib.noise.views import compared_blocks, estimate_view_noise  # loads much that is used here only
 
@@ -158,7 +161,7 @@ def _found(stated: StatedNoise, pictures: Pictures) -> "ViewNoise":
     blocks = []
     for three in progress(neighbours, "comparing views", len(neighbours)):
         frames = [read_frame(pictures.folder / pictures.views[index].image) for index in three]
-        offset_dn = _offset_dn(frames[0], stated)
+        offset_dn = _offset_dn(frames[0], stated_noise)
         first, middle, last = (_colours(frame) - offset_dn for frame in frames)
         blocks.append(
             compared_blocks(
@@ -174,7 +177,7 @@ def _found(stated: StatedNoise, pictures: Pictures) -> "ViewNoise":
             mean_dn, pictures.tone, pictures.bits, pictures.first.saturation_dn
         ),
         flattest=_ALL if pictures.lossy else _FLATTEST,
-        gain_dn=stated.gain_dn_per_e,
+        gain_dn=stated_noise.gain_dn_per_e,
     )
 
 
@@ -207,29 +210,29 @@ def _colours(frame: Frame) -> NDArray[np.float32]:
     return np.asarray(part.reshape(*part.shape[:2], -1), np.float32)
 
 
-def _offset_dn(frame: Frame, stated: StatedNoise) -> NDArray[np.float32]:
+def _offset_dn(frame: Frame, stated_noise: StatedNoise) -> NDArray[np.float32]:
     """Return the offset of each colour: as stated, else the file's own black level, else 0."""
     own: Any = 0.0 if frame.black_dn is None else frame.black_dn if frame.mosaic is not None else frame.black_dn.mean()
-    return np.asarray(own if stated.offset_dn is None else stated.offset_dn, np.float32).ravel()
+    return np.asarray(own if stated_noise.offset_dn is None else stated_noise.offset_dn, np.float32).ravel()
 
 
-def _words(found: "ViewNoise", tone: Tone) -> str:
+def _describe_estimate(estimate: "ViewNoise", tone: Tone) -> str:
     """Return in words what was estimated, in the unit of the pictures."""
-    return "gain and noise are not stated; estimated from the differences of neighbouring views, " + _variance_words(
-        found.gain_dn.value, found.read_noise_dn.value, tone
+    return "gain and noise are not stated; estimated from the differences of neighbouring views, " + _describe_variance(
+        estimate.gain_dn.value, estimate.read_noise_dn.value, tone
     )
 
 
-def _variance_words(gain_dn: float, read_noise_dn: float, tone: Tone) -> str:
+def _describe_variance(gain_dn: float, read_noise_dn: float, tone: Tone) -> str:
     """Return in words how the variance follows from the light, in the unit of the pictures."""
     unit, words = (1.0, "DN") if tone == "linear" else (1.0 / WHITE_DN, "fractions of white")
     return f"the variance of a pixel is {gain_dn * unit:.3g} · light + {read_noise_dn * unit:.3g}², in {words}"
 
 
-def _origin(found: "ViewNoise") -> NoiseOrigin:
+def _origin(estimate: "ViewNoise") -> NoiseOrigin:
     """Return the record of an estimate."""
     gain, read = (
-        Measured(estimate.value, estimate.se, estimate.ci95) for estimate in (found.gain_dn, found.read_noise_dn)
+        Measured(quantity.value, quantity.se, quantity.ci95) for quantity in (estimate.gain_dn, estimate.read_noise_dn)
     )
-    curve = tuple(found.mean_dn.tolist()), tuple(found.variance_dn2.tolist())
-    return NoiseOrigin("estimated", None, gain, read, *curve, found.blocks)
+    curve = tuple(estimate.mean_dn.tolist()), tuple(estimate.variance_dn2.tolist())
+    return NoiseOrigin("estimated", None, gain, read, *curve, estimate.blocks)

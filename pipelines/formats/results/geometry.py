@@ -219,7 +219,7 @@ def read_geometry[Kind: CameraPoses](path: Path, kind: type[Kind]) -> Kind:
     return geometry
 
 
-def write_geometry(out: Path, record: GeometryRecord, beside: Mapping[str, bytes | str]) -> None:
+def write_geometry(out: Path, record: GeometryRecord, files: Mapping[str, bytes | str]) -> None:
     """Write geometry.json and the files beside it into `out`.
 
     geometry.json is removed first and written last: where it stands, it vouches for the files beside it.
@@ -231,7 +231,7 @@ def write_geometry(out: Path, record: GeometryRecord, beside: Mapping[str, bytes
         remove_leftovers(cameras)
         for earlier in out.glob(CAMERA_FILE.format("*", "*")):
             remove(earlier)  # the node may not be part of the new geometry
-        for name, content in beside.items():
+        for name, content in files.items():
             write_whole(out / name, content)
-        hashes = {name: sha256(out / name) for name in beside}
+        hashes = {name: sha256(out / name) for name in files}
         write_record(out / GEOMETRY_FILE, msgspec.structs.replace(record, sha256=hashes))

@@ -188,7 +188,7 @@ class _Verification:
             self.unchecked.append(f"{path}: has no digest: an earlier version wrote it, or a person")
         else:
             self.problems.append(f"{path}: was altered after it was written")
-        beside = _beside(record)
+        beside = _vouched_files(record)
         self._name(path, path.parent, beside, is_input=False)
         self.problems += [f"{path}: has no SHA-256 of {name}" for name in _named_by(record) if name not in beside]
 
@@ -234,12 +234,12 @@ class _Verification:
         """All files that are to be compared."""
         return list(self._named.values())
 
-    def compare(self, one: _Named, path: Path, hashed: Callable[[Path], str]) -> None:
+    def compare(self, entry: _Named, path: Path, hashed: Callable[[Path], str]) -> None:
         """Compare one file with the SHA-256 by which a record names it."""
-        fault = problem_of_file(path, one.folder, one.sha256, hashed)
-        if fault and one.is_input:
+        fault = problem_of_file(path, entry.folder, entry.sha256, hashed)
+        if fault and entry.is_input:
             self.problems.append(
-                f"{one.record}: {path} {fault} since it was made from it, or is another input of that name"
+                f"{entry.record}: {path} {fault} since it was made from it, or is another input of that name"
             )
         elif fault:
             self.problems.append(f"{path}: {fault}")
@@ -286,7 +286,7 @@ def _kinds_of(path: Path) -> tuple[type[Struct], ...]:
     return next((kinds for pattern, kinds in _KINDS.items() if fnmatchcase(path.name, pattern)), ())
 
 
-def _beside(record: Struct) -> Mapping[str, str]:
+def _vouched_files(record: Struct) -> Mapping[str, str]:
     """Return the SHA-256 of each file beside a record for which it vouches, by name."""
     match record:
         case PlaneFileRecord() | DepthMapFileRecord() | SurfaceFileRecord():

@@ -239,9 +239,9 @@ def overlap(elemental_set: ElementalSet, depth_mm: float) -> float:
     return float(inside.mean())
 
 
-def _refined(compared: Compared, found: DepthEstimate, place: NDArray[np.bool_]) -> float:
+def _refined(compared: Compared, estimate: DepthEstimate, place: NDArray[np.bool_]) -> float:
     """Return the depth, between those of the search, at which the views agree best on a place."""
-    middle = round(float(np.median(found.index[place])))
+    middle = round(float(np.median(estimate.index[place])))
     near = slice(max(middle - _STEPS_AROUND, 0), middle + _STEPS_AROUND + 1)
     return likeliest_depth_mm(compared.planes[near], compared.depths_mm[near], place)
 

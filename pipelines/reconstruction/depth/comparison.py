@@ -121,6 +121,6 @@ def _bins(
     return min(max(needed, -(-min_bins_px // max(lattice.step))), min(lattice.shape) // _MIN_BINS_ACROSS)
 
 
-def _sum(one: Agreement, other: Agreement) -> Agreement:
+def _sum(first: Agreement, second: Agreement) -> Agreement:
     """Return the agreement of two colours together."""
-    return Agreement(*(a + b for a, b in zip(one, other, strict=True)))
+    return Agreement(*(a + b for a, b in zip(first, second, strict=True)))

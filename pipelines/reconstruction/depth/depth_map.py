@@ -155,13 +155,16 @@ def _map_of(elemental_set: ElementalSet, depths_mm: Sequence[float], disparities
     return _Map(record, (min(scale), max(scale)), index, np.where(known, values, np.nan), confidence)
 
 
-def _write_maps(folder: Path, found: _Map, sharp: NDArray[np.float32]) -> dict[str, str]:
+def _write_maps(folder: Path, depth_map: _Map, sharp: NDArray[np.float32]) -> dict[str, str]:
     """Write the maps and the all-in-focus picture with their previews; return their hashes by file name."""
-    record = found.record
+    record = depth_map.record
     label = "disparity (px)" if record.unit == "px" else f"depth ({record.unit})"
     pictures: dict[str, tuple[NDArray[np.floating], bytes]] = {
-        record.file: (found.values, map_picture(found.values, label, *found.limits)),
-        record.confidence: (found.confidence, map_picture(found.confidence, "probability of the depth", 0.0, 1.0)),
+        record.file: (depth_map.values, map_picture(depth_map.values, label, *depth_map.limits)),
+        record.confidence: (
+            depth_map.confidence,
+            map_picture(depth_map.confidence, "probability of the depth", 0.0, 1.0),
+        ),
         record.all_in_focus: (sharp, encoded(grey_levels(sharp, white_level(sharp)), ".png")),
     }
     for name, (values, picture) in pictures.items():

@@ -38,14 +38,14 @@ _MIN_OVERLAP, _TRIED = 0.1, 8
 _COARSE, _TOO_COARSE = 3.5, 16.0
 
 
-def check_views(elemental_set: ElementalSet, wanted: str) -> None:
+def check_views(elemental_set: ElementalSet, purpose: str) -> None:
     """Refuse a set whose views tell no depths.
 
     Parameters
     ----------
     elemental_set : ElementalSet
         The set.
-    wanted : str
+    purpose : str
         What the depths are for, as the messages name it.
 
     Raises
@@ -58,11 +58,11 @@ def check_views(elemental_set: ElementalSet, wanted: str) -> None:
     views, size_px = len(elemental_set.settings.view), elemental_set.settings.camera.size_px
     if views < _MIN_VIEWS:
         raise BadValue(
-            f"{elemental_set.folder}: has {views} views, and {wanted} needs at least {_MIN_VIEWS}; capture more nodes"
+            f"{elemental_set.folder}: has {views} views, and {purpose} needs at least {_MIN_VIEWS}; capture more nodes"
         )
     if min(size_px) < _MIN_SIDE_PX:
         raise BadValue(
-            f"{elemental_set.folder}: has views of {size_px[0]} x {size_px[1]} px, and {wanted} needs at least "
+            f"{elemental_set.folder}: has views of {size_px[0]} x {size_px[1]} px, and {purpose} needs at least "
             f"{_MIN_SIDE_PX} px along each side; use larger ones"
         )
     if not np.linalg.norm(elemental_set.poses_rt_cam_ref[:, 3:], axis=1).max() > 0:

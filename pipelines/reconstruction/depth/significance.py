@@ -117,7 +117,7 @@ def _shuffles(count: int) -> list[NDArray[np.intp]]:
 
 
 def _refuse_rearranged(
-    elemental_set: ElementalSet, shown: _Views, stated: float, shuffled: list[float], largest_p: float
+    elemental_set: ElementalSet, shown: _Views, statistic: float, shuffled: list[float], largest_p: float
 ) -> None:
     """Refuse views that agree clearly better with their rows or columns reversed, or exchanged (NothingInFocus)."""
     chance = float(np.mean(shuffled))
@@ -125,11 +125,11 @@ def _refuse_rearranged(
     if not tried:
         return
     best, remedy = min(tried)
-    if significance(best, shuffled).p_value <= largest_p and chance - best > _CLEARLY * (chance - stated):
+    if significance(best, shuffled).p_value <= largest_p and chance - best > _CLEARLY * (chance - statistic):
         raise NothingInFocus(
             f"{elemental_set.folder}: the views agree better with {remedy}: "
             f"by {chance - best:.3g} in squared deviations, "
-            f"and by {chance - stated:.3g} as stated; import the pictures again so"
+            f"and by {chance - statistic:.3g} as stated; import the pictures again so"
         )
 
 

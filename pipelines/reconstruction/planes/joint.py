@@ -55,12 +55,14 @@ def solve_together(
     operator = factory.of_scene(grids)
     objective = Objective.of(SceneProblem(operator, images), settings)
     joint = [pilots[place].solution for place in grids] if pilots else solve_pmlem(objective, settings)
-    others = operator.samples_of([pilots[place].others for place in grids]) if pilots else None
+    other_colours = operator.samples_of([pilots[place].other_colours for place in grids]) if pilots else None
     found: dict[Method, list[Solution]] = {}
     if "joint" in methods:
-        found["joint"] = with_prior(objective, joint, settings, others=others)
+        found["joint"] = with_prior(objective, joint, settings, other_colours=other_colours)
     if "occlusion" in methods:
-        found["occlusion"] = _with_occlusion(factory, objective, grids, joint, settings, others, found.get("joint"))
+        found["occlusion"] = _with_occlusion(
+            factory, objective, grids, joint, settings, other_colours, found.get("joint")
+        )
     return {method: dict(zip(grids, planes, strict=True)) for method, planes in found.items()}
 
 
@@ -82,7 +84,7 @@ def _with_occlusion(
     grids: Mapping[Place, PlaneGrid],
     joint: list[Solution],
     settings: Settings,
-    others: Image | None,
+    other_colours: Image | None,
     done: list[Solution] | None,
 ) -> list[Solution]:
     """Estimate opacity from the planes, then reconstruct the light again behind it with the same penalty weight.
@@ -97,7 +99,7 @@ def _with_occlusion(
     try:
         occluded = factory.of_scene(grids, [opacity(solution.plane) for solution in joint])
     except GeometryMismatch:
-        unchanged = done or with_prior(objective, joint, settings, others=others)
+        unchanged = done or with_prior(objective, joint, settings, other_colours=other_colours)
         return _without_occlusion(unchanged, "a plane would be hidden from all views")
     behind = replace(objective, posed=replace(objective.posed, operator=occluded))
     better = solve_pmlem(behind, settings)
@@ -105,24 +107,27 @@ def _with_occlusion(
     assert objectives[0] is not None
     assert objectives[1] is not None
     if objectives[0] >= objectives[1]:
-        unchanged = done or with_prior(objective, joint, settings, others=others)
+        unchanged = done or with_prior(objective, joint, settings, other_colours=other_colours)
         return _without_occlusion(unchanged, "it explains the images no better")
-    return [_of_opaque_part(solution, first) for solution in with_prior(behind, better, settings, others=others)]
+    return [
+        _of_opaque_part(solution, first)
+        for solution in with_prior(behind, better, settings, other_colours=other_colours)
+    ]
 
 
-def _of_opaque_part(one: Solution, first: SolveRecord) -> Solution:
+def _of_opaque_part(solution: Solution, first: SolveRecord) -> Solution:
     """Return a plane as `α f` with α beside it, its weight recorded as chosen in the first run."""
-    alpha = opacity(one.plane)
-    plane = alpha * one.plane
+    alpha = opacity(solution.plane)
+    plane = alpha * solution.plane
     record = structs.replace(
-        one.record,
+        solution.record,
         penalty_weight_chosen=first.penalty_weight_chosen,
         penalty_weight_curve=first.penalty_weight_curve,
         passes_before=first.passes_before,
         mean_e=mean_e(plane),
         occlusion=True,
     )
-    return Solution(plane, record, one.sidecars | {"opacity": alpha})
+    return Solution(plane, record, solution.sidecars | {"opacity": alpha})
 
 
 def _without_occlusion(joint: list[Solution], reason: str) -> list[Solution]:

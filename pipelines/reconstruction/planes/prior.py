@@ -25,14 +25,14 @@ def with_prior(
     solutions: Sequence[Solution],
     settings: Settings,
     *,
-    others: Image | None = None,
+    other_colours: Image | None = None,
 ) -> list[Solution]:
     """Return planes under the prior of the settings, given those of total variation.
 
     The proposal x̂ is a mixture of candidates chosen by held-out views. What is returned is the certified optimum of
     `min L(f) + β TV(f − x̂)` over f ≥ 0, with the β of total variation: where the data contradict the proposal, they
-    win. Its record says how far they moved it. Groups of alike patches are found in the sum with `others` (samples),
-    the planes in other colours, if given. Standard deviations are added where the settings ask for them.
+    win. Its record says how far they moved it. Groups of alike patches are found in the sum with `other_colours`
+    (samples), if given. Standard deviations are added where the settings ask for them.
     """
     operator = objective.posed.operator
     if settings.prior == "tv":
@@ -41,9 +41,13 @@ def with_prior(
         found, answers = [_without(solution, "too few views to hold some out") for solution in solutions], None
     else:
         samples = operator.samples_of([solution.plane for solution in solutions])
-        evidences = evidence_of_planes(operator, objective.posed.images, samples, others=others)
+        evidences = evidence_of_planes(operator, objective.posed.images, samples, other_colours=other_colours)
         why_not = _contradiction(objective, samples, evidences)
-        made = None if why_not else _about_proposals(objective, solutions, evidences, settings, others=others)
+        made = (
+            None
+            if why_not
+            else _about_proposals(objective, solutions, evidences, settings, other_colours=other_colours)
+        )
         if made is None:
             why_not = why_not or "total variation predicts held-out views best"
             found, answers = [_without(solution, why_not) for solution in solutions], None
@@ -72,7 +76,7 @@ def _about_proposals(
     evidences: Sequence[Evidence],
     settings: Settings,
     *,
-    others: Image | None,
+    other_colours: Image | None,
 ) -> tuple[list[Solution], Callable[[int, LocalProblem], Answers]] | None:
     """Return the planes about their proposals, and how each answers to noise; None if nothing is proposed."""
     operator, first = objective.posed.operator, solutions[0].record
@@ -80,7 +84,7 @@ def _about_proposals(
     samples = operator.samples_of([solution.plane for solution in solutions])
     no_network = _why_no_network(evidences) if settings.prior != "patches" else None
     candidates = _candidates(settings.prior if no_network is None else "patches")
-    proposals = propose(objective.posed, samples, evidences, weight, candidates, others=others)
+    proposals = propose(objective.posed, samples, evidences, weight, candidates, other_colours=other_colours)
     if all(weights.get("tv") == 1 for proposal in proposals for weights in proposal.mixture.values()):
         return None
     proposed = operator.samples_of([proposal.picture for proposal in proposals])
@@ -153,6 +157,6 @@ def _solution(
     return Solution(plane, structs.replace(record, mean_e=mean_e(plane), prior=prior), sidecars)
 
 
-def _without(one: Solution, reason: str) -> Solution:
+def _without(solution: Solution, reason: str) -> Solution:
     """Return the plane of total variation, and say why it is that."""
-    return replace(one, record=structs.replace(one.record, prior=PriorRecord(name="tv", left_out=reason)))
+    return replace(solution, record=structs.replace(solution.record, prior=PriorRecord(name="tv", left_out=reason)))

@@ -71,12 +71,12 @@ class Pilot:
     ----------
     solution : Solution
         The plane of total variation.
-    others : float array (row, column)
+    other_colours : float array (row, column)
         The sum of the same plane in the other colours, in electrons.
     """
 
     solution: Solution
-    others: Image
+    other_colours: Image
 
 
 def mean_e(plane: Image) -> float:

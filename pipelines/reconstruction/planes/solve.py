@@ -58,7 +58,7 @@ def solve(
     if method == "pmlem":
         objective = Objective.of(SceneProblem(operator, images), settings)
         if pilot:
-            return with_prior(objective, [pilot.solution], settings, others=pilot.others)[0]
+            return with_prior(objective, [pilot.solution], settings, other_colours=pilot.other_colours)[0]
         return with_prior(objective, solve_pmlem(objective, settings), settings)[0]
     start = smooth_start(operator, images)
     likelihood = select_likelihood(images, settings.likelihood, mean_light_e(operator, start))

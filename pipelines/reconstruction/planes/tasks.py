@@ -102,7 +102,7 @@ class Channel:
         try:
             return self._factory.at(place, grid)
         except GeometryMismatch as failure:
-            raise GeometryMismatch(f"plane at {self._words(place)}: {failure}") from failure
+            raise GeometryMismatch(f"plane at {self._describe(place)}: {failure}") from failure
 
     def _save(self, task: PlaneTask, files: PlaneFiles, solution: Solution, focus: FocusPoint | None) -> None:
         """Save one plane of this colour with its record."""
@@ -130,7 +130,7 @@ class Channel:
         focus = in_units(self._loaded, focus) if focus else None
         files.save_part(self._layout.name, arrays, in_units(self._loaded, record), focus)
 
-    def _words(self, place: Place) -> str:
+    def _describe(self, place: Place) -> str:
         """Return the name of a plane in messages."""
         return f"'{place.name}'" if isinstance(place, TiltedPlane) else self._loaded.depth_text(place)
 
@@ -147,7 +147,7 @@ class Channel:
         if not blind:
             return []
         first, count = self._loaded.settings.view[min(blind)].image, len(blind)
-        place_words = self._words(place)
+        place_words = self._describe(place)
         return [f"{place_words}: {count} views see nothing of the plane, {first} for one; are their poses right?"]
 
 

@@ -118,10 +118,10 @@ def select_surface(options: Options) -> SurfaceSelection | None:
     return SurfaceSelection(range_mm, range_px, settings, filtered=options.prior is None)
 
 
-def _ends(option: str, given: str, example: str) -> tuple[float, float]:
+def _ends(option: str, text: str, example: str) -> tuple[float, float]:
     """Return the two ends of a range in ascending order."""
-    parts = re.fullmatch(f"{_NUMBER}:{_NUMBER}", given)
+    parts = re.fullmatch(f"{_NUMBER}:{_NUMBER}", text)
     if parts is None or float(parts[1]) == float(parts[2]):
-        raise WrongUsage(f"{option} {given}: is no range; give two different numbers as NEAR:FAR, such as {example}")
+        raise WrongUsage(f"{option} {text}: is no range; give two different numbers as NEAR:FAR, such as {example}")
     first, last = sorted((float(parts[1]), float(parts[2])))
     return first, last

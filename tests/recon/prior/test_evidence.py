@@ -46,7 +46,7 @@ def test_picture_leaves_out_light_of_other_planes(planes: int, held_out: list[in
     samples, colour = (operator.samples_of([f(light) for light in lights]) for f in (np.copy, lambda light: 3 - light))
     signal = (images.electrons - images.background_e)[views].ravel()
     all_light = sum(part @ light.ravel() for part, light in zip(dense, lights, strict=True))
-    coloured = evidence_of_planes(operator, images, samples, chosen, others=colour)
+    coloured = evidence_of_planes(operator, images, samples, chosen, other_colours=colour)
     for own, light, plain, evidence in zip(
         dense, lights, evidence_of_planes(operator, images, samples, chosen), coloured, strict=True
     ):
@@ -55,9 +55,11 @@ def test_picture_leaves_out_light_of_other_planes(planes: int, held_out: list[in
         np.testing.assert_allclose(evidence.coverage, coverage, atol=1e-12)
         np.testing.assert_allclose(evidence.picture, divided(left, coverage), atol=1e-10)
         np.testing.assert_allclose(evidence.pilot, divided(own.T @ own @ light.ravel(), coverage), atol=1e-10)
-        assert plain.others is None
-        assert evidence.others is not None
-        np.testing.assert_allclose(evidence.others, divided(own.T @ own @ (3 - light).ravel(), coverage), atol=1e-10)
+        assert plain.other_colours is None
+        assert evidence.other_colours is not None
+        np.testing.assert_allclose(
+            evidence.other_colours, divided(own.T @ own @ (3 - light).ravel(), coverage), atol=1e-10
+        )
 
 
 def test_unseen_samples_have_no_light_and_infinite_noise() -> None:

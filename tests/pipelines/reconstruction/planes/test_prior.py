@@ -179,7 +179,7 @@ def _by_hand(folder: Path, depth_mm: float, settings: Settings) -> list[Image]:
     red, green, blue = (solution.plane for (solution,) in first)
     others = [green + blue, red + blue, red + green]
     return [
-        with_prior(objective, solution, settings, others=light)[0].plane
+        with_prior(objective, solution, settings, other_colours=light)[0].plane
         for objective, solution, light in zip(objectives, first, others, strict=True)
     ]
 
@@ -206,8 +206,8 @@ def test_each_colour_begins_with_sum_of_others(
     assert len(judged) >= 3 * 3  # colours times two folds and the whole
     assert len({evidence.coverage.sum(dtype=float) for evidence in judged}) == len(judged)
     for evidence in judged:
-        assert evidence.others is not None
-        assert evidence.others[evidence.coverage > 0].min() > 0
+        assert evidence.other_colours is not None
+        assert evidence.other_colours[evidence.coverage > 0].min() > 0
 
 
 @pytest.mark.deep
@@ -223,7 +223,7 @@ def test_joint_planes_begin_with_other_colours(
             assert settings.prior == "tv"
             light.append({place: solution.plane for place, solution in found["joint"].items()})
         else:
-            begun.append({place: (pilot.solution.plane, pilot.others) for place, pilot in pilots.items()})
+            begun.append({place: (pilot.solution.plane, pilot.other_colours) for place, pilot in pilots.items()})
         return found
 
     monkeypatch.setattr(tasks, "solve_together", watched)
