@@ -87,9 +87,9 @@ def detect_boards(image: NDArray[Any], boards: Sequence[Board]) -> list[BoardCor
     """
     light = np.asarray(image, np.float32)
     step = max(int(_MIN_PERIMETER * max(light.shape) / 4 / _MIN_MARKER_PX), 1)
-    parts = [_part(light, boards, step)]
+    parts = [_search(light, boards, step)]
     if step > 1:
-        parts += _second_parts(light, boards, parts[0])
+        parts += _search_again(light, boards, parts[0])
     found = (_detect_board(light, max(parts, key=lambda part: part.markers(board).ids.size), board) for board in boards)
     return [corners for corners in found if corners is not None]
 
@@ -185,7 +185,7 @@ class _Part:
 type _Window = tuple[slice, slice]
 
 
-def _part(light: NDArray[np.float32], boards: Sequence[Board], step: int, window: _Window | None = None) -> _Part:
+def _search(light: NDArray[np.float32], boards: Sequence[Board], step: int, window: _Window | None = None) -> _Part:
     """Look for the markers of boards in an image or in a window of it, reduced by `step`."""
     rows, columns = window or (slice(0, light.shape[0]), slice(0, light.shape[1]))
     part = light[rows, columns]
@@ -206,7 +206,7 @@ def _part(light: NDArray[np.float32], boards: Sequence[Board], step: int, window
     return _Part(stretched, step, (columns.start, rows.start), found, unknown)
 
 
-def _second_parts(light: NDArray[np.float32], boards: Sequence[Board], first: _Part) -> list[_Part]:
+def _search_again(light: NDArray[np.float32], boards: Sequence[Board], first: _Part) -> list[_Part]:
     """Look again at full size: at boards of which markers are missing, and for all others where anything may be one."""
     whole = slice(0, light.shape[0]), slice(0, light.shape[1])
     parts, unseen, hulls = [], [], []
@@ -215,7 +215,7 @@ def _second_parts(light: NDArray[np.float32], boards: Sequence[Board], first: _P
         if not markers.ids.size:
             unseen.append(board)
         elif markers.ids.size < min(_MIN_TELLING, board.marker_count):
-            parts.append(_part(light, [board], 1, whole))
+            parts.append(_search(light, [board], 1, whole))
         else:
             outlines, hull = _places(first, markers, board)
             hulls.append(hull)
@@ -223,11 +223,11 @@ def _second_parts(light: NDArray[np.float32], boards: Sequence[Board], first: _P
             inside = (low >= _BORDER_PX) & (high <= -_BORDER_PX)
             window = _window(hull, light.shape)
             if markers.ids.size < inside.sum() and light[window].size:
-                parts.append(_part(light, [board], 1, window))
+                parts.append(_search(light, [board], 1, window))
     quads = [first.in_image(quad) for quad in first.unknown]
     odd = [quad for quad in quads if not any(_holds(hull, quad.mean(axis=0)) for hull in hulls)]
     if unseen and odd:
-        parts.append(_part(light, unseen, 1, _window(np.concatenate(odd), light.shape)))
+        parts.append(_search(light, unseen, 1, _window(np.concatenate(odd), light.shape)))
     return parts
 
 
