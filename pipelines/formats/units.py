@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import msgspec
-from msgspec import UNSET, UnsetType
+from msgspec import UNSET
 
 type DepthUnit = Literal["mm", "relative", "disparity_px"]
 type LightUnit = Literal["electrons", "dn", "relative"]
@@ -178,6 +178,3 @@ def _renamed(value: Any, depths: Mapping[str, str], lights: Mapping[str, str]) -
             if lights.get(key) != _LEFT_OUT
         }
     return [_renamed(part, depths, lights) for part in value] if isinstance(value, list) else value
-
-
-type UnitsOrUnset = StatedUnits | UnsetType

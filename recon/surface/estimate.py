@@ -14,9 +14,8 @@ from faintfield.recon.surface.confidence import confidence
 from faintfield.recon.surface.edges import moved_edges
 from faintfield.recon.surface.evidence import DepthEvidence, Explained, Halves
 from faintfield.recon.surface.generalized_variation import PiecewisePlane
-from faintfield.recon.surface.goodness import explained_share
+from faintfield.recon.surface.goodness import explained_share, lit_samples
 from faintfield.recon.surface.held_out import Prediction, predicted, seen_of, squared_errors
-from faintfield.recon.surface.lit import lit_samples
 from faintfield.recon.surface.paths import lowest, sum_over_paths
 from faintfield.recon.surface.pinhole_views import PinholeViews
 

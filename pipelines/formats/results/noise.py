@@ -23,8 +23,7 @@ from faintfield.pipelines.formats.frames import at_phase
 from faintfield.pipelines.formats.limits import sound_mosaic
 from faintfield.pipelines.formats.provenance import Provenance
 from faintfield.pipelines.formats.reading import is_file, read_arrays, read_json
-from faintfield.pipelines.formats.results.noise_emva import EmvaRecord
-from faintfield.pipelines.formats.results.noise_fit import FitRecord
+from faintfield.pipelines.formats.results.noise_fit import EmvaRecord, FitRecord
 from faintfield.pipelines.formats.results.noise_fit import Measured as Measured
 
 NOISE_FILE, NOISE_MAPS = "noise.json", "noise_maps.npz"

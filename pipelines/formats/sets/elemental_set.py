@@ -181,10 +181,6 @@ class ElementalSet:
         """Return several depths in words, in the unit of the set: "500, 700 mm", "disparities -3.25, 0.5 px"."""
         return self.units.depths_text([self.stated_depth(depth) for depth in depths_mm], join)
 
-    def depth_range_text(self, first_mm: float, last_mm: float) -> str:
-        """Return a range of depths in words, in the unit of the set: "400 to 900 mm", "disparities -3.5 to 0.8 px"."""
-        return self.depths_text(first_mm, last_mm, join=" to ")
-
     def inverse_depth_of_disparity(self) -> tuple[float, float]:
         """Return 1/depth in 1/mm of the disparity zero, and by how much it grows with each px of disparity.
 

@@ -3,18 +3,43 @@
 from pathlib import Path
 from typing import Literal
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.files import remove, write_record
 from faintfield.pipelines.formats.frames import read_frame
-from faintfield.pipelines.formats.results.depth_errors import DEPTH_ERRORS_FILE, DepthErrors
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.formats.sets.ground_truth import read_true_depth_mm
 
+DEPTH_ERRORS_FILE = "depth_errors.json"
+
 # An error of this share of the depth counts as right, as in the confidence.
 _RIGHT = 0.02
+
+
+class DepthErrors(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Errors of the depths that are known, at the samples where the truth is known, too.
+
+    Attributes
+    ----------
+    file : str
+        The map that was compared.
+    samples, share : int, float
+        Number of samples that were compared, and their share of those with a true depth.
+    median_error_mm, median_relative_error : float
+        Median of the error's size, in mm and as a share of the true depth.
+    within_2_percent : float
+        Share of the compared samples whose error is at most 2 % of the true depth.
+    """
+
+    file: str
+    samples: int
+    share: float
+    median_error_mm: float
+    median_relative_error: float
+    within_2_percent: float
 
 
 def write_depth_errors(

@@ -11,8 +11,7 @@ import pytest
 
 from faintfield.pipelines.commands.noise import noise
 from faintfield.pipelines.formats.results.noise import NoiseRecord
-from faintfield.pipelines.formats.results.noise_emva import EmvaRecord
-from faintfield.pipelines.formats.results.noise_fit import Measured
+from faintfield.pipelines.formats.results.noise_fit import EmvaRecord, Measured
 from faintfield.pipelines.pages.emva_page import EMVA_PAGE
 from tests.calib.noise.darkroom import specimen
 from tests.pipelines.noise_sets import measure_sensor, take_set, write_frames

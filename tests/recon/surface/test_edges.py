@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from faintfield.recon.surface.edges import moved_edges, near_side, values_at
-from faintfield.recon.surface.lit import lit_samples
+from faintfield.recon.surface.goodness import lit_samples
 from faintfield.recon.surface.pinhole_views import UNKNOWN
 from tests.recon import surface_scene
 from tests.recon.surface_scene import CENTRES_MM, FOCAL_PX, NODES, READ_VARIANCE_E2, UNMOVED, views_of

@@ -142,7 +142,7 @@ def test_depths_are_worded_in_unit_of_set(tmp_path: Path) -> None:
     settings = _rectified_set(10.0, 100.0, 2.5, [(0, 0), (0, 1), (1, 0)])
     elemental_set = _written_set(msgspec.structs.replace(settings, units=Units(depth="disparity_px")), tmp_path)
     assert elemental_set.depth_text(400.0) == "disparity 0 px"
-    assert elemental_set.depth_range_text(250.0, 400.0) == "disparities -1.5 to 0 px"
+    assert elemental_set.depths_text(250.0, 400.0, join=" to ") == "disparities -1.5 to 0 px"
     assert elemental_set.disparity_of_depth(250.0) == pytest.approx(-1.5)
     assert elemental_set.depth_of_disparity(-1.5) == pytest.approx(250.0)
     with pytest.raises(BadValue, match=r"disparity of 3 px .* below 2\.5 px, that of infinitely far"):
