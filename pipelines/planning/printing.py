@@ -1,0 +1,114 @@
+"""A prediction in words, as `faintfield plan` prints it."""
+
+import math
+
+from faintfield.pipelines.console import inform
+from faintfield.pipelines.formats.results.noise_fit import Measured
+from faintfield.pipelines.formats.results.prediction import Alternative, DepthPrediction, PredictionRecord
+from faintfield.rig.capture.guide import format_duration
+
+# Heads and widths of the table's columns.
+_COLUMNS = (
+    *(("exposure", 10), ("grid", 9), ("frames", 6), ("SNR", 8), ("sigma", 8), ("contrast", 8)),
+    *(("scene", 9), ("session", 9)),
+)
+
+
+def print_prediction(record: PredictionRecord) -> None:
+    """Print the prediction for people."""
+    known_s = record.time_s.value
+    time = f"unknown: {record.time_s.why}" if known_s is None else f"{format_duration(known_s)} without prompts"
+    shape = f"{record.rows} x {record.columns} nodes {record.pitch_mm:g} mm apart"
+    inform(f"{record.rig}: {shape}, frames at each: {record.frames_per_node}, {_exposures(record)}; {time}")
+    noise, dark = _number_text(record.read_noise_e, "e⁻"), _number_text(record.dark_current_e_per_s, "e⁻/s")
+    inform(f"noise: read noise {noise}; dark current {dark}; from {record.noise_from}")
+    light = f"{_number_text(record.light_e, 'e⁻')} per pixel in a frame, photons: {_number_text(record.photons)}"
+    inform(f"light: {light}; {record.light_from}")
+    snrs = f"SNR {_number_text(record.snr)} by eq. (4), {_number_text(record.snr_linear)} by eq. (7)"
+    inform(f"one elemental image of an even object: {snrs}")
+    for depth in record.depths:
+        _print_depth(depth, record)
+    inform("sigma: of one sample, as wide as a pixel, on the axis, estimated without a penalty, which lowers it")
+    if record.pixel_share < 1:
+        inform(f"colours: of the scarcest one, which {record.pixel_share:.0%} of the pixels have")
+    if record.vignetting is not None:
+        inform(f"vignetting: unknown: {record.vignetting}; none is assumed")
+    _print_table(record)
+
+
+def _print_depth(depth: DepthPrediction, record: PredictionRecord) -> None:
+    """Print what is predicted of a plane."""
+    name = "plane at unknown depth" if depth.depth_mm is None else f"plane at {depth.depth_mm:g} mm"
+    everywhere = depth.seen_by_all_mm
+    count = record.rows * record.columns
+    views = f"where all {count} views see it"
+    if everywhere is not None:
+        part = f"{everywhere[0]:.0f} x {everywhere[1]:.0f} mm" if min(everywhere) > 0 else "no part"
+        views = f"its middle is seen by {depth.views} of {count} views, {part} by all"
+    inform(f"{name}: {views}; sigma {_number_text(depth.sigma_e, 'e⁻')}")
+    across, blur = _number_text(depth.mm_per_px, "mm"), _number_text(depth.blur_mm, "mm")
+    inform(
+        f"  a pixel: {across}; blur: {blur}; a pixel of parallax: {_number_text(depth.depth_step_mm, 'mm')} of depth"
+    )
+    for feature in depth.features:
+        side = f"{feature.side_px:.3g} px ({_number_text(feature.side_mm, 'mm')})"
+        contrast = _number_text(feature.smallest_contrast)
+        hidden = (feature.smallest_contrast.value or 0.0) > 1
+        contrast += ", so none is" if hidden else ""
+        inform(f"  square of {side}: visible (k = {record.rose_k:g}) from contrast {contrast}")
+        inform(f"    depth of a black one: +- {_number_text(feature.depth_sigma_mm, 'mm')}")
+
+
+def _print_table(record: PredictionRecord) -> None:
+    """Print the table of alternatives, and the cheapest."""
+    inform(f"sigma in e⁻ of one frame of {1e3 * record.exposure_s:g} ms; contrast of the first square")
+    inform(" ".join(f"{head:>{wide}}" for head, wide in _COLUMNS))
+    for row in record.alternatives:
+        numbers = f"{_cell(row.snr)} {_cell(row.sigma_e)} {_cell(row.smallest_contrast)}"
+        times = f"{_minutes(row.scene_s)} {_minutes(row.time_s)}"
+        inform(f"{_asked(row)} {numbers} {times}{'' if row.why_not is None else '  not possible'}")
+    hindrances = {f"not possible: {row.why_not}": None for row in record.alternatives if row.why_not is not None}
+    unknown = {f"time unknown: {row.time_s.why}": None for row in record.alternatives if row.time_s.value is None}
+    for reason in hindrances | unknown:
+        inform(reason)
+    if record.wanted_sigma_e is None:
+        return
+    if record.cheapest is None:
+        inform(
+            f"sigma of {record.wanted_sigma_e:g} e⁻: none of these is known to reach it; give longer exposures or more"
+        )
+    else:
+        inform(f"sigma of {record.wanted_sigma_e:g} e⁻ in the shortest session:")
+        inform(f"{_asked(record.cheapest)} {'':>8} {_cell(record.cheapest.sigma_e)}")
+
+
+def _asked(row: Alternative) -> str:
+    """Return what a row compares."""
+    shape = f"{row.rows} x {row.columns}"
+    return f"{1e3 * row.exposure_s:>7g} ms {shape:>9} {row.frames_per_node:>6}"
+
+
+def _number_text(number: Measured, unit: str = "") -> str:
+    """Return a number with its unit and interval, or why it is unknown."""
+    if number.value is None:
+        return f"unknown: {number.why}"
+    ends = "" if number.ci95 is None else f" (95 %: {number.ci95[0]:.3g} to {number.ci95[1]:.3g})"
+    return f"{number.value:.3g}{' ' if unit else ''}{unit}{ends}"
+
+
+def _cell(number: Measured) -> str:
+    """Return a number in a column."""
+    return f"{'unknown' if number.value is None else format(number.value, '.3g'):>8}"
+
+
+def _minutes(number: Measured) -> str:
+    """Return a duration in a column."""
+    return f"{'unknown' if number.value is None else format(number.value / 60, '.1f') + ' min':>9}"
+
+
+def _exposures(record: PredictionRecord) -> str:
+    """Return the exposures of a node's frames in words."""
+    total_ms, first_ms = 1e3 * record.total_exposure_s, 1e3 * record.exposure_s
+    if math.isclose(total_ms, record.frames_per_node * first_ms):
+        return f"{first_ms:g} ms"
+    return f"{total_ms:g} ms together, the first {first_ms:g} ms"

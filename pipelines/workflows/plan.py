@@ -1,0 +1,64 @@
+"""A prediction of what a capture will show: what is known of rig, sensor, lens and light, then the numbers."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from faintfield.pipelines.errors import WrongUsage
+from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE
+from faintfield.pipelines.formats.results.noise import NOISE_FILE
+from faintfield.pipelines.formats.results.noise_fit import Measured
+from faintfield.pipelines.formats.results.prediction import PredictionRecord
+from faintfield.pipelines.formats.rig_file import read_rig
+from faintfield.pipelines.planning.known import calibration_file, known_lens, known_pace, known_sensor
+from faintfield.pipelines.planning.light import LightOptions
+from faintfield.pipelines.planning.options import PlanOptions
+from faintfield.pipelines.planning.predict import Predictor, Question, parse_grids, scene_view
+from faintfield.pipelines.planning.printing import print_prediction
+
+
+def predict_capture(rig: Path, options: PlanOptions) -> PredictionRecord:
+    """Return and print what a capture by a rig.toml will show."""
+    settings = read_rig(rig)
+    sensor = known_sensor(
+        settings,
+        calibration_file(options.noise, NOISE_FILE, rig.parent),
+        read_noise_e=options.read_noise_e,
+        dark_current_e_per_s=options.dark_current_e_per_s,
+        quantum_efficiency=options.quantum_efficiency,
+    )
+    lens = known_lens(settings, sensor, calibration_file(options.geometry, GEOMETRY_FILE, rig.parent), options.fx_px)
+    exposures_s = [1e-3 * exposure_ms for exposure_ms in options.exposures_ms or []]
+    exposure_s, view = scene_view(settings, exposures_s)
+    frame_exposure_s = None if options.frame_exposure_ms is None else 1e-3 * options.frame_exposure_ms
+    given = LightOptions(
+        options.light_e, options.light_e_per_s, options.flat, options.test_frame, frame_exposure_s, options.region_px
+    )
+    depths_mm = options.depth_mm or settings.scene.depth_mm
+    sides_px = [*(options.feature_px or []), *_in_px(options.feature_mm or [], depths_mm, lens.f_px)]
+    question = Question(
+        depths_mm,
+        sides_px or [10.0],
+        options.blur_px,
+        options.rose_k,
+        exposures_s,
+        parse_grids(options.grids or []),
+        options.frames or [],
+        options.sigma_e,
+    )
+    light = given.resolve(exposure_s, sensor)
+    predictor = Predictor(settings, sensor, lens, known_pace(settings), light, question)
+    record = predictor.record(str(rig), exposure_s, view)
+    print_prediction(record)
+    return record
+
+
+def _in_px(sides_mm: list[float], depths_mm: Sequence[float], f_px: Measured) -> list[float]:
+    """Return sides in pixels at the first depth."""
+    if not sides_mm:
+        return []
+    if not depths_mm or f_px.value is None:
+        raise WrongUsage(
+            f"--feature-mm {sides_mm[0]:g}: pixels of it are not known without a depth and a focal length; give "
+            "--depth-mm and --fx-px or --geometry, or --feature-px"
+        )
+    return [side_mm * f_px.value / depths_mm[0] for side_mm in sides_mm]
