@@ -117,7 +117,7 @@ def _show_viewer(tab: Tab, demo: Path, button: str, share: float) -> None:
 @contextmanager
 def _capturing(folder: Path) -> Iterator[str]:
     """Run a capture of a board sweep and a bright set on a simulated rig, and yield the address of its page."""
-    from faintfield.pipelines.commands.init import init
+    from faintfield.pipelines.commands.capture import init
 
     rig = folder / "rig.toml"
     init(rig)

@@ -44,7 +44,7 @@ _MODULES = {
     "plane_from_ray": "calib.homography",
     "pmlem": "recon.solver.pmlem",
     "read_frame": "pipelines.formats.frames",
-    "simulate": "pipelines.commands.simulate",
+    "simulate": "pipelines.commands.simulation",
     "smooth_start": "recon.solver.initialization",
     "taken_frames": "rig.session.session",
     "universal_penalty_weight": "recon.solver.initialization",
@@ -64,7 +64,7 @@ if TYPE_CHECKING:  # type checkers and editors read these lines; a test compares
     from faintfield.calib.noise import Conditions as Conditions
     from faintfield.calib.noise import calibrate
     from faintfield.calib.noise import measure_series as measure_series
-    from faintfield.pipelines.commands.simulate import simulate as simulate
+    from faintfield.pipelines.commands.simulation import simulate as simulate
     from faintfield.pipelines.errors import InputError as InputError
     from faintfield.pipelines.formats.frames import read_frame as read_frame
     from faintfield.pipelines.formats.sets.elemental_set import load_set as load_set

@@ -7,14 +7,15 @@ from cyclopts import App, Group
 _COMMANDS = "faintfield.pipelines.commands"
 _AT_THE_RIG = Group("At the rig", sort_key=2)
 
-# A sensible call of each command, without "faintfield"; the first word is its name. A test parses each.
-COMMANDS: dict[Group, tuple[str, ...]] = {
-    Group("Try it without hardware", sort_key=1): (
+# A sensible call of each command, without "faintfield", by group and module; the first word is its name. A test parses
+# each.
+COMMANDS: dict[tuple[Group, str], tuple[str, ...]] = {
+    (Group("Try it without hardware", sort_key=1), "simulation"): (
         "demo first-demo --quick",
         "simulate scene --rows 5 --columns 5 --size-px 320 240",
         "darken bright dark --snr 0.16 --seed 1",
     ),
-    _AT_THE_RIG: (
+    (_AT_THE_RIG, "capture"): (
         "init rig.toml",
         "check rig.toml --remember",
         "plan rig.toml --light-e 0.97 --sigma-e 0.3 --exposures-ms 50 100 --grids 5x5 7x7",
@@ -22,11 +23,11 @@ COMMANDS: dict[Group, tuple[str, ...]] = {
         "capture rig.toml session --page",
         "verify session",
     ),
-    Group("Calibrate", sort_key=3): (
+    (Group("Calibrate", sort_key=3), "calibration"): (
         "noise session --out results",
         "geometry boards --depth-mm 500 --depth-mm 700",
     ),
-    Group("Reconstruct", sort_key=4): (
+    (Group("Reconstruct", sort_key=4), "reconstruction"): (
         "run session --depth-mm 500 --depth-mm 700",
         "reconstruct dark --geometry boards --depth-mm 500 --depth-mm 700 --out planes",
         "report planes",
@@ -53,10 +54,10 @@ EXPORTS = (
 
 def register_commands(app: App) -> None:
     """Register all commands with `app`, grouped as its help shows them, without importing their modules."""
-    for group, examples in COMMANDS.items():
+    for (group, module), examples in COMMANDS.items():
         for place, example in enumerate(examples, start=1):
             name = example.split()[0]
-            _register(app, name, f"{name}:{name}", example, place, group)
+            _register(app, name, f"{module}:{name}", example, place, group)
     stage_help = "Bring up a stage: identify it, home it, move it, test it."
     app.command(f"{_COMMANDS}.stage:app", name="stage", help=stage_help, group=_AT_THE_RIG, sort_key=2.5)
     files = Group("Other people's files", sort_key=5)

@@ -1,17 +1,116 @@
-"""`faintfield capture`: capture a session with guidance, or resume one."""
+"""Commands at the rig, from its description to a verified session."""
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from faintfield.pipelines.arguments import Positive
-from faintfield.pipelines.console import console
-from faintfield.pipelines.errors import WrongUsage
+from faintfield.pipelines.arguments import Count, Positive
+from faintfield.pipelines.choices import PaperName
+from faintfield.pipelines.console import inform
+from faintfield.pipelines.errors import OutputExists
+from faintfield.pipelines.planning.options import PlanOptions
 
 if TYPE_CHECKING:
-    from faintfield.pipelines.live.planes_messages import LiveOrder
+    from faintfield.pipelines.formats.results.prediction import PredictionRecord
+    from faintfield.pipelines.workflows.board import BoardSheets
+    from faintfield.pipelines.workflows.verify import Verified
+
+_PLAN = PlanOptions()
+
+type Prediction = PredictionRecord
+type Sheets = BoardSheets
+type Verification = Verified
+
+
+def init(rig: Path = Path("rig.toml"), /) -> dict[str, Any]:
+    """Write a commented configuration, which describes a simulated rig until you change it.
+
+    Parameters
+    ----------
+    rig
+        File to write; an existing one is left alone.
+    """
+    from faintfield.pipelines.formats.files import write_whole
+    from faintfield.pipelines.formats.rig_file import rig_template
+
+    if rig.exists():
+        raise OutputExists(f"{rig}: exists and is not overwritten; name another file, or edit this one")
+    write_whole(rig, rig_template())
+    inform(f"wrote {rig}; describe your rig in it, then: faintfield check {rig}")
+    return {"rig": str(rig)}
+
+
+def check(rig: Path, /, *, remember: bool = False, session: Path | None = None) -> dict[str, Any]:
+    """Check a configuration against the rig, without any motion.
+
+    Parameters
+    ----------
+    rig
+        The rig.toml.
+    remember
+        Store the stage's settings beside the file; later checks say what has changed since.
+    session
+        Folder of a session: also say which settings have changed since it was begun, and whether it can be resumed.
+    """
+    from faintfield.pipelines.workflows.check import check_rig
+
+    return check_rig(rig, remember, session)
+
+
+def plan(rig: Path, /, *, options: PlanOptions = _PLAN) -> Prediction:
+    """Predict what a capture will show: SNR, noise of the planes, smallest contrast, depth, and time.
+
+    Stage and camera are asked for their speeds, and nothing moves. A table compares exposures, grids and frames per
+    node, and with --sigma-e names the shortest session that reaches a wanted noise. What is not known is said to be
+    unknown, and why. docs/capture.md explains the numbers, and compares them with simulated captures.
+
+    Parameters
+    ----------
+    rig
+        The rig.toml.
+    """
+    from faintfield.pipelines.workflows.plan import predict_capture
+
+    return predict_capture(rig, options)
+
+
+def board(
+    out: Path,
+    /,
+    *,
+    paper: PaperName = "A3",
+    boards: Count = 1,
+    columns: Count | None = None,
+    rows: Count | None = None,
+    square_mm: Positive = 27.0,
+    dictionary: str = "DICT_5X5_1000",
+) -> Sheets:
+    """Write ChArUco boards as PDF, a page each; they share no marker and can be in view together.
+
+    Print at 100 % ("actual size"), measure the scale bar, glue the sheet to something flat and stiff. The [[board]]
+    entries for charuco.toml are printed beneath each board.
+
+    Parameters
+    ----------
+    out
+        File to write.
+    paper
+        Paper format; the long side goes across.
+    boards
+        Number of boards.
+    columns
+        Number of squares across; as many as fit by default.
+    rows
+        Number of squares down; as many as fit by default.
+    square_mm
+        Edge of a square.
+    dictionary
+        OpenCV's dictionary of the markers.
+    """
+    from faintfield.pipelines.workflows.board import write_boards
+
+    return write_boards(out, paper, boards, columns, rows, square_mm, dictionary)
 
 
 def capture(
@@ -53,44 +152,33 @@ def capture(
     fx_px
         For these planes: focal length in pixels, where there is no geometry.json.
     """
-    from faintfield.pipelines.formats.rig_file import read_rig
-    from faintfield.pipelines.live.guided import capture_session
+    from faintfield.pipelines.workflows.capture import capture_or_resume
 
-    if not (yes or page or (console.is_terminal and sys.stdin.isatty())):
-        raise WrongUsage("there is no terminal to answer prompts on; give --yes, or --page and answer there")
-    planes = _live_order(rig, session, live_depth_mm, live_sweep_mm, (noise, geometry, fx_px))
-    if planes is not None and not page:
-        raise WrongUsage("live planes are shown on the page, and there is none; give --page, too")
-    taken = capture_session(read_rig(rig), session, unattended=yes, page=page, planes=planes)
-    return {"session": str(session), "complete": True, "taken": taken}
-
-
-def _live_order(
-    rig: Path,
-    session: Path,
-    depth_mm: list[float] | None,
-    sweep_mm: str | None,
-    known: tuple[Path | None, Path | None, float | None],
-) -> "LiveOrder | None":
-    """Return which live planes are asked for, None if none are; `known` are noise, geometry and focal length."""
-    from faintfield.pipelines.live.planes_messages import MAX_DEPTHS, LiveOrder
-    from faintfield.pipelines.reconstruction.request import sweep_values
-
-    depths = [*(depth_mm or []), *([] if sweep_mm is None else sweep_values("--live-sweep-mm", sweep_mm, "400:900:16"))]
-    noise, geometry, fx_px = known
-    if not depths:
-        if any(value is not None for value in known):
-            raise WrongUsage("--noise, --geometry and --fx-px are of live planes; give --live-depth-mm, too")
-        return None
-    if min(depths) <= 0:
-        raise WrongUsage(f"--live-sweep-mm {sweep_mm}: planes lie before the camera; give positive depths")
-    if len(depths) > MAX_DEPTHS:
-        raise WrongUsage(f"{len(depths)} live planes are asked for, at most {MAX_DEPTHS} are computed; give fewer")
-    return LiveOrder(
-        session=session.absolute(),
-        rig=rig.absolute(),
-        depths_mm=tuple(sorted(set(depths))),
-        noise=None if noise is None else noise.absolute(),
-        geometry=None if geometry is None else geometry.absolute(),
-        fx_px=fx_px,
+    return capture_or_resume(
+        rig,
+        session,
+        yes=yes,
+        page=page,
+        live_depth_mm=live_depth_mm,
+        live_sweep_mm=live_sweep_mm,
+        known=(noise, geometry, fx_px),
     )
+
+
+def verify(path: Path, /, *, inputs: Path | None = None) -> Verification:
+    """Verify a session or results without changing a byte of them.
+
+    Of a session: its plan, its journal and the SHA-256 of every frame, then the results in its folder. Of results:
+    every record against its own digest, the files that it vouches for, and the inputs that it was made from.
+
+    Parameters
+    ----------
+    path
+        A session, a folder of results, or one record such as noise.json, geometry.json or reconstruction.json.
+    inputs
+        Folder of the session or set that the results were made from; searched for around them by default. Inputs that
+        are not found are named as not checked, which is no failure.
+    """
+    from faintfield.pipelines.workflows.verify import verify_folder
+
+    return verify_folder(path, inputs)

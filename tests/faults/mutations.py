@@ -136,7 +136,7 @@ def warm_up() -> None:
     folder = Path(registry.__file__).parent / "commands"
     for path in folder.rglob("*.py"):
         module = ".".join(path.relative_to(folder).with_suffix("").parts)
-        if path.stem not in ("__init__", "view"):
+        if path.stem != "__init__":
             import_module(f"faintfield.pipelines.commands.{module}")
     with TemporaryDirectory() as place, open(os.devnull, "w") as null, redirect_stderr(null), redirect_stdout(null):
         for words in _EACH_COMMAND:

@@ -10,7 +10,7 @@ import tifffile
 import tomli_w
 from numpy.typing import NDArray
 
-from faintfield.pipelines.commands.noise import noise
+from faintfield.pipelines.commands.calibration import noise
 from faintfield.pipelines.formats.results.noise import NoiseRecord
 from tests.calib.noise.darkroom import Chip, expose
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from faintfield.pipelines.cli import run
-from faintfield.pipelines.commands.run import run as run_session
+from faintfield.pipelines.commands.reconstruction import run as run_session
 from faintfield.pipelines.reconstruction.options import Options
 
 _RIG = """

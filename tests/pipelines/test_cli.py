@@ -112,7 +112,7 @@ def test_examples_are_calls_of_their_commands(example: str) -> None:
     words = shlex.split(example)
     function, bound, _ = launcher.app.parse_args(words, print_error=False, exit_on_error=False)
     path = words[: 2 if words[0] in ("import", "export") else 1]
-    assert function.__module__.startswith(f"faintfield.pipelines.commands.{path[0]}")
+    assert function.__module__.startswith("faintfield.pipelines.commands.")
     assert function.__name__ == "_".join(path)
     assert bound.arguments
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from faintfield.pipelines.commands.noise import noise
+from faintfield.pipelines.commands.calibration import noise
 from faintfield.pipelines.errors import BadValue, MissingFile, WrongSize
 from faintfield.pipelines.formats.files import sha256, write_record
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, NOISE_MAPS, NoiseRecord, read_noise

@@ -12,10 +12,10 @@ import pytest
 
 from faintfield.calib.board import Board
 from faintfield.calib.geometry import BoardObservation, GeometrySettings, Node, Target, calibrate_geometry
-from faintfield.pipelines.commands.board import board
-from faintfield.pipelines.commands.geometry import geometry
+from faintfield.pipelines.commands.calibration import geometry
+from faintfield.pipelines.commands.capture import board
 from faintfield.pipelines.commands.imports import import_mrcal
-from faintfield.pipelines.commands.simulate import simulate
+from faintfield.pipelines.commands.simulation import simulate
 from faintfield.pipelines.errors import BadValue, InputError, MissingFile
 from faintfield.pipelines.formats.exchange.colmap import read_model
 from faintfield.pipelines.formats.results.geometry import (

@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from faintfield.pipelines.commands.simulate import simulate
+from faintfield.pipelines.commands.simulation import simulate
 from faintfield.pipelines.formats.files import sha256, write_json
 from faintfield.pipelines.formats.results.geometry import (
     CameraPoses,

@@ -9,7 +9,7 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from faintfield.pipelines.commands.noise import noise
+from faintfield.pipelines.commands.calibration import noise
 from faintfield.pipelines.formats.results.noise import NoiseRecord
 from faintfield.pipelines.formats.results.noise_fit import EmvaRecord, Measured
 from faintfield.pipelines.pages.emva_page import EMVA_PAGE

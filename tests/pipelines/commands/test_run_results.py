@@ -9,10 +9,9 @@ from unittest import mock
 import numpy as np
 import pytest
 
+from faintfield.pipelines.commands.capture import verify as verify_all
 from faintfield.pipelines.commands.exports import export_colmap, export_mrcal
-from faintfield.pipelines.commands.reconstruct import reconstruct
-from faintfield.pipelines.commands.run import run
-from faintfield.pipelines.commands.verify import verify as verify_all
+from faintfield.pipelines.commands.reconstruction import reconstruct, run
 from faintfield.pipelines.errors import BadValue, MissingFile, ResultDamaged, WrongUsage
 from faintfield.pipelines.formats.exchange.colmap import read_model
 from faintfield.pipelines.formats.frames import read_frame

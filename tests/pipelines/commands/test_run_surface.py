@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import tifffile
 
-from faintfield.pipelines.commands.reconstruct import reconstruct
-from faintfield.pipelines.commands.verify import verify
+from faintfield.pipelines.commands.capture import verify
+from faintfield.pipelines.commands.reconstruction import reconstruct
 from faintfield.pipelines.reconstruction.options import Options
 from faintfield.recon.errors import NothingInFocus
 from tests.pipelines.sessions import steps_run

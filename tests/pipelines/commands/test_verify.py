@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from faintfield.pipelines.commands.verify import verify
+from faintfield.pipelines.commands.capture import verify
 from faintfield.pipelines.errors import BadValue, ResultDamaged
 from faintfield.pipelines.formats.digests import DIGEST_KEY, digest_holds, with_digest
 from faintfield.pipelines.formats.results.result_files import results_below

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from faintfield.pipelines.commands.verify import verify
+from faintfield.pipelines.commands.capture import verify
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.results.surface import SURFACE_FILE, surfaces_below

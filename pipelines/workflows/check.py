@@ -1,33 +1,22 @@
-"""`faintfield check`: ask stage, camera and disk whether a capture is possible; nothing moves."""
+"""Check of a rig.toml against stage, camera and disk, without any motion."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import MissingFile
+from faintfield.pipelines.formats.files import require_room, write_json
+from faintfield.pipelines.formats.rig_file import read_rig, read_stage_settings, stage_settings_path
+from faintfield.pipelines.live.guided import changed_settings, needed_bytes, survey_lines
+from faintfield.rig.capture.survey import survey
+from faintfield.rig.devices import open_rig
+from faintfield.rig.session.changes import check_same_rig, find_changes, present_settings
+from faintfield.rig.session.session import has_session, is_sealed, read_plan
+from faintfield.rig.settings import RigSettings
 
-if TYPE_CHECKING:
-    from faintfield.rig.settings import RigSettings
 
-
-def check(rig: Path, /, *, remember: bool = False, session: Path | None = None) -> dict[str, Any]:
-    """Check a configuration against the rig, without any motion.
-
-    Parameters
-    ----------
-    rig
-        The rig.toml.
-    remember
-        Store the stage's settings beside the file; later checks say what has changed since.
-    session
-        Folder of a session: also say which settings have changed since it was begun, and whether it can be resumed.
-    """
-    from faintfield.pipelines.formats.files import require_room, write_json
-    from faintfield.pipelines.formats.rig_file import read_rig, read_stage_settings, stage_settings_path
-    from faintfield.pipelines.live.guided import changed_settings, needed_bytes, survey_lines
-    from faintfield.rig.capture.survey import survey
-    from faintfield.rig.devices import open_rig
-
+def check_rig(rig: Path, remember: bool, session: Path | None) -> dict[str, Any]:
+    """Ask stage, camera and disk whether a capture is possible, and print the answers."""
     settings = read_rig(rig)
     since = [] if session is None else _changes_since(session, settings)
     found = survey(open_rig(settings), settings)
@@ -55,7 +44,7 @@ def check(rig: Path, /, *, remember: bool = False, session: Path | None = None) 
     }
 
 
-def _changes_since(session: Path, settings: "RigSettings") -> list[str]:
+def _changes_since(session: Path, settings: RigSettings) -> list[str]:
     """Print what has changed since a session was begun or resumed last, and return it.
 
     Raises
@@ -63,9 +52,6 @@ def _changes_since(session: Path, settings: "RigSettings") -> list[str]:
     PlanRefused
         A setting that the session keeps has changed, so that it cannot be resumed.
     """
-    from faintfield.rig.session.changes import check_same_rig, find_changes, present_settings
-    from faintfield.rig.session.session import has_session, is_sealed, read_plan
-
     if not has_session(session):
         raise MissingFile(f"{session}: holds no session; name the folder of one that was begun")
     changes = find_changes(present_settings(session), settings)

@@ -1,19 +1,17 @@
-"""`faintfield board`: ChArUco boards to print, as vectors and true to size."""
+"""ChArUco boards to print, that fit a paper and share no marker."""
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
 
 import msgspec
 
-from faintfield.pipelines.arguments import Count, Positive
+from faintfield.calib.board import Board
+from faintfield.pipelines.choices import PaperName
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import WrongUsage
-
-if TYPE_CHECKING:
-    from faintfield.calib.board import Board
-    from faintfield.pipelines.formats.sets.board_set import BoardEntry
-
+from faintfield.pipelines.formats.board_pdf import FOOT_MM, MARGIN_MM, board_pdf
+from faintfield.pipelines.formats.files import write_whole
+from faintfield.pipelines.formats.sets.board_set import BoardEntry
 
 # Width and height, the long side across.
 _PAPERS_MM = {"A4": (297.0, 210.0), "A3": (420.0, 297.0), "A2": (594.0, 420.0), "letter": (279.4, 215.9)}
@@ -27,46 +25,19 @@ class BoardSheets(msgspec.Struct, frozen=True):
 
     out: str
     paper: str
-    board: "list[BoardEntry]"
+    board: list[BoardEntry]
 
 
-def board(
+def write_boards(
     out: Path,
-    /,
-    *,
-    paper: Literal["A4", "A3", "A2", "letter"] = "A3",
-    boards: Count = 1,
-    columns: Count | None = None,
-    rows: Count | None = None,
-    square_mm: Positive = 27.0,
-    dictionary: str = "DICT_5X5_1000",
+    paper: PaperName,
+    boards: int,
+    columns: int | None,
+    rows: int | None,
+    square_mm: float,
+    dictionary: str,
 ) -> BoardSheets:
-    """Write ChArUco boards as PDF, a page each; they share no marker and can be in view together.
-
-    Print at 100 % ("actual size"), measure the scale bar, glue the sheet to something flat and stiff. The [[board]]
-    entries for charuco.toml are printed beneath each board.
-
-    Parameters
-    ----------
-    out
-        File to write.
-    paper
-        Paper format; the long side goes across.
-    boards
-        Number of boards.
-    columns
-        Number of squares across; as many as fit by default.
-    rows
-        Number of squares down; as many as fit by default.
-    square_mm
-        Edge of a square.
-    dictionary
-        OpenCV's dictionary of the markers.
-    """
-    from faintfield.pipelines.formats.board_pdf import board_pdf
-    from faintfield.pipelines.formats.files import write_whole
-    from faintfield.pipelines.formats.sets.board_set import BoardEntry
-
+    """Write boards as PDF, a page each; see `faintfield board`."""
     across, down = _squares(paper, columns, rows, square_mm)
     made = _boards(boards, across, down, square_mm, dictionary)
     write_whole(out, board_pdf(made, _PAPERS_MM[paper]))
@@ -75,10 +46,8 @@ def board(
     return BoardSheets(str(out), paper, entries)
 
 
-def _boards(count: int, across: int, down: int, square_mm: float, dictionary: str) -> "list[Board]":
+def _boards(count: int, across: int, down: int, square_mm: float, dictionary: str) -> list[Board]:
     """Return boards of one size that share no marker."""
-    from faintfield.calib.board import Board
-
     marker_mm, markers = round(_MARKER_SHARE * square_mm, 1), across * down // 2
     try:
         return [
@@ -91,8 +60,6 @@ def _boards(count: int, across: int, down: int, square_mm: float, dictionary: st
 
 def _squares(paper: str, columns: int | None, rows: int | None, square_mm: float) -> tuple[int, int]:
     """Return how many squares a board has across and down: as many as asked for, or as fit the paper."""
-    from faintfield.pipelines.formats.board_pdf import FOOT_MM, MARGIN_MM
-
     width_mm, height_mm = _PAPERS_MM[paper]
     max_across = int((width_mm - 2 * MARGIN_MM) // square_mm)
     max_down = int((height_mm - 2 * MARGIN_MM - FOOT_MM) // square_mm)

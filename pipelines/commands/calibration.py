@@ -1,24 +1,26 @@
-"""`faintfield noise`: a sensor measured from dark and flat frames."""
+"""Commands that measure a sensor, and where the camera was."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, overload
 
+from faintfield.pipelines.arguments import Positive
+from faintfield.pipelines.choices import LensName
 from faintfield.pipelines.errors import WrongUsage
 
 if TYPE_CHECKING:
     from faintfield.pipelines.calibration.noise_comparison import NoiseComparison
     from faintfield.pipelines.formats.results.noise import NoiseRecord
+    from faintfield.pipelines.workflows.geometry import GeometrySummary
 
-type Result = NoiseRecord | NoiseComparison
+type Noise = NoiseRecord | NoiseComparison
+type Geometry = GeometrySummary
 
 
 @overload
 def noise(folder: Path, /, *, out: Path | None = None) -> "NoiseRecord": ...
 @overload
 def noise(*, compare: tuple[Path, Path]) -> "NoiseComparison": ...
-def noise(
-    folder: Path | None = None, /, *, out: Path | None = None, compare: tuple[Path, Path] | None = None
-) -> Result:
+def noise(folder: Path | None = None, /, *, out: Path | None = None, compare: tuple[Path, Path] | None = None) -> Noise:
     """Measure offset, gain, read noise and dark current from dark frames, and flats if there are any.
 
     Writes noise.json (numbers with 95 % intervals, or why there are none), noise_maps.npz (per pixel), a page of
@@ -43,3 +45,35 @@ def noise(
     if folder is None:
         raise WrongUsage("nothing to measure is named; give a FOLDER with frames, or two results with --compare A B")
     return measure_sensor(folder, out)
+
+
+def geometry(
+    directory: Path,
+    /,
+    *,
+    out: Path | None = None,
+    lens: LensName = "opencv5",
+    depth_mm: list[Positive] | None = None,
+    limit_px: Positive = 0.5,
+) -> Geometry:
+    """Measure the lens, and where the camera was at every node, from images of ChArUco boards.
+
+    Writes geometry.json, its covariance, a .cameramodel per node, and a page about the stage. A set that cannot tell
+    the geometry is refused, with the reason and what to add.
+
+    Parameters
+    ----------
+    directory
+        A session with charuco frames, or a folder with charuco.toml and the images it names.
+    out
+        Folder for the results; DIRECTORY by default.
+    lens
+        Distortion model.
+    depth_mm
+        Depth of a plane that will be reconstructed; give it once per plane. 500 and 700 by default.
+    limit_px
+        How well the transfer between views by such a plane must be known: standard deviation, rms over views.
+    """
+    from faintfield.pipelines.workflows.geometry import measure_stage
+
+    return measure_stage(directory, out, lens, depth_mm, limit_px)
