@@ -50,10 +50,27 @@ class PixelGain:
     share: float
 
 
+@dataclass(frozen=True)
+class PhotonTransfer:
+    """ε by the photon transfer of each pixel alone.
+
+    Attributes
+    ----------
+    epsilon, information : array (row, column)
+        ε, and its inverse variance given the read noise.
+    of_read : float
+        Variance that the error of the read noise adds to the mean of many pixels, relative to that of ε itself.
+    """
+
+    epsilon: Map
+    information: Map
+    of_read: float
+
+
 def photon_transfer(
-    flats: Sequence[Series], offset_dn: Map, read_dn: Map, values: Mapping[str, float]
-) -> tuple[Map, Map]:
-    """Return ε by the photon transfer of each pixel alone, and its inverse variance, both (row, column).
+    flats: Sequence[Series], offset_dn: Map, read_dn: Map, values: Mapping[str, float], dark_freedom: float
+) -> PhotonTransfer:
+    """Return ε by the photon transfer of each pixel alone.
 
     Parameters
     ----------
@@ -63,6 +80,8 @@ def photon_transfer(
         Offset and read noise of each pixel.
     values : mapping
         Parameters of the fit.
+    dark_freedom : float
+        Degrees of freedom of the darks' variance of a pixel, from which its read noise is known.
     """
     gain = float(np.exp(values["log_gain"]))
 
@@ -75,29 +94,33 @@ def photon_transfer(
 
     kept = [kept_of(lambda rows, flat=flat: noise(flat, rows)[1], ~flat.suspect) for flat in flats]  # type: ignore[misc]
 
-    def work(rows: slice) -> tuple[Array, Array]:
-        gains, information = np.zeros((2, *offset_dn[rows].shape))
+    def work(rows: slice) -> tuple[Array, Array, Array]:
+        gains, information, per_dn2 = np.zeros((3, *offset_dn[rows].shape))
         for flat, of_strip in zip(flats, kept, strict=True):
             shot, variance = noise(flat, rows)
             share = shot / variance
             weight = 0.5 * (flat.frames - 1) * share
             gains += weight * (flat.within_dn2[rows] / ((flat.frames - 1) * of_strip(rows, variance)) - 1)
             information += weight * share
-        return gains / np.maximum(information, 1e-12), information
+            per_dn2 += weight / variance
+        # A variance of χ² over its freedom has the variance 2/freedom, relative to its square
+        read_dn2 = np.square(read_dn[rows], dtype=np.float64)
+        of_read = 2 / dark_freedom * np.square(per_dn2 * read_dn2) / np.maximum(information, 1e-12)
+        return gains / np.maximum(information, 1e-12), information, of_read
 
-    epsilon, information = maps_of(work, offset_dn.shape, (np.float32, np.float32))
-    return epsilon, information
+    epsilon, information, of_read = maps_of(work, offset_dn.shape, (np.float32, np.float32, np.float32))
+    return PhotonTransfer(epsilon, information, float(of_read.mean(dtype=np.float64)))
 
 
 def measure_gain(
-    transfer: tuple[Map, Map], usable: Mask, even: Response, response: Callable[[Map], Response]
+    transfer: PhotonTransfer, usable: Mask, even: Response, response: Callable[[Map], Response]
 ) -> tuple[PixelGain | None, str]:
     """Return the gain of every pixel, or None and the reason why the frames do not determine it.
 
     Parameters
     ----------
-    transfer : tuple of arrays (row, column)
-        ε and its inverse variance, see `photon_transfer`.
+    transfer : PhotonTransfer
+        Of all flats.
     usable : array (row, column), bool
         Pixels in use.
     even : Response
@@ -105,7 +128,7 @@ def measure_gain(
     response : callable
         Returns it given relative gains (row, column) by which the signals are divided first.
     """
-    measured, information = transfer
+    measured, information = transfer.epsilon, transfer.information
     shape = usable.shape
     weight = map_of(lambda rows: np.where(usable[rows], information[rows], 0.0), shape)
 
@@ -121,15 +144,8 @@ def measure_gain(
         return np.clip(np.subtract(measured[rows], mean, dtype=np.float64), -limit, limit)
 
     epsilon = map_of(clipped, shape)
-    seams = _gain_seams(epsilon, weight, even)
+    seams = _gain_seams(epsilon, weight, 1 / (1 + transfer.of_read), even, response)
     known = response(gain_of_regions(seams, shape)) if seams else even
-    # The response is smoothed and shrunk across a seam, so that the first value of its step is a little too small.
-    seams = tuple(
-        replace(seam, effect=(1 + share_of_seam(seam, *_over_mean(known, weight))[0]) * seam.effect)
-        if seam.of_response
-        else seam
-        for seam in seams
-    )
 
     def part(rows: slice) -> Array:
         relative = np.divide(known.relative[rows], np.maximum(known.vignetting[rows], 1e-6), dtype=np.float64)
@@ -170,14 +186,25 @@ def gain_of_regions(seams: Sequence[Seam], shape: tuple[int, ...]) -> Map:
     return map_of(lambda rows: 1 + _of_regions(seams, rows), shape)
 
 
-def _gain_seams(epsilon: Map, weight: Map, response: Response) -> tuple[Seam, ...]:
+def _gain_seams(
+    epsilon: Map, weight: Map, precision: float, even: Response, response: Callable[[Map], Response]
+) -> tuple[Seam, ...]:
     """Return the seams of the gain: those of the response that are of the gain, and others that photon transfer shows.
 
     The response tells the size of a step ten times better than photon transfer, but not whether gain makes it.
     """
-    seams = {seam.lines: seam for seam in find_seams(epsilon, weight)}
-    for seam in find_seams(*_over_mean(response, weight)):
-        share, se = share_of_seam(seam, epsilon, weight)
+    seams = {seam.lines: seam for seam in find_seams(epsilon, weight, precision)}
+    steps = [
+        step
+        for step in find_seams(*_over_mean(even, weight))
+        if np.greater(*np.multiply((1, _MIN_SIGMA), share_of_seam(step, epsilon, weight, precision)))
+    ]
+    if steps:
+        # The response is smoothed and shrunk across a seam: what remains once a step is taken out belongs to the step
+        rest = _over_mean(response(gain_of_regions(steps, weight.shape)), weight)
+        steps = [replace(step, effect=(1 + share_of_seam(step, *rest)[0]) * step.effect) for step in steps]
+    for seam in steps:
+        share, se = share_of_seam(seam, epsilon, weight, precision)
         if share > _MIN_SIGMA * se:
             whole = abs(share - 1) < _ONE_SIGMA * se
             measured = replace(seam, effect=share * seam.effect, se=se * seam.difference)

@@ -127,7 +127,8 @@ def measure_pixels(fitted: SeriesFit, hot: Mask, outlying: Mask) -> Pixels:
     why = "no flats: record 10 flats each of 3 light levels"
     if fitted.flats:
         response = response_e = _response(fitted, levels, usable, None)
-        transfer = photon_transfer(fitted.flats, levels.offset_dn, read.read_noise_dn, fitted.fit.values)
+        freedom = sum(dark.frames - 1.0 for dark in fitted.darks)
+        transfer = photon_transfer(fitted.flats, levels.offset_dn, read.read_noise_dn, fitted.fit.values, freedom)
         bright = usable & ~response.dead
         gain, why = measure_gain(
             transfer, bright, response, lambda relative: _response(fitted, levels, usable, relative)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from faintfield.calib.noise.maps.seams import find_seams
+from faintfield.calib.noise.maps.seams import find_seams, mean_effect
 from faintfield.calib.noise.series.statistics import Series, any_suspect, robust_sigma
 from faintfield.calib.noise.strips import (
     Array,
@@ -222,13 +222,14 @@ def _scaled(read_dn: Array | float, factor: Array, shot_dn2: float, read_dn2: fl
 def _region_factors(ratio: Map, usable: Mask, precision: float) -> _LineFactor:
     """Return by which factor the variances of regions differ that are read apart.
 
-    Nothing shrinks them. The population would draw the noise of a region towards that of all pixels if a pixel has few
-    frames, and photon transfer would take what it drew away for gain.
+    Nothing shrinks them, and no gradient is fitted beside them. The population would draw the noise of a region towards
+    that of all pixels if a pixel has few frames, and a gradient doubles the error of a step: photon transfer would take
+    both for gain.
     """
     differs = {"rows": np.zeros(ratio.shape[0]), "columns": np.zeros(ratio.shape[1])}
     mean = mean_over(lambda rows: ratio[rows], usable)
     for seam in find_seams(ratio, usable, precision):
-        differs[seam.lines] = seam.effect / mean
+        differs[seam.lines] = mean_effect(seam, ratio, usable) / mean
     return _LineFactor(differs["rows"], differs["columns"], lambda effect: np.maximum(1 + effect, 0.05))
 
 

@@ -78,6 +78,14 @@ def find_seams(values: NDArray[Any], weight: NDArray[Any], precision: float = 1.
     return [seam for lines, profile in profiles.items() if (seam := _find_seam(*profile, lines))]
 
 
+def mean_effect(seam: Seam, values: NDArray[Any], weight: NDArray[Any]) -> Array:
+    """Return by how much the means of a seam's regions differ from the mean of all values (row, column): (line,)."""
+    profile, total = _profiles(values, weight, 1.0)[seam.lines]
+    region = np.unique(seam.effect, return_inverse=True)[1]
+    means = np.bincount(region, total * profile) / np.bincount(region, total)
+    return np.asarray(means[region] - np.average(profile, weights=total))
+
+
 def share_of_seam(
     seam: Seam, values: NDArray[Any], weight: NDArray[Any], precision: float = 1.0
 ) -> tuple[float, float]:
