@@ -51,7 +51,7 @@ class SharedCore:
             import pymmcore_plus  # noqa: F401
         except ImportError as failure:
             raise PackageMissing(
-                "'micromanager' needs a package; run: pip install 'faintfield[micromanager]'"
+                "'micromanager' needs a package that is not installed; run: pip install 'faintfield[micromanager]'"
             ) from failure
 
     def acquire(self, user: User) -> Any:

@@ -184,7 +184,9 @@ def _load[T](group: str, name: str, kind: type[T]) -> T:
             f"{in_one_line(failure)}; install what it needs, or another version of it"
         ) from failure
     settings = getattr(plugin, "settings", None)
-    strict = getattr(getattr(settings, "__struct_config__", None), "forbid_unknown_fields", False)
+    strict = (
+        isinstance(settings, type) and issubclass(settings, Struct) and settings.__struct_config__.forbid_unknown_fields
+    )
     if not isinstance(plugin, kind) or not strict:
         raise PluginFailed(
             f"the plug-in {name!r} of {packages[0]} is no {kind.__name__} whose settings forbid unknown fields; "

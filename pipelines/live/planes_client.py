@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
-from signal import Signals
 
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.live.planes_messages import LiveFrame, LiveNews, LiveOrder, LiveStatus
@@ -101,7 +100,7 @@ class PlanesClient:
         code = self._process.poll()
         if code is None or self._ending:
             return None
-        how = f"by signal {Signals(-code).name}" if code < 0 else f"with code {code}"
+        how = f"by signal {-code}" if code < 0 else f"with code {code}"
         return f"live planes ended ({how}); the capture goes on without them"
 
     def silence_s(self) -> float:

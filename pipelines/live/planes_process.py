@@ -225,7 +225,7 @@ def _pmlem_status(scene: LiveScene, planes: PlaneAccumulator) -> str:
 
 def stretch(plane: NDArray[np.floating], covered: NDArray[np.bool_]) -> tuple[float, float]:
     """Return black and white of a picture: quantiles of its covered samples, a little apart from one another."""
-    values = plane[covered]
+    values = plane[covered & np.isfinite(plane)]
     if not values.size:
         return 0.0, 1.0
     black, white = np.quantile(values[:: 1 + values.size // _QUANTILE_SAMPLES], _QUANTILES).tolist()

@@ -117,10 +117,10 @@ def _in_other_units(known: Mapping[str, Estimate]) -> dict[str, Estimate]:
 
 def _mapped(known: Estimate, function: Callable[[float], float]) -> Estimate:
     """Return a monotonic function of an estimate."""
-    if known.value is None or known.ci95 is None:
+    if known.value is None:
         return known
-    low, high = sorted(float(function(end)) for end in known.ci95)
-    return Estimate(float(function(known.value)), None, (low, high))
+    ends = sorted(float(function(end)) for end in known.ci95 or ())
+    return Estimate(float(function(known.value)), None, (ends[0], ends[1]) if ends else None)
 
 
 def _line(known: Estimate, row: Sequence[str], factor: float, explained: dict[str, str]) -> Line:

@@ -1,5 +1,6 @@
 """Options of planes and surfaces, of `reconstruct` and of `run`, apart from the code that makes these: for help."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +10,7 @@ from cyclopts import Parameter
 
 from faintfield.pipelines.arguments import Count, NotNegativeOrAuto, Positive
 from faintfield.pipelines.choices import Method, PriorName
+from faintfield.pipelines.errors import WrongUsage
 from faintfield.recon.names import LikelihoodName, PenaltyName
 
 # Options that say where planes are, and all that a surface does not know.
@@ -17,6 +19,9 @@ OF_PLANES = (
     *PLACES,
     *("depth_map", "method", "joint", "occlusion", "uncertainty", "pitch_mm", "workers", "scheduler"),
 )
+
+# Largest sweep: more planes are a typing error, and would fill any disk.
+_MAX_PLANES = 10_000
 
 
 @Parameter(name="*")
@@ -125,3 +130,15 @@ class Options:
 
 
 DEFAULTS = Options()
+
+
+def sweep_values(option: str, text: str, example: str) -> list[float]:
+    """Return the numbers of FIRST:LAST:COUNT, in equal steps."""
+    parts = re.fullmatch(r"(-?\d+(?:\.\d*)?):(-?\d+(?:\.\d*)?):(\d+)", text)
+    if parts is None:
+        raise WrongUsage(f"{option} {text}: is no sweep; give FIRST:LAST:COUNT, such as {example}")
+    first, last, count = float(parts[1]), float(parts[2]), int(parts[3])
+    if first == last or not 2 <= count <= _MAX_PLANES:
+        raise WrongUsage(f"{option} {text}: is no sweep; give two different ends and 2 to {_MAX_PLANES} planes")
+    step = (last - first) / (count - 1)
+    return [*(round(first + index * step, 6) for index in range(count - 1)), round(last, 6)]

@@ -1,11 +1,9 @@
 """Request to `reconstruct` and `run`: their options select planes, are checked, and are resolved for a set."""
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
 from msgspec import UNSET
 
 from faintfield.pipelines.errors import WrongUsage
@@ -28,16 +26,13 @@ from faintfield.pipelines.reconstruction.depth.autofocus import (
     sweep_of_range,
 )
 from faintfield.pipelines.reconstruction.operators import check_in_front
-from faintfield.pipelines.reconstruction.options import PLACES, Options
+from faintfield.pipelines.reconstruction.options import PLACES, Options, sweep_values
 from faintfield.pipelines.reconstruction.planes.solutions import PriorName, Settings
 
 DEFAULT_METHOD: Method = "pmlem"
 
 # Fewer depths leave nothing to interpolate between.
 _MIN_DEPTHS_OF_A_MAP = 5
-
-# Largest sweep: more planes are a typing error, and would fill any disk.
-_MAX_PLANES = 10_000
 
 # Methods whose planes a prior can improve.
 _WITH_PRIOR: frozenset[Method] = frozenset({"pmlem", *JOINT_METHODS})
@@ -290,17 +285,6 @@ def _sweep_depths(sweep_mm: str) -> list[float]:
     if min(depths) <= 0:
         raise WrongUsage(f"--sweep-mm {sweep_mm}: is no sweep; give two different positive depths")
     return depths
-
-
-def sweep_values(option: str, text: str, example: str) -> list[float]:
-    """Return the numbers of FIRST:LAST:COUNT, in equal steps."""
-    parts = re.fullmatch(r"(-?\d+(?:\.\d*)?):(-?\d+(?:\.\d*)?):(\d+)", text)
-    if parts is None:
-        raise WrongUsage(f"{option} {text}: is no sweep; give FIRST:LAST:COUNT, such as {example}")
-    first, last, count = float(parts[1]), float(parts[2]), int(parts[3])
-    if first == last or not 2 <= count <= _MAX_PLANES:
-        raise WrongUsage(f"{option} {text}: is no sweep; give two different ends and 2 to {_MAX_PLANES} planes")
-    return [round(float(value), 6) for value in np.linspace(first, last, count)]
 
 
 def resolve(

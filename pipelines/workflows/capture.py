@@ -9,7 +9,7 @@ from faintfield.pipelines.errors import WrongUsage
 from faintfield.pipelines.formats.rig_file import read_rig
 from faintfield.pipelines.live.guided import capture_session
 from faintfield.pipelines.live.planes_messages import MAX_DEPTHS, LiveOrder
-from faintfield.pipelines.reconstruction.request import sweep_values
+from faintfield.pipelines.reconstruction.options import sweep_values
 
 
 def capture_or_resume(

@@ -30,7 +30,9 @@ class GPhoto2Camera:
         try:
             import gphoto2
         except ImportError as failure:
-            raise MissingExtra("backend 'gphoto2' needs a package; run: pip install 'faintfield[gphoto2]'") from failure
+            raise MissingExtra(
+                "backend 'gphoto2' needs a package that is not installed; run: pip install 'faintfield[gphoto2]'"
+            ) from failure
         self._gphoto2 = gphoto2
         self.close()
         self._camera = self._bounded(self._connect, "connecting")

@@ -62,7 +62,8 @@ class TemperatureWait:
             temperature_c = read_temperature(self._rig.camera)
             if temperature_c is None:
                 raise CameraError(
-                    f"camera.settle_temperature_c = {target_c:g}, but none is reported; check cooler and cable"
+                    f"camera.settle_temperature_c = {target_c:g}, but the camera reports no temperature; check cooler "
+                    "and cable"
                 )
             now_s = clock.now_s()
             near = abs(temperature_c - target_c) <= settings.settle_tolerance_c

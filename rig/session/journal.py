@@ -236,7 +236,9 @@ class Journal:
             ]
         for frame in frames:
             if not is_plain_name(frame.file):
-                raise SessionCorrupt(f"{self.path}: {frame.file!r:.60} is no name of a frame; restore it from a copy")
+                raise SessionCorrupt(
+                    f"{self.path}: {frame.file!r:.60} is no name of a frame; restore the journal from a copy"
+                )
         return frames
 
     def uncommitted(self) -> list[tuple[int, int]]:

@@ -211,7 +211,7 @@ def open_journal(folder: Path, frozen: FrozenPlan, *, create: bool = False, read
     if journal.format != frozen.format:
         journal.close()
         raise SessionCorrupt(
-            f"{journal.path}: has format {journal.format}, the plan {frozen.format}; restore it from a copy"
+            f"{journal.path}: has format {journal.format}, the plan {frozen.format}; restore the journal from a copy"
         )
     return journal
 

@@ -221,7 +221,7 @@ def test_end_of_live_planes_leaves_session_alone(tmp_path: Path, number: signal.
         if number == signal.SIGKILL:
             while running.client.failure() is None:
                 time.sleep(_POLL_S)
-            assert running.client.failure() == "live planes ended (by signal SIGKILL); the capture goes on without them"
+            assert running.client.failure() == "live planes ended (by signal 9); the capture goes on without them"
         running.end()
     verdict = verify(running.folder)
     assert (verdict.problems, verdict.present, verdict.sealed) == ((), 4, True)

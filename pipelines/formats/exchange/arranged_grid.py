@@ -154,7 +154,7 @@ def _choose_order(grid: ImageGrid, inspect: _Inspect, *, fixed: bool) -> tuple[l
         for kind, reversed_nodes in _back_and_forth(nodes).items():
             other = inspect(reversed_nodes)
             if (
-                other.order.verdict == "fits"
+                other.failure is None
                 and len(other.fits.odd) <= len(inspection.fits.odd)
                 and other.axes.level >= inspection.axes.level
                 and other.fits.shift_rms_px < _MAX_SHIFT_SHARE * inspection.fits.shift_rms_px

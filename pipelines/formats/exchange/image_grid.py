@@ -17,6 +17,9 @@ from faintfield.pipelines.formats.exchange.imported_set import PosedImage
 from faintfield.pipelines.formats.exchange.picture_folder import pictures_in
 from faintfield.rig.plan import centre_node, grid_nodes
 
+# Largest ratio of missing pictures to those found; beyond it, the numbers in the names are not rows and columns.
+_MAX_MISSING_RATIO = 10
+
 # Largest step of numbers, such as 2 for every second view; times and serial numbers may have larger ones.
 _MAX_STEP = 8
 
@@ -75,12 +78,14 @@ class ImageGrid:
 
         Measured positions go with their cameras; the distance between columns remains their unit, or takes its place.
         """
-        moves = sorted((to, node) for i, (node, to) in enumerate(zip(self.paths, nodes, strict=True)) if i not in omit)
+        moves = sorted(zip(nodes, self.paths, strict=True))
         measured = self.measured
-        if measured is not None:
+        if measured is not None:  # all cameras tell the unit, those whose pictures are left out, too
             places = {to: measured[node] for to, node in moves}
             measured = measured_steps({to: (y, x) if transposed else (x, y) for to, (x, y) in places.items()})
-        return replace(self, paths={to: self.paths[node] for to, node in moves}, measured=measured)
+        left_out = {nodes[index] for index in omit}
+        paths = {to: self.paths[node] for to, node in moves if to not in left_out}
+        return replace(self, paths=paths, measured=measured and {to: measured[to] for to in paths})
 
     def posed(self, lens: Lens, pitch_mm: float, disparity_px: float, ratio: float = 1.0) -> list[PosedImage]:
         """Return the pictures at measured poses where positions were measured, else at nominal ones.
@@ -185,6 +190,12 @@ def _check_size(folder: Path, grid: ImageGrid, rows: int | None, columns: int | 
     """Refuse a grid of which half is missing, or of another size than stated."""
     size = grid.size
     missing = size[0] * size[1] - len(grid.paths)
+    if missing > _MAX_MISSING_RATIO * len(grid.paths):
+        raise BadValue(
+            f"{folder}: numbers in names like {next(iter(grid.paths.values())).name} would make a grid of {size[0]} x "
+            f"{size[1]} of {len(grid.paths)} pictures, so they are not row and column; give --rows and --columns to "
+            "take files in order, or --pattern"
+        )
     if missing >= len(grid.paths):
         row, column = next((r, c) for r in range(size[0]) for c in range(size[1]) if (r, c) not in grid.paths)
         raise MissingFile(

@@ -54,9 +54,13 @@ def pictures_in(folder: Path, *, every: bool = False) -> tuple[list[Path], list[
     pictures = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES]
     unread = [path for path in files if path.suffix.lower() not in IMAGE_SUFFIXES | _NO_PICTURES]
     if not pictures:
-        contents = _count_kinds(files) or (f"folders only, such as {entries[0].name}" if entries else "nothing")
+        folders = [path for path in entries if is_folder(path)]
+        if folders and not files:
+            raise MissingFile(
+                f"{folder}: holds folders only, such as {folders[0].name}; name the one with the pictures"
+            )
         raise MissingFile(
-            f"{folder}: holds {contents}; convert pictures to PNG or TIFF (read are "
+            f"{folder}: holds {_count_kinds(files) or 'nothing'}; convert pictures to PNG or TIFF (read are "
             f"{', '.join(sorted(IMAGE_SUFFIXES))}), or name the folder that holds them"
         )
     remarks = [f"left out: {_count_kinds(unread)}, which are not read"] if unread else []

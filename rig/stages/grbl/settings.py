@@ -100,6 +100,7 @@ class GrblSettings(Struct, frozen=True):
         value = float(self.values.get(setting, "nan"))
         if not (value > 0.0 or (value == 0.0 and setting < 100 and setting not in (24, 25))):
             raise WrongFirmware(
-                f"${setting}={self.values.get(setting, 'not reported')}: the stage cannot be driven; set it"
+                f"${setting}={self.values.get(setting, 'not reported')}: the stage cannot be driven; set it in the "
+                "controller"
             )
         return value

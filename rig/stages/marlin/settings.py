@@ -41,17 +41,21 @@ def marlin_identity(messages: Iterable[Message], axes: tuple[str, str], travel_m
         value = parameters.get(command, {}).get(letter)
         if value is None or value <= 0.0:
             state = "not reported" if value is None else f"{value:g}"
-            raise WrongFirmware(f"{command} {letter}={state}: the stage cannot be driven with it; set it")
+            raise WrongFirmware(f"{command} {letter}={state}: the stage cannot be driven with it; set it in Marlin")
         return value
 
-    boxes = [Box(message.x_mm, message.y_mm) for message in received if isinstance(message, Limits)]
+    limits = [message for message in received if isinstance(message, Limits)]
     warnings = []
-    if not boxes:
+    if not limits:
         warnings.append("no limits are reported: only stage.travel_mm keeps the stage inside its travel; check it")
-    if Capability("EMERGENCY_PARSER", present=True) not in received:
+    capabilities = {message.name: message.present for message in received if isinstance(message, Capability)}
+    if not capabilities.get("EMERGENCY_PARSER"):
         warnings.append("no emergency parser: a motion cannot be stopped half way; enable EMERGENCY_PARSER")
-    if boxes and axes == ("X", "Y"):
-        travel_mm = reduce(Box.intersection, boxes)
+    if limits and axes == ("X", "Y"):
+        try:
+            travel_mm = reduce(Box.intersection, (Box(message.x_mm, message.y_mm) for message in limits))
+        except ValueError as failure:
+            raise WrongFirmware(f"the travel reported (M115, M211) is none: {failure}; set it in Marlin") from failure
     if travel_mm is None:
         raise WrongFirmware("the controller does not report its travel (M115, M211); set stage.travel_mm")
     x, y = axes

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from faintfield.pipelines.formats.exchange.image_grid import ImageGrid, measured_steps
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
 from tests.calib.light_fields import Layer, Views, light_field, with_noise
@@ -46,6 +47,23 @@ def _assert_as_rendered(elemental_set: ElementalSet, views: Views) -> None:
     for node, path in zip(nodes, elemental_set.image_paths, strict=True):
         assert node is not None
         np.testing.assert_array_equal(read_frame(path).pixels_dn, (views[node] * 40_000).astype(np.uint16))
+
+
+def test_four_views_named_back_and_forth_are_put_in_order(tmp_path: Path, done: Command) -> None:
+    views = light_field(grid=(2, 2), size_px=SIZE_PX)
+    src = _write(tmp_path / "src", views, lambda row, column: _plain(row, 1 - column if row else column))
+    assert "names run back and forth" in done("import", "grid", src, tmp_path / "set").stderr
+    _assert_as_rendered(load_set(tmp_path / "set"), views)
+
+
+def test_cameras_keep_their_places_when_a_picture_is_left_out() -> None:
+    positions = {(row, column): (50.0 * column + 3 * row % 4, 40.0 * row) for row, column in np.ndindex(3, 2)}
+    paths = {node: Path(f"{index}.png") for index, node in enumerate(positions)}
+    grid = ImageGrid(paths, measured_steps(positions))
+    whole, part = grid.moved(list(paths)), grid.moved(list(paths), omit=[1, 3, 5])  # the second column
+    assert whole.measured is not None
+    assert part.measured == {node: whole.measured[node] for node in part.paths}
+    assert list(part.paths) == [(0, 0), (1, 0), (2, 0)]
 
 
 def test_pictures_turned_by_their_names_are_put_in_order(views: Views, tmp_path: Path, done: Command) -> None:
