@@ -174,5 +174,5 @@ def test_second_look_restores_small_markers(monkeypatch: pytest.MonkeyPatch) -> 
     reduce_images(monkeypatch)
     reduced = detected(light, [BOARD])["a"]
     assert len(whole.corners) == len(reduced.corners) == 35
-    monkeypatch.setattr("faintfield.calib.detection._second_looks", lambda *_: [])
+    monkeypatch.setattr("faintfield.calib.detection._search_again", lambda *_: [])
     assert detected(light, [BOARD])["a"].markers < reduced.markers == 24

@@ -50,7 +50,7 @@ def _assert_as_rendered(elemental_set: ElementalSet, views: Views) -> None:
 
 
 def test_four_views_named_back_and_forth_are_put_in_order(tmp_path: Path, done: Command) -> None:
-    views = light_field(grid=(2, 2), size_px=SIZE_PX)
+    views = light_field(grid=(2, 2), size_px=SMALL_PX)
     src = _write(tmp_path / "src", views, lambda row, column: _plain(row, 1 - column if row else column))
     assert "names run back and forth" in done("import", "grid", src, tmp_path / "set").stderr
     _assert_as_rendered(load_set(tmp_path / "set"), views)
