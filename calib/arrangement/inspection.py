@@ -108,7 +108,7 @@ class GridInspection:
     @property
     def still(self) -> bool:
         """No point moves from view to view by more than is told from zero."""
-        return max(map(abs, self.disparity_px)) <= _NO_SIGN_PX
+        return self.failure is None and max(map(abs, self.disparity_px)) <= _NO_SIGN_PX
 
 
 def inspect_grid(
@@ -161,7 +161,9 @@ def inspect_grid(
         ratio=ratio,
     )
     turn, direction, undecided = _direction(opposed, side_z, (least_px, largest_px), no_sign_px)
-    if turn and prescribed is None:
+    if prescribed is not None:
+        turn, direction, undecided = False, "names", False
+    if turn:
         orientation, side_z, least_px, largest_px = orientation.turned(), -side_z, -largest_px, -least_px
     fits = compare_neighbours(
         dict(zip(orientation.apply(nodes), pictures.fine, strict=True)), (least_px, largest_px), ratio
