@@ -83,8 +83,8 @@ def check_flat_levels(darks: Sequence[Series], flats: Sequence[Series]) -> None:
                 f"{item.names[high]}: mean {item.levels_dn[high]:.1f} DN, where {item.names[low]} of the same "
                 f"{item.conditions} has {item.levels_dn[low]:.1f} DN: {range_dn[index] / signal_dn[index]:.0%} of "
                 f"their signal apart (limit {limit:.0%}{', by the flicker of the others' * (rest.size > 1)}); they are "
-                "of different light or exposure: correct `exposure_s`, `level` or `photons` of the wrong one, or leave it "
-                "out"
+                "of different light or exposure: correct `exposure_s`, `level` or `photons` of the wrong one, or leave "
+                "it out"
             )
 
 
