@@ -118,7 +118,7 @@ def _start(guesses: Array, squares_px: Array) -> Array:
 
 
 def _windows(image: Pixels, guesses: Array, positions: Array, squares_px: Array, clear: float) -> _Windows:
-    """Return a cross of pixels along the edges about each position `positions` (corner, 2), relative to the guesses."""
+    """Return a cross of pixels along the edges about the positions (corner, 2), relative to the guesses."""
     sides = np.linalg.norm(squares_px, axis=2)
     heights = np.abs(np.linalg.det(squares_px))[:, np.newaxis] / sides
     along = np.minimum(_MAX_ALONG_SQUARES * sides, _MAX_ALONG_PX)

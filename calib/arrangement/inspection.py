@@ -45,6 +45,7 @@ _AGREE, _SQUARE = 0.35, 0.08
 # Standard errors from which the occlusion test decides, and from which it casts doubt on what signs say.
 _MIN_SIDE_Z, _DOUBTFUL_SIDE_Z = 4.0, 2.5
 
+type Failure = Literal["small", "single", "even", "apart", "dark"]
 type DirectionSource = Literal["pictures", "signs", "names"]
 
 
@@ -81,7 +82,7 @@ class GridInspection:
     """
 
     orientation: Orientation
-    failure: Literal["small", "single", "even", "apart", "dark"] | None = None
+    failure: Failure | None = None
     axes: Axes = field(default_factory=Axes)
     side_z: float = 0.0
     direction: DirectionSource = "names"
@@ -125,18 +126,11 @@ def inspect_grid(
     prescribed : Orientation, optional
         The orientation, if a person stated it; else it is found.
     """
-    orientation = prescribed or Orientation()
-    if len(nodes) < 2:
-        return GridInspection(orientation, "single")
-    if not any(np.ptp(picture) for picture in pictures.brightness):
-        return GridInspection(orientation, "even")
-    if min(pictures.fine[0].shape) < MIN_SIDE_PX:
-        return GridInspection(orientation, "small")
-    if not neighbour_counts(nodes, 1).any():
-        return GridInspection(orientation, "apart")
+    if (failure := _failure_at_sight(nodes, pictures)) is not None:
+        return GridInspection(prescribed or Orientation(), failure)
     coarse, coarse_axes = _match_coarsely(nodes, pictures)
     if coarse_axes.match_z < SURE:
-        return GridInspection(orientation, "dark", axes=coarse_axes)
+        return GridInspection(prescribed or Orientation(), "dark", axes=coarse_axes)
     coarse_px = max(map(abs, _range(coarse, coarse_axes) or (0.0, 0.0))) + 1.0
     fine_px = coarse_px * pictures.coarse_scale / pictures.fine_scale
     fine, distance = _match_finely(nodes, pictures, fine_px)
@@ -179,16 +173,31 @@ def inspect_grid(
         side_z=side_z,
         direction=direction,
         undecided=undecided,
-        contradicted=prescribed is not None
-        and (
-            side_z < -_MIN_SIDE_Z
-            or (axes.transposed_z > SURE and axes.transposed != prescribed.transpose)
-            or (axes.opposed_z > SURE and axes.opposed != prescribed.opposed)
-        ),
+        contradicted=prescribed is not None and _contradict(prescribed, axes, side_z),
         disparity_px=(least_px * pictures.fine_scale, largest_px * pictures.fine_scale),
         ratio=ratio,
         fits=replace(fits, shift_px=fits.shift_px * pictures.fine_scale),
         order=check_order(fitting, axes, coarse_px),
+    )
+
+
+def _failure_at_sight(nodes: Sequence[Node], pictures: GridPictures) -> Failure | None:
+    """Return why pictures cannot be compared, None if they can."""
+    if len(nodes) < 2:
+        return "single"
+    if not any(np.ptp(picture) for picture in pictures.brightness):
+        return "even"
+    if min(pictures.fine[0].shape) < MIN_SIDE_PX:
+        return "small"
+    return None if neighbour_counts(nodes, 1).any() else "apart"
+
+
+def _contradict(prescribed: Orientation, axes: Axes, side_z: float) -> bool:
+    """Return whether the pictures deny a prescribed orientation."""
+    return (
+        side_z < -_MIN_SIDE_Z
+        or (axes.transposed_z > SURE and axes.transposed != prescribed.transpose)
+        or (axes.opposed_z > SURE and axes.opposed != prescribed.opposed)
     )
 
 

@@ -125,14 +125,16 @@ def gather(
             f"node {reference}, whose camera is the reference, shows no board with {_MIN_CORNERS} corners or more; "
             "take it again with a board in view"
         )
-    kept = [seen for seen in useful if seen.node in nodes]
-    targets = sorted({seen.target for seen in kept}, key=lambda target: (target.sweep, target.homing, target.board))
-    kept.sort(key=lambda seen: (targets.index(seen.target), nodes.index(seen.node)))
+    kept = [observation for observation in useful if observation.node in nodes]
+    targets = sorted(
+        {observation.target for observation in kept}, key=lambda target: (target.sweep, target.homing, target.board)
+    )
+    kept.sort(key=lambda observation: (targets.index(observation.target), nodes.index(observation.node)))
     return Observations(
         nodes,
         targets,
-        np.array([nodes.index(seen.node) for seen in kept], np.int32),
-        np.array([targets.index(seen.target) for seen in kept], np.int32),
+        np.array([nodes.index(observation.node) for observation in kept], np.int32),
+        np.array([targets.index(observation.target) for observation in kept], np.int32),
         *_lattices(kept, corner_shapes),
     )
 

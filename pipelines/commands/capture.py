@@ -1,7 +1,7 @@
 """Commands at the rig, from its description to a verified session."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
@@ -14,16 +14,20 @@ from faintfield.pipelines.planning.options import PlanOptions
 if TYPE_CHECKING:
     from faintfield.pipelines.formats.results.prediction import PredictionRecord
     from faintfield.pipelines.workflows.board import BoardSheets
+    from faintfield.pipelines.workflows.capture import Captured
+    from faintfield.pipelines.workflows.check import RigCheck
     from faintfield.pipelines.workflows.verify import Verified
 
 _PLAN = PlanOptions()
 
 type Prediction = PredictionRecord
+type Check = RigCheck
+type Capture = Captured
 type Sheets = BoardSheets
 type Verification = Verified
 
 
-def init(rig: Path = Path("rig.toml"), /) -> dict[str, Any]:
+def init(rig: Path = Path("rig.toml"), /) -> dict[str, str]:
     """Write a commented configuration, which describes a simulated rig until you change it.
 
     Parameters
@@ -41,7 +45,7 @@ def init(rig: Path = Path("rig.toml"), /) -> dict[str, Any]:
     return {"rig": str(rig)}
 
 
-def check(rig: Path, /, *, remember: bool = False, session: Path | None = None) -> dict[str, Any]:
+def check(rig: Path, /, *, remember: bool = False, session: Path | None = None) -> Check:
     """Check a configuration against the rig, without any motion.
 
     Parameters
@@ -125,7 +129,7 @@ def capture(
     noise: Path | None = None,
     geometry: Path | None = None,
     fx_px: Positive | None = None,
-) -> dict[str, Any]:
+) -> Capture:
     """Capture a session, step by step; run it again to go on where it stopped.
 
     Keys: p pause, r take the last frame again, s skip, q stop. Ctrl-C stops after the present frame, a second one at

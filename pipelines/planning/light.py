@@ -10,6 +10,7 @@ from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.results.noise import read_fitted_noise
 from faintfield.pipelines.formats.results.noise_fit import Measured
 from faintfield.pipelines.planning.known import Sensor
+from faintfield.pipelines.planning.options import PlanOptions
 
 # Two-sided 95 % of the normal distribution.
 _Z95 = 1.96
@@ -29,62 +30,43 @@ class Light:
     source: str
 
 
-@dataclass(frozen=True)
-class LightOptions:
-    """The light as options give it: exactly one of the first four.
+def planned_light(options: PlanOptions, exposure_s: float, sensor: Sensor) -> Light:
+    """Return the light of the scene: as stated, or that of a frame.
 
-    Attributes
+    Parameters
     ----------
-    e, e_per_s : float, optional
-        Electrons per pixel in one frame, or in a second.
-    flat, test_frame, exposure_s : Path and float, optional
-        A frame of even light, or one of the scene, and its exposure; by default that which its file states.
-    region_px : (int, int, int, int), optional
-        Left column, upper row, width and height of the object in the frame; by default the middle of a flat, or all
-        of a test frame.
+    options : PlanOptions
+        Exactly one of the light, the light per second, a flat and a test frame.
+    exposure_s : float
+        Exposure of the frame that `light_e` is of.
+    sensor : Sensor
+        That took the frame.
+
+    Raises
+    ------
+    WrongUsage
+        None or several are given.
+    InputError
+        The frame cannot be used, or shows no light.
     """
-
-    e: float | None = None
-    e_per_s: float | None = None
-    flat: Path | None = None
-    test_frame: Path | None = None
-    exposure_s: float | None = None
-    region_px: tuple[int, int, int, int] | None = None
-
-    def resolve(self, exposure_s: float, sensor: Sensor) -> Light:
-        """Return the light.
-
-        Parameters
-        ----------
-        exposure_s : float
-            Exposure of the frame that `e` is of.
-        sensor : Sensor
-            That took the frame.
-
-        Raises
-        ------
-        WrongUsage
-            None or several are given.
-        InputError
-            The frame cannot be used, or shows no light.
-        """
-        count = sum(value is not None for value in (self.e, self.e_per_s, self.flat, self.test_frame))
-        if count != 1:
-            raise WrongUsage(
-                f"{count} lights are given, and one is wanted; give --light-e, --light-e-per-s, --flat or --test-frame"
-            )
-        if (path := self.flat or self.test_frame) is not None:
-            return _light_of_frame(path, self, sensor)
-        if (self.exposure_s, self.region_px) != (None, None):
-            raise WrongUsage("--frame-exposure-ms and --region-px are those of a frame; give --test-frame or --flat")
-        per_s = self.e_per_s if self.e is None else self.e / exposure_s
-        return Light(Measured(per_s), "as stated")
+    per_frame_e, per_s, path = options.light_e, options.light_e_per_s, options.flat or options.test_frame
+    count = sum(value is not None for value in (per_frame_e, per_s, options.flat, options.test_frame))
+    if count != 1:
+        raise WrongUsage(
+            f"{count} lights are given, and one is wanted; give --light-e, --light-e-per-s, --flat or --test-frame"
+        )
+    if path is not None:
+        return _light_of_frame(path, options, sensor)
+    if (options.frame_exposure_ms, options.region_px) != (None, None):
+        raise WrongUsage("--frame-exposure-ms and --region-px are those of a frame; give --test-frame or --flat")
+    return Light(Measured(per_s if per_frame_e is None else per_frame_e / exposure_s), "as stated")
 
 
-def _light_of_frame(path: Path, options: LightOptions, sensor: Sensor) -> Light:
+def _light_of_frame(path: Path, options: PlanOptions, sensor: Sensor) -> Light:
     """Return the light of a frame, with its interval: by the noise of its pixels, and by that of the calibration."""
     frame = read_frame(path)
-    exposure_s = options.exposure_s or frame.exposure_s
+    stated_ms = options.frame_exposure_ms
+    exposure_s = frame.exposure_s if stated_ms is None else 1e-3 * stated_ms
     if exposure_s is None:
         raise BadValue(f"{path}: states no exposure time; give --frame-exposure-ms")
     if frame.pixels_dn.ndim != 2:
@@ -129,7 +111,7 @@ def _light_of_frame(path: Path, options: LightOptions, sensor: Sensor) -> Light:
     return Light(Measured(light_e / exposure_s, margin_e / _Z95 / exposure_s, ends), source)
 
 
-def _region(path: Path, options: LightOptions, width: int, height: int) -> tuple[slice, slice]:
+def _region(path: Path, options: PlanOptions, width: int, height: int) -> tuple[slice, slice]:
     if options.region_px is not None:
         left, upper, wide, high = options.region_px
         if min(left, upper) < 0 or min(wide, high) < 1 or left + wide > width or upper + high > height:

@@ -12,7 +12,7 @@ from faintfield.pipelines.arguments import Count, Fraction, NotNegative, Positiv
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class PlanOptions:
-    """What is known of the light and the camera, and what is to be compared.
+    """Known light and camera of a capture, and the alternatives to compare.
 
     Parameters
     ----------

@@ -2,7 +2,8 @@
 
 import sys
 from pathlib import Path
-from typing import Any
+
+import msgspec
 
 from faintfield.pipelines.console import console
 from faintfield.pipelines.errors import WrongUsage
@@ -10,6 +11,14 @@ from faintfield.pipelines.formats.rig_file import read_rig
 from faintfield.pipelines.live.guided import capture_session
 from faintfield.pipelines.live.planes_messages import MAX_DEPTHS, LiveOrder
 from faintfield.pipelines.reconstruction.options import sweep_values
+
+
+class Captured(msgspec.Struct, frozen=True):
+    """The result of `faintfield capture`: the session, and the number of frames taken by this call."""
+
+    session: str
+    complete: bool
+    taken: int
 
 
 def capture_or_resume(
@@ -21,7 +30,7 @@ def capture_or_resume(
     live_depth_mm: list[float] | None,
     live_sweep_mm: str | None,
     known: tuple[Path | None, Path | None, float | None],
-) -> dict[str, Any]:
+) -> Captured:
     """Capture a session, or go on with it; `known` are noise, geometry and focal length for the live planes."""
     if not (yes or page or (console.is_terminal and sys.stdin.isatty())):
         raise WrongUsage("there is no terminal to answer prompts on; give --yes, or --page and answer there")
@@ -29,7 +38,7 @@ def capture_or_resume(
     if planes is not None and not page:
         raise WrongUsage("live planes are shown on the page, and there is none; give --page, too")
     taken = capture_session(read_rig(rig), session, unattended=yes, page=page, planes=planes)
-    return {"session": str(session), "complete": True, "taken": taken}
+    return Captured(str(session), complete=True, taken=taken)
 
 
 def _live_order(

@@ -1,7 +1,8 @@
 """Check of a rig.toml against stage, camera and disk, without any motion."""
 
 from pathlib import Path
-from typing import Any
+
+import msgspec
 
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import MissingFile
@@ -15,7 +16,20 @@ from faintfield.rig.session.session import has_session, is_sealed, read_plan
 from faintfield.rig.settings import RigSettings
 
 
-def check_rig(rig: Path, remember: bool, session: Path | None) -> dict[str, Any]:
+class RigCheck(msgspec.Struct, frozen=True):
+    """The result of `faintfield check`: what the capture takes, who answered, and what has changed."""
+
+    frames: int
+    disk_bytes: int
+    duration_s: float
+    stage: str
+    camera: str
+    changed_settings: list[str]
+    changed_since_session: list[str]
+    warnings: list[str]
+
+
+def check_rig(rig: Path, remember: bool, session: Path | None) -> RigCheck:
     """Ask stage, camera and disk whether a capture is possible, and print the answers."""
     settings = read_rig(rig)
     since = [] if session is None else _changes_since(session, settings)
@@ -32,16 +46,16 @@ def check_rig(rig: Path, remember: bool, session: Path | None) -> dict[str, Any]
         inform(f"stored the stage's settings in {stage_settings_path(rig)}")
     elif stored is None:
         inform("the stage's settings are not stored yet; with --remember, later checks say what has changed")
-    return {
-        "frames": found.plan.frame_count(),
-        "disk_bytes": found.plan.disk_bytes(),
-        "duration_s": found.duration_s,
-        "stage": found.stage.firmware,
-        "camera": found.camera.name,
-        "changed_settings": changed,
-        "changed_since_session": since,
-        "warnings": found.stage.warnings,
-    }
+    return RigCheck(
+        frames=found.plan.frame_count(),
+        disk_bytes=found.plan.disk_bytes(),
+        duration_s=found.duration_s,
+        stage=found.stage.firmware,
+        camera=found.camera.name,
+        changed_settings=changed,
+        changed_since_session=since,
+        warnings=list(found.stage.warnings),
+    )
 
 
 def _changes_since(session: Path, settings: RigSettings) -> list[str]:

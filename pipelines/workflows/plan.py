@@ -10,7 +10,7 @@ from faintfield.pipelines.formats.results.noise_fit import Measured
 from faintfield.pipelines.formats.results.prediction import PredictionRecord
 from faintfield.pipelines.formats.rig_file import read_rig
 from faintfield.pipelines.planning.known import calibration_file, known_lens, known_pace, known_sensor
-from faintfield.pipelines.planning.light import LightOptions
+from faintfield.pipelines.planning.light import planned_light
 from faintfield.pipelines.planning.options import PlanOptions
 from faintfield.pipelines.planning.predict import Predictor, Question, parse_grids, scene_view
 from faintfield.pipelines.planning.printing import print_prediction
@@ -29,10 +29,6 @@ def predict_capture(rig: Path, options: PlanOptions) -> PredictionRecord:
     lens = known_lens(settings, sensor, calibration_file(options.geometry, GEOMETRY_FILE, rig.parent), options.fx_px)
     exposures_s = [1e-3 * exposure_ms for exposure_ms in options.exposures_ms or []]
     exposure_s, view = scene_view(settings, exposures_s)
-    frame_exposure_s = None if options.frame_exposure_ms is None else 1e-3 * options.frame_exposure_ms
-    given = LightOptions(
-        options.light_e, options.light_e_per_s, options.flat, options.test_frame, frame_exposure_s, options.region_px
-    )
     depths_mm = options.depth_mm or settings.scene.depth_mm
     sides_px = [*(options.feature_px or []), *_in_px(options.feature_mm or [], depths_mm, lens.f_px)]
     question = Question(
@@ -45,7 +41,7 @@ def predict_capture(rig: Path, options: PlanOptions) -> PredictionRecord:
         options.frames or [],
         options.sigma_e,
     )
-    light = given.resolve(exposure_s, sensor)
+    light = planned_light(options, exposure_s, sensor)
     predictor = Predictor(settings, sensor, lens, known_pace(settings), light, question)
     record = predictor.record(str(rig), exposure_s, view)
     print_prediction(record)

@@ -124,7 +124,7 @@ def complete_noise(stated_noise: StatedNoise, pictures: Pictures) -> tuple[Noise
     if stated_noise.gain_dn_per_e is not None and stated_noise.read_noise_e is not None:
         return noise(stated_noise.gain_dn_per_e, stated_noise.read_noise_e, estimated=False), NoiseOrigin("stated")
     try:
-        estimate = _estimated(stated_noise, pictures)
+        estimate = _estimate_noise(stated_noise, pictures)
     except NotIdentifiable as failure:
         gain, read_e = _assumed(stated_noise, pictures.tone)
         inform(
@@ -152,7 +152,7 @@ def _assumed(stated_noise: StatedNoise, tone: Tone) -> tuple[float, float]:
     return stated_noise.gain_dn_per_e or 1.0, stated_noise.read_noise_e or 0.0
 
 
-def _estimated(stated_noise: StatedNoise, pictures: Pictures) -> "ViewNoise":
+def _estimate_noise(stated_noise: StatedNoise, pictures: Pictures) -> "ViewNoise":
     """Return the noise that neighbouring views show."""
     from faintfield.calib.noise.views import compared_blocks, estimate_view_noise  # loads much that is used here only
 

@@ -188,7 +188,7 @@ class _Verification:
             self.unchecked.append(f"{path}: has no digest: an earlier version wrote it, or a person")
         else:
             self.problems.append(f"{path}: was altered after it was written")
-        beside = _vouched_files(record)
+        beside = _hashes_beside(record)
         self._name(path, path.parent, beside, is_input=False)
         self.problems += [f"{path}: has no SHA-256 of {name}" for name in _named_by(record) if name not in beside]
 
@@ -286,7 +286,7 @@ def _kinds_of(path: Path) -> tuple[type[Struct], ...]:
     return next((kinds for pattern, kinds in _KINDS.items() if fnmatchcase(path.name, pattern)), ())
 
 
-def _vouched_files(record: Struct) -> Mapping[str, str]:
+def _hashes_beside(record: Struct) -> Mapping[str, str]:
     """Return the SHA-256 of each file beside a record for which it vouches, by name."""
     match record:
         case PlaneFileRecord() | DepthMapFileRecord() | SurfaceFileRecord():
