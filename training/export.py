@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import onnx
 import torch
+from numpy.typing import NDArray
 from onnx import helper, numpy_helper
 
 from training.train import WIDTHS, PlanePrior
@@ -20,7 +21,9 @@ class _Graph:
     """An ONNX graph that grows node by node; methods return the name of what they add."""
 
     def __init__(self, weights: dict[str, torch.Tensor]) -> None:
-        self._weights, self.nodes, self.constants = weights, [], []
+        self._weights = weights
+        self.nodes: list[onnx.NodeProto] = []
+        self.constants: list[onnx.TensorProto] = []
 
     def add(self, kind: str, *inputs: str, **attributes: object) -> str:
         """Add a node of one output."""
@@ -28,7 +31,7 @@ class _Graph:
         self.nodes.append(helper.make_node(kind, inputs, [name], name, **attributes))
         return name
 
-    def constant(self, name: str, value: np.ndarray) -> str:
+    def constant(self, name: str, value: NDArray[np.float32]) -> str:
         """Add a constant."""
         self.constants.append(numpy_helper.from_array(value, name))
         return name

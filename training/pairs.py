@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.pipelines.reconstruction.planes.solve import Settings, solve
+from faintfield.pipelines.reconstruction.planes.solutions import Settings
+from faintfield.pipelines.reconstruction.planes.solve import solve
 from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.metrics import signal_scale_for_snr
 from faintfield.recon.operator.grid import PlaneGrid
@@ -110,7 +111,14 @@ def channels(exposed: Exposure, weight: float | None) -> NDArray[np.float32]:
 def photographs(folder: Path | None) -> list[Picture]:
     """Return the pictures of a folder as light from 0 to 1."""
     files = sorted(folder.iterdir()) if folder else []
-    return [(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) / np.float32(255)) ** np.float32(2.2) for file in files]
+    return [_read_photograph(file) for file in files]
+
+
+def _read_photograph(file: Path) -> Picture:
+    levels = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+    if levels is None:
+        raise SystemExit(f"{file} is no picture that OpenCV reads; move it out of the folder of photographs")
+    return np.asarray((levels / np.float32(255)) ** np.float32(2.2), np.float32)
 
 
 def _cut(random: np.random.Generator, photograph: Picture, size: int) -> Picture:
@@ -119,7 +127,7 @@ def _cut(random: np.random.Generator, photograph: Picture, size: int) -> Picture
     top, left = (int(random.integers(0, length - side + 1)) for length in photograph.shape)
     square = photograph[top : top + side, left : left + side]
     light = cv2.resize(square, (size, size), interpolation=cv2.INTER_AREA if side > size else cv2.INTER_LINEAR)
-    return np.clip(light, 0, 1).astype(np.float32)
+    return np.asarray(np.clip(light, 0, 1), np.float32)
 
 
 def shown_picture(random: np.random.Generator, given: list[Picture]) -> tuple[str, Picture]:

@@ -35,7 +35,7 @@ def _blank(size: int) -> Drawing:
 
 
 def _mask(drawing: Drawing) -> Picture:
-    return drawing.astype(np.float32) / 255
+    return drawing.astype(np.float32) / np.float32(255)
 
 
 def _drawn_polygon(size: int, corners: NDArray[np.floating]) -> Picture:
@@ -107,8 +107,8 @@ def rods(random: np.random.Generator, size: int, radius: float, centre: NDArray[
             angle = random.uniform(0, np.pi)
         along = np.array([np.cos(angle), np.sin(angle)]) * radius
         across = np.array([-np.sin(angle), np.cos(angle)]) * gap * k
-        ends = [tuple(np.round((centre + across + d * along) * 16).astype(int).tolist()) for d in (-1, 1)]
-        cv2.line(drawing, *ends, 255, thickness, cv2.LINE_AA, 4)
+        start, end = (np.round((centre + across + d * along) * 16).astype(int).tolist() for d in (-1, 1))
+        cv2.line(drawing, start, end, 255, thickness, cv2.LINE_AA, 4)
     return _mask(drawing)
 
 
@@ -143,7 +143,8 @@ def gradient(random: np.random.Generator, size: int) -> Picture:
     """Return levels that rise in some direction."""
     x, y = np.meshgrid(*2 * [np.linspace(-1, 1, size, dtype=np.float32)])
     angle, slope = random.uniform(0, 2 * np.pi), random.uniform(0.1, 0.7)
-    return np.clip(random.uniform(0.2, 0.8) + slope * (x * np.cos(angle) + y * np.sin(angle)), 0, 1).astype(np.float32)
+    levels = random.uniform(0.2, 0.8) + slope * (x * np.cos(angle) + y * np.sin(angle))
+    return np.asarray(np.clip(levels, 0, 1), np.float32)
 
 
 def shading(random: np.random.Generator, size: int) -> Picture:
@@ -200,7 +201,8 @@ def _put(canvas: Picture, mask: Picture, fill: Picture | float) -> None:
 def _scattered(random: np.random.Generator, size: int, canvas: Picture, count: int, radii: tuple[float, float]) -> None:
     """Put shapes at random places onto a canvas, sizes even on a logarithmic scale, large ones first."""
     fills: list[Picture | float] = [_fill(random, size) for _ in range(_MOST_FILLS)]
-    for radius in np.sort(np.exp(random.uniform(*np.log(radii), count)))[::-1] * size:
+    low, high = (float(np.log(radius)) for radius in radii)
+    for radius in np.sort(np.exp(random.uniform(low, high, count)))[::-1] * size:
         shape = _SHAPES[random.integers(len(_SHAPES))]
         fill = random.random() if random.random() < 0.5 else fills[random.integers(_MOST_FILLS)]
         _put(canvas, shape(random, size, float(radius), random.uniform(0, size, 2)), fill)

@@ -47,7 +47,8 @@ def network_output(weights: dict[str, NDArray[np.float64]], x: NDArray[np.float6
         seen.append(x)
     for level in range(len(WIDTHS) - 1):
         x = stage(np.concatenate([x.repeat(2, axis=1).repeat(2, axis=2), seen[-2 - level]]), f"up.{level}")
-    return convolution(x, "last")[0]
+    output = convolution(x, "last")
+    return np.asarray(output[0])
 
 
 def main() -> None:

@@ -107,8 +107,9 @@ class Pairs:
             lit = cv2.dilate((truth > _LIT * truth.max()).astype(np.float32), np.ones((7, 7)))
             weight = seen * (_DARK_WEIGHT + (1 - _DARK_WEIGHT) * lit)
             weights.append(weight / weight.mean())
-        stacked = [np.stack(arrays).astype(np.float32) for arrays in (inputs, wanted, weights)]
-        return cls(*stacked, np.mean(stacked[2] * np.square(stacked[1]), axis=(1, 2)), kinds)
+        residuals, shares = np.stack(wanted).astype(np.float32), np.stack(weights).astype(np.float32)
+        errors = np.mean(shares * np.square(residuals), axis=(1, 2))
+        return cls(np.stack(inputs).astype(np.float32), residuals, shares, errors, kinds)
 
 
 def batch(pairs: Pairs, random: np.random.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
