@@ -24,8 +24,8 @@ def main() -> None:
     shape = int((pixels / 1.5) ** 0.5), int((pixels * 1.5) ** 0.5)
     boards = [Board(f"b{k}", 8, 6, 40.0, 29.0, "DICT_5X5_1000", 100 * k) for k in range(6)]
     scene = _scene(boards, shape)
-    found = _timed("six boards", lambda: detect_boards(scene, boards))
-    print(f"{sum(len(one.corners) for one in found)} of 210 corners")
+    observations = _timed("six boards", lambda: detect_boards(scene, boards))
+    print(f"{sum(len(board.corners) for board in observations)} of 210 corners")
     with TemporaryDirectory() as folder, maps_by(maps_in_files(Path(folder))):
         series = _timed(f"statistics of {5 * frames} frames, which are simulated", lambda: _series(shape, frames))
         _timed("fit and maps", lambda: calibrate(series, 65535.0))

@@ -39,7 +39,7 @@ _LIGHT_E = (0.6, 1.0, 0.5)
 
 @dataclass(frozen=True)
 class Stage:
-    """What a command took.
+    """Cost of a command.
 
     Attributes
     ----------

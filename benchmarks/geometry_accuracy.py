@@ -1,4 +1,4 @@
-"""How accurate the geometry and its stated uncertainty are, over many seeds: `python -m benchmarks.geometry_accuracy`.
+"""Accuracy of the geometry and of its stated uncertainty over many seeds: `python -m benchmarks.geometry_accuracy`.
 
 Per seed: 49 nodes with errors of 0.3 mm and 0.2 degrees, six boards, corners with noise of 0.2 px at 1600 x 1200 px.
 """
@@ -93,7 +93,7 @@ def errors_of(geometry: RigGeometry, truth: NDArray[np.float64], experiment: Sim
 
 
 def per_view_pnp_um(
-    seen: Sequence[BoardObservation], truth: NDArray[np.float64], experiment: SimulatedExperiment
+    observations: Sequence[BoardObservation], truth: NDArray[np.float64], experiment: SimulatedExperiment
 ) -> float:
     """Return the error of the centres when each view is solved alone, with the true lens, from its best board.
 
@@ -104,16 +104,16 @@ def per_view_pnp_um(
     matrix, distortion = lens.camera_matrix(), np.array(lens.distortion)
     points = {name: board.corners_mm() for name, board in boards().items()}
     solved = {}
-    for one in seen:
-        _, r, t = cv2.solvePnP(points[one.target.board][one.corners], one.pixels, matrix, distortion)
+    for board in observations:
+        _, r, t = cv2.solvePnP(points[board.target.board][board.corners], board.pixels, matrix, distortion)
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(r)[0], t.ravel()
-        solved[one.node, one.target] = pose
+        solved[board.node, board.target] = pose
     misses = []
     for node, rt in zip(grid_nodes(7, 7), truth, strict=True):
         if node == _REFERENCE:
             continue
-        best = max((one for one in seen if one.node == node), key=lambda one: len(one.corners)).target
+        best = max((board for board in observations if board.node == node), key=lambda board: len(board.corners)).target
         camera_from_ref = solved[node, best] @ np.linalg.inv(solved[_REFERENCE, best])
         centre = -camera_from_ref[:3, :3].T @ camera_from_ref[:3, 3]
         misses.append(centre - centres_mm(rt[np.newaxis])[0])

@@ -78,7 +78,7 @@ class LibraryProblem:
 
     @cached_property
     def counts(self) -> NDArray[np.bool_]:
-        """Which pixels see the plane."""
+        """Mask of the pixels that see the plane."""
         return np.asarray(self.operator.forward(np.ones(self.operator.grid.shape, np.float32)) != 0)
 
     def prox_of_data(self, x: Image, length: float) -> Image:

@@ -1,4 +1,4 @@
-"""How accurate and how fast the noise calibration is: `python -m benchmarks.noise_accuracy [study ...] [--repeats N]`.
+"""Accuracy and speed of the noise calibration: `python -m benchmarks.noise_accuracy [study ...] [--repeats N]`.
 
 Errors are divided by the Cramér-Rao bound of the same frames; 1.00 cannot be beaten. Frames are simulated afresh in
 every repeat and go through the whole calibration. The tests run the same studies with fewer repeats.
@@ -84,7 +84,7 @@ def subtle(repeats: int) -> None:
 def _bound_of_values(read_noise_e: float, floor_dn: int | None = None, offset_dn: float = 100.0) -> dict[str, float]:
     """Return the bound of the likelihood of single values, from the scores at the truth of 16 384 pixels."""
     series = take(1, read_noise_e=read_noise_e, offset_dn=offset_dn, shape=(128, 128))
-    counts = Counts(EXPOSURES_S, tuple(one.sample_dn for one in series), floor_dn)
+    counts = Counts(EXPOSURES_S, tuple(darks.sample_dn for darks in series), floor_dn)
     truth = np.array([np.log(2.0), np.log(read_noise_e), np.log(0.2), 0.0, offset_dn, np.log(3.0)])
     start = dict(zip(PARAMETERS, truth, strict=True))
     _, _, scores = MarginalLikelihood(counts, start, exact=True, spread=False).evaluate(truth)

@@ -1,4 +1,4 @@
-"""How often the intervals of the noise hold: `python -m benchmarks.noise_coverage [case ...] [--repeats N]`.
+"""Coverage of the intervals of the noise: `python -m benchmarks.noise_coverage [case ...] [--repeats N]`.
 
 Sensors that bend, saturate, drift, flicker and scatter are simulated here, apart from `calib`. Every repeat draws
 frames afresh and goes through the whole calibration. An interval holds if the truth is inside; quantities without a
@@ -82,7 +82,7 @@ def make_pixels(camera: Camera, rng: np.random.Generator) -> dict[str, Array]:
 
 @dataclass(frozen=True)
 class Session:
-    """What is recorded: exposures and numbers of darks, and the charges of the flats, whose photons may be stated."""
+    """Frames to record: exposures and numbers of darks, and the charges of the flats, whose photons may be stated."""
 
     dark_s: tuple[float, ...] = (0.01, 1.0, 3.0, 10.0, 20.0, 30.0)
     dark_frames: int = 8
@@ -115,8 +115,8 @@ def record(camera: Camera, session: Session, rng: np.random.Generator) -> list[S
 
 def true_linearity(camera: Camera, result: NoiseCalibration) -> float:
     """Return EMVA 1288's linearity error of the true response at the levels that were used."""
-    used = [one.series for one in result.goodness if one.series.conditions.kind == "flat"]
-    charge = np.array([0.5 * (one.conditions.photons or 0.0) for one in used])
+    used = [entry.series for entry in result.goodness if entry.series.conditions.kind == "flat"]
+    charge = np.array([0.5 * (flat.conditions.photons or 0.0) for flat in used])
     signal = camera.mean_dn(charge)
     full = signal.max() if result.saturation.level_dn is None else result.saturation.level_dn - camera.offset_dn
     inside = (signal >= 0.05 * full) & (signal <= 0.95 * full)

@@ -147,12 +147,12 @@ def _sum(part: NDArray[np.float32]) -> float:
     return float(total)
 
 
-def _ratio(problem: BenchmarkProblem, view: int, seen: NDArray[np.float32]) -> NDArray[np.float32]:
+def _ratio(problem: BenchmarkProblem, view: int, mean_e: NDArray[np.float32]) -> NDArray[np.float32]:
     images = problem.images
     shifted: NDArray[np.float32] = np.maximum(images.electrons[view] + images.read_variance_e2, np.float32(0))
-    seen = seen + images.background_e
-    seen += images.read_variance_e2
-    shifted /= seen
+    mean_e = mean_e + images.background_e
+    mean_e += images.read_variance_e2
+    shifted /= mean_e
     return shifted
 
 

@@ -1,4 +1,4 @@
-"""What `faintfield plan` predicts, against simulated captures: `python -m benchmarks.plan_accuracy [STUDY …]`.
+"""Predictions of `faintfield plan` against simulated captures: `python -m benchmarks.plan_accuracy [STUDY …]`.
 
 `sigma`: the paper's truck before the paper's camera, at SNRs by eq. (4) and on grids of several sizes. The rig's
 simulation renders and exposes the views, which share no code with the operator; each is exposed anew for every draw,

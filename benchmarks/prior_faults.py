@@ -1,4 +1,4 @@
-"""What is false in planes by priors: patterns in flat light and in the dark, and bright specks."""
+"""Faults of planes by priors: patterns in flat light and in the dark, and bright specks."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -34,9 +34,9 @@ def draw(path: Path, rows: Sequence[Sequence[ShownPlane]]) -> None:
         figure = Figure(figsize=(_WIDTH_IN, sum(heights)), layout=layout, dpi=_DPI)
         every = figure.subplots(len(rows), columns, squeeze=False, gridspec_kw={"height_ratios": heights})
         for of_row, axes in zip(rows, every, strict=True):
-            for one, axis in zip(of_row, axes, strict=True):
-                axis.imshow(np.clip(one.plane, 0, 1), cmap="gray", vmin=0, vmax=1)
-                axis.set_title(one.title)
+            for shown, axis in zip(of_row, axes, strict=True):
+                axis.imshow(np.clip(shown.plane, 0, 1), cmap="gray", vmin=0, vmax=1)
+                axis.set_title(shown.title)
                 axis.set_axis_off()
         content = io.BytesIO()
         figure.savefig(content, format="png")

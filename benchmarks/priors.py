@@ -75,7 +75,7 @@ class Outcome:
 
 @dataclass
 class Bench:
-    """What is compared, and what is kept of it for a picture.
+    """The comparison, and what a picture of it shows.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class Bench:
         for make in _MAKERS:
             stage = stage_object(make(0.0, 0.0, _DEPTH_MM).grey(), _SIZE_PX)
             for seed in range(1, seeds + 1):
-                for snr, images, scale_e in (one for one in stage.exposures(seed) if one[0] in snrs):
+                for snr, images, scale_e in (exposure for exposure in stage.exposures(seed) if exposure[0] in snrs):
                     made = self._solutions(stage, snr, images, scale_e)
                     yield from _judged(stage, snr, seed, made, scale_e)
                     if seed == 1:
@@ -112,7 +112,9 @@ class Bench:
         if self.bm3d is not None:
             picture, case = back_projection(stage.operator, images), (snr, stage.name)
             if case not in self.sigmas_e:
-                self.sigmas_e[case] = self.bm3d.best_sigma_e(picture, lambda one: stage.errors(one, scale_e)[0])
+                self.sigmas_e[case] = self.bm3d.best_sigma_e(
+                    picture, lambda estimate: stage.errors(estimate, scale_e)[0]
+                )
             made[_PEER] = Solution(self.bm3d.denoised(picture, self.sigmas_e[case]), made["tv"].record)
         return made
 
@@ -135,7 +137,7 @@ def counted(stage: StagedObject, solution: Solution, sigma_e: float, scale_e: fl
     return Specks(
         all=_count(found),
         bright=_count(found & (plane > _BRIGHT * scale_e)),
-        beside=_count(found & _beside(stage)),
+        beside=_count(found & _near_object(stage)),
         rim=_count(found & rim),
         proposed=None if proposal is None else _count(found & (proposal >= plane / 2)),
     )
@@ -146,7 +148,7 @@ def _count(samples: NDArray[np.bool_]) -> int:
     return int(np.count_nonzero(samples))
 
 
-def _beside(stage: StagedObject) -> NDArray[np.bool_]:
+def _near_object(stage: StagedObject) -> NDArray[np.bool_]:
     """Return the samples (row, column) within some samples of the object."""
     size = 2 * _NEAR_SAMPLES + 1
     disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
@@ -168,16 +170,19 @@ def _row(stage: StagedObject, made: dict[str, Solution], scale_e: float) -> list
 
 def error_table(outcomes: Sequence[Outcome]) -> list[str]:
     """Return a Markdown table of errors x 1000, the mean over the draws: `mse / mse_texture`."""
-    objects, methods = _names(one.object for one in outcomes), _names(one.method for one in outcomes)
+    objects, methods = _names(outcome.object for outcome in outcomes), _names(outcome.method for outcome in outcomes)
     lines = [
         "| MSE / `mse_texture`, ×1000 | " + " | ".join([*objects, "mean"]) + " |",
         "|---" * (len(objects) + 2) + "|",
     ]
-    for snr in sorted({one.snr for one in outcomes}):
+    for snr in sorted({outcome.snr for outcome in outcomes}):
         for method in methods:
-            own = [one for one in outcomes if (one.snr, one.method) == (snr, method)]
-            groups = [[one for one in own if one.object == name] for name in objects]
-            means = [np.mean([(1e3 * one.mse, 1e3 * one.mse_texture) for one in group], axis=0) for group in groups]
+            own = [outcome for outcome in outcomes if (outcome.snr, outcome.method) == (snr, method)]
+            groups = [[outcome for outcome in own if outcome.object == name] for name in objects]
+            means = [
+                np.mean([(1e3 * outcome.mse, 1e3 * outcome.mse_texture) for outcome in group], axis=0)
+                for group in groups
+            ]
             cells = (f"{mse:.2f} / {texture:.2f}" for mse, texture in [*means, np.mean(means, axis=0)])
             lines.append(f"| SNR {snr:g}: {method} | " + " | ".join(cells) + " |")
     return lines
@@ -186,11 +191,11 @@ def error_table(outcomes: Sequence[Outcome]) -> list[str]:
 def speck_table(outcomes: Sequence[Outcome]) -> list[str]:
     """Return a Markdown table of specks, summed over objects and draws."""
     lines = ["| specks | all | > 0.1 of white | beside the object | on the rim | in the proposal |", "|---" * 6 + "|"]
-    for snr in sorted({one.snr for one in outcomes}):
-        for method in _names(one.method for one in outcomes):
-            own = [one.specks for one in outcomes if (one.snr, one.method) == (snr, method)]
-            sums = np.sum([[one.all, one.bright, one.beside, one.rim] for one in own], axis=0).tolist()
-            proposed = "–" if own[0].proposed is None else sum(one.proposed or 0 for one in own)
+    for snr in sorted({outcome.snr for outcome in outcomes}):
+        for method in _names(outcome.method for outcome in outcomes):
+            counts = [outcome.specks for outcome in outcomes if (outcome.snr, outcome.method) == (snr, method)]
+            sums = np.sum([[count.all, count.bright, count.beside, count.rim] for count in counts], axis=0).tolist()
+            proposed = "–" if counts[0].proposed is None else sum(count.proposed or 0 for count in counts)
             lines.append(f"| SNR {snr:g}: {method} | " + " | ".join(str(count) for count in (*sums, proposed)) + " |")
     return lines
 
@@ -200,15 +205,15 @@ def residual_table(residuals: Sequence[Residual]) -> list[str]:
     bands = [f"{low:.2f}–{high:.2f}" for low, high in pairwise(BANDS)]
     head = ["residual", "rms, σ", "largest pattern, σ", "in σ of tv's", *bands]
     lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
-    for one in residuals:
-        cells = [f"{value:.2g}" for value in (one.rms, one.pattern, one.pattern_of_tv, *one.bands)]
-        lines.append(f"| {one.field}: {one.method} | " + " | ".join(cells) + " |")
+    for residual in residuals:
+        cells = [f"{value:.2g}" for value in (residual.rms, residual.pattern, residual.pattern_of_tv, *residual.bands)]
+        lines.append(f"| {residual.field}: {residual.method} | " + " | ".join(cells) + " |")
     return lines
 
 
-def _names(given: Iterable[str]) -> list[str]:
+def _names(names: Iterable[str]) -> list[str]:
     """Return names once each, in the order of their first appearance."""
-    return list(dict.fromkeys(given))
+    return list(dict.fromkeys(names))
 
 
 def main() -> None:
@@ -222,9 +227,9 @@ def main() -> None:
     options = parser.parse_args()
     if not options.fields:
         bench, outcomes = Bench(Bm3d(options.bm3d) if options.bm3d else None), []
-        for one in bench.outcomes(options.snr, options.seeds):
-            outcomes.append(one)
-            print(json.dumps(asdict(one)), flush=True)
+        for outcome in bench.outcomes(options.snr, options.seeds):
+            outcomes.append(outcome)
+            print(json.dumps(asdict(outcome)), flush=True)
         for snr in options.snr if options.picture else ():
             rows = [row for (of_snr, _), row in bench.shown.items() if of_snr == snr]
             draw(options.picture.with_stem(f"{options.picture.stem}_{snr:g}"), rows)

@@ -1,4 +1,4 @@
-"""What maps per pixel gain on an sCMOS sensor: `python -m benchmarks.sensor_maps [SEEDS] [WIDTH HEIGHT]`.
+"""Gain by maps per pixel on an sCMOS sensor: `python -m benchmarks.sensor_maps [SEEDS] [WIDTH HEIGHT]`.
 
 Each simulated sensor has log-normal read noise (median 1.2 e⁻, a tail to 10 e⁻, columns that differ), 1 % telegraph
 pixels, offsets of pixels and columns, gains that differ by 1 % from pixel to pixel and by 2 % between two taps, and
@@ -162,7 +162,7 @@ def picture_errors(sensor: Sensor, calibration: NoiseCalibration, rng: np.random
 def main() -> None:
     """Measure and print."""
     seeds = int(sys.argv[1]) if len(sys.argv) > 1 else 5
-    width, height = (int(it) for it in sys.argv[2:4]) if len(sys.argv) > 3 else (128, 96)
+    width, height = (int(word) for word in sys.argv[2:4]) if len(sys.argv) > 3 else (128, 96)
     results = []
     for seed in range(seeds):
         rng = np.random.default_rng(seed)
@@ -173,8 +173,10 @@ def main() -> None:
         relative = {f"mse_{name}": error / errors["one_number"] for name, error in errors.items()}
         results.append({"mse_e2": errors["one_number"], **relative, **map_errors(sensor, calibration, series[0])})
         print(json.dumps({"seed": seed, **{name: round(value, 4) for name, value in results[-1].items()}}), flush=True)
-    means = {name: float(np.mean([it[name] for it in results])) for name in results[0]}
-    errors = {f"{n}_se": float(np.std([it[n] for it in results], ddof=1) / seeds**0.5) for n in means if seeds > 1}
+    means = {name: float(np.mean([result[name] for result in results])) for name in results[0]}
+    errors = {
+        f"{n}_se": float(np.std([result[n] for result in results], ddof=1) / seeds**0.5) for n in means if seeds > 1
+    }
     print(json.dumps({"mean": {name: round(value, 4) for name, value in (means | errors).items()}}))
 
 

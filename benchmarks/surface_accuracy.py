@@ -1,4 +1,4 @@
-"""How good a surface is against the truth: `python -m benchmarks.surface_accuracy RESULT TRUTH [--scale-e X]`.
+"""Accuracy of a surface against the truth: `python -m benchmarks.surface_accuracy RESULT TRUTH [--scale-e X]`.
 
 RESULT holds picture.tiff, depth_mm.tiff and depth_confidence.tiff, TRUTH true_depth_mm.tiff and true_picture.tiff, all
 on the same samples. The picture is compared in electrons: `--scale-e` is the `scale_e` in the provenance.json of a set
@@ -124,13 +124,13 @@ def depth_edges(depth_mm: Map) -> NDArray[np.bool_]:
     return edges
 
 
-def median_edge_distance_px(edges: NDArray[np.bool_], others: NDArray[np.bool_]) -> float:
-    """Return the median distance from each of the edges to the nearest of the others, at most 20; NaN without edges."""
+def median_edge_distance_px(edges: NDArray[np.bool_], targets: NDArray[np.bool_]) -> float:
+    """Return the median distance from each of the edges to the nearest target, at most 20; NaN without edges."""
     if not edges.any():
         return float("nan")
-    if not others.any():
+    if not targets.any():
         return _MAX_EDGE_DISTANCE_PX
-    distances = distance_transform_edt(~others)[edges]
+    distances = distance_transform_edt(~targets)[edges]
     return float(np.median(np.minimum(distances, _MAX_EDGE_DISTANCE_PX)))
 
 
@@ -157,20 +157,20 @@ def report_lines(
     }
     lines = [f"{name:26} {value:>8}" for name, value in figures.items()]
     lines += ["", f"{'confidence':>14} {'share %':>8} {'mean %':>8} {'right %':>8}"]
-    for one in reliability(depth_mm, confidence, true_depth_mm):
-        numbers = " ".join(f"{100 * value:8.1f}" for value in (one.share, one.confidence, one.right))
-        lines.append(f"{one.low:6.2f} … {one.high:5.2f} {numbers}")
+    for interval in reliability(depth_mm, confidence, true_depth_mm):
+        numbers = " ".join(f"{100 * value:8.1f}" for value in (interval.share, interval.confidence, interval.right))
+        lines.append(f"{interval.low:6.2f} … {interval.high:5.2f} {numbers}")
     return lines
 
 
-def main(words: Sequence[str] | None = None) -> None:
+def main(argv: Sequence[str] | None = None) -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.surface_accuracy", description=__doc__)
     parser.add_argument("result", type=Path, help="folder of the surface")
     parser.add_argument("truth", type=Path, help="folder of the true depth and picture")
     parser.add_argument("--scale-e", type=float, default=1.0, help="electrons per unit of the true picture")
     parser.add_argument("--affine", action="store_true", help="fit a straight line to the picture first")
-    arguments = parser.parse_args(words)
+    arguments = parser.parse_args(argv)
     picture, depth_mm, confidence = (
         tifffile.imread(arguments.result / name) for name in ("picture.tiff", "depth_mm.tiff", "depth_confidence.tiff")
     )

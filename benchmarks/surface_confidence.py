@@ -72,12 +72,12 @@ def fitted(
     return np.asarray(minimize(loss, np.zeros(x.shape[1]), jac=True).x)
 
 
-def main(words: Sequence[str] | None = None) -> None:
+def main(argv: Sequence[str] | None = None) -> None:
     """Print the fitted coefficients, and what they and the present ones say of each set."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.surface_confidence", description=__doc__)
     parser.add_argument("sets", nargs="+", metavar="SET=TRUTH")
     parser.add_argument("--misleading", nargs="*", default=[], metavar="SET=TRUTH")
-    arguments = parser.parse_args(words)
+    arguments = parser.parse_args(argv)
     named = [name.split("=") for name in (*arguments.sets, *arguments.misleading)]
     sets = [samples_of(Path(folder), Path(truth)) for folder, truth in named]
     plain, misleading = sets[: len(arguments.sets)], sets[len(arguments.sets) :]

@@ -58,7 +58,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class Node:
-    """Where one view is taken: the camera's centre (mm), and its rotation, from its axes to the reference's."""
+    """Pose of one view: the camera's centre (mm), and its rotation, from its axes to the reference's."""
 
     row: int
     column: int
@@ -115,9 +115,12 @@ def sensor(camera: Camera, node: Node) -> Any:
 
 def render(scenes: Sequence[Any], camera: Camera, node: Node) -> Picture:
     """Return the light (row, column) of a view: the sum over scenes, each of which has one of the lamps."""
-    seen, seed = sensor(camera, node), 100 * node.row + node.column
+    camera_sensor, seed = sensor(camera, node), 100 * node.row + node.column
     return np.asarray(
-        sum(np.array(mi.render(one, sensor=seen, spp=camera.rays_per_px, seed=seed))[:, :, 0] for one in scenes),
+        sum(
+            np.array(mi.render(scene, sensor=camera_sensor, spp=camera.rays_per_px, seed=seed))[:, :, 0]
+            for scene in scenes
+        ),
         np.float32,
     )
 
@@ -179,7 +182,7 @@ def write_scene(name: str, out: Path, camera: Camera, nodes: Sequence[Node]) -> 
     (out / "elemental.toml").write_text(settings_text(camera, nodes))
 
 
-def main(words: Sequence[str] | None = None) -> None:
+def main(argv: Sequence[str] | None = None) -> None:
     """Render the scene that is asked for."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.surface_scenes", description=__doc__.splitlines()[0])
     parser.add_argument("scene", choices=SCENES)
@@ -189,7 +192,7 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--rays", type=int, default=9, help="rays per pixel")
     parser.add_argument("--nodes", type=int, default=7, help="rows and columns of the grid, an odd number")
     parser.add_argument("--pitch-mm", type=float, default=50.0)
-    arguments = parser.parse_args(words)
+    arguments = parser.parse_args(argv)
     if mi is None:
         parser.error("mitsuba is not installed here; see the first lines of benchmarks/surface_scenes.py")
     if arguments.nodes % 2 == 0:

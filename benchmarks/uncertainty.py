@@ -1,4 +1,4 @@
-"""How often the 90 % interval of a sample holds the truth: `python -m benchmarks.uncertainty [SCENE …]`.
+"""Coverage of the 90 % interval of a sample: `python -m benchmarks.uncertainty [SCENE …]`.
 
 Each scene is one picture as a plane at 500 mm before the paper's camera and grid, rendered by the simulated rig, whose
 lens and interpolation are not those of the reconstruction: an object of the demo alone, a picture that scikit-image

@@ -1,1 +1,1 @@
-"""How the network that improves planes is trained: pictures, pairs, training, export. No part of the product."""
+"""Training of the network that improves planes: pictures, pairs, training, export. No part of the product."""

@@ -108,7 +108,7 @@ def channels(exposed: Exposure, weight: float | None) -> NDArray[np.float32]:
     return np.stack([seen, pilot, (first + second) / 2, np.sqrt(noise.variance), exposed.truth]).astype(np.float32)
 
 
-def photographs(folder: Path | None) -> list[Picture]:
+def read_photographs(folder: Path | None) -> list[Picture]:
     """Return the pictures of a folder as light from 0 to 1."""
     files = sorted(folder.iterdir()) if folder else []
     return [_read_photograph(file) for file in files]
@@ -130,11 +130,11 @@ def _cut(random: np.random.Generator, photograph: Picture, size: int) -> Picture
     return np.asarray(np.clip(light, 0, 1), np.float32)
 
 
-def shown_picture(random: np.random.Generator, given: list[Picture]) -> tuple[str, Picture]:
+def shown_picture(random: np.random.Generator, photographs: list[Picture]) -> tuple[str, Picture]:
     """Return a picture to expose, one in eight a part of a photograph."""
     size = _FINE * _PLANE
-    if given and random.random() < 1 / 8:
-        return "photograph", _cut(random, given[random.integers(len(given))], size)
+    if photographs and random.random() < 1 / 8:
+        return "photograph", _cut(random, photographs[random.integers(len(photographs))], size)
     return picture(random, size)
 
 
@@ -146,10 +146,10 @@ def main() -> None:
     parser.add_argument("--photographs", type=Path)
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
-    given = photographs(options.photographs)
+    photographs = read_photographs(options.photographs)
     for seed in range(*options.seeds):
         random = np.random.default_rng([4, seed])
-        kind, shown = shown_picture(random, given)
+        kind, shown = shown_picture(random, photographs)
         exposed = exposure(random, shown)
         start = smooth_start(exposed.operator, exposed.images)
         guess = universal_penalty_weight(exposed.operator, exposed.images, start) * _log_uniform(random, (0.7, 2.5))
