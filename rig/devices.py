@@ -32,8 +32,7 @@ from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.grblhal import SimulatedGrblHal
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.simulation.lab import SimulatedCamera, SimulatedLab
-from faintfield.rig.stages.drivers import make_stage
-from faintfield.rig.stages.gantry import Gantry
+from faintfield.rig.stages.gantry import Gantry, serial_stage
 from faintfield.rig.stages.micromanager import MicroManagerController, MicroManagerStage
 from faintfield.rig.stages.protocol import SERIAL_PROTOCOLS, StageSettings
 from faintfield.rig.stages.protocol import SIMULATED as SIMULATED  # commands take it from here
@@ -153,7 +152,7 @@ def open_stage(
         simulated = msgspec.structs.replace(settings, protocol=bench.firmware.protocol, port=port, options={})
         return bench.stage(simulated, traffic)
     if settings.protocol in SERIAL_PROTOCOLS:
-        return make_stage(settings, clock, traffic, partial(SerialPort, settings.port, settings.baud))
+        return serial_stage(settings, clock, traffic, partial(SerialPort, settings.port, settings.baud))
     if settings.protocol == "micromanager":
         options = _micromanager_stage(settings)
         core = core or SharedCore(options.configuration, options.adapters)

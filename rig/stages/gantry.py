@@ -7,13 +7,16 @@ axes restores trust.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from faintfield.rig.clock import Clock
 from faintfield.rig.errors import NotHomed, OutsideTravel, PositionLost, StageError, StageLost
+from faintfield.rig.stages.grbl import GrblController
+from faintfield.rig.stages.marlin import MarlinController
 from faintfield.rig.stages.motion import StageWorkspace, duration_s, one_sided_path, path_duration_s
 from faintfield.rig.stages.protocol import AxisIndex, Box, Controller, Homing, Identity, Point, Position, StageSettings
+from faintfield.rig.stages.transport import LineTransport, Port, TrafficLog
 
 # Longest jog without homing, in mm: enough to see which way an axis moves, too short to do damage.
 _MAX_UNHOMED_JOG_MM = 10.0
@@ -24,13 +27,6 @@ class Gantry:
 
     Every method that uses the controller is bounded in time, and raises a `StageError` if the controller does not obey.
     After an error nothing moves until `recover` and, unless the error kept the position, `home`.
-
-    Parameters
-    ----------
-    controller, clock : Controller, Clock
-        Driver of the firmware; clock of the rig.
-    settings : StageSettings
-        Feed, approach, keep-out boxes and, where the controller does not report it, the travel.
 
     Attributes
     ----------
@@ -50,13 +46,7 @@ class Gantry:
         self.homings = 0
 
     def connect(self) -> None:
-        """Open the port, wait for the controller and read its settings, without moving.
-
-        Raises
-        ------
-        StageLost, StageTimeout, WrongFirmware
-            The controller cannot be used; the port is closed again.
-        """
+        """Open the port, wait for the controller and read its settings, without moving; a failure closes the port."""
         self._distrust()
         try:
             self._controller.connect()
@@ -94,13 +84,7 @@ class Gantry:
         return min(self.identify().motion.rate_mm_per_s) if configured is None else configured / 60.0
 
     def home(self, axis: AxisIndex | None = None) -> Homing:
-        """Home the stage, or one axis if the controller can; positions are trusted once all axes were homed together.
-
-        Raises
-        ------
-        StageAlarm, StageTimeout, StageLost
-            A switch was not found in time.
-        """
+        """Home the stage, or one axis if the controller can; only homing of all axes together restores trust."""
         identity = self.identify()
         was_trusted = self.trusted
         with self._stopping_on_error():
@@ -114,13 +98,8 @@ class Gantry:
         """Go to a position, wait until the stage stands still there, and return the verified report.
 
         Each axis arrives in the positive direction (`one_sided_path`), so play in the drive does not affect the place.
-
-        Raises
-        ------
-        NotHomed, OutsideTravel, KeepOutCrossed
-            The position is refused before anything moves.
-        StageError
-            The stage did not arrive and was told to stop.
+        Raises `NotHomed`, `OutsideTravel` or `KeepOutCrossed` before anything moves. After a `StageError` the stage did
+        not arrive, and was told to stop.
         """
         target = Point(x_mm, y_mm)
         self._require_trust(target)
@@ -136,10 +115,7 @@ class Gantry:
     def jog(self, dx_mm: float, dy_mm: float, *, unlock: bool = False) -> Position:
         """Move by a distance, homed or not, to bring up hardware; `unlock` clears the lock of an unhomed controller.
 
-        Raises
-        ------
-        OutsideTravel, KeepOutCrossed
-            The target is not allowed, or the stage is not homed and the distance exceeds 10 mm; nothing moves.
+        Raises `OutsideTravel` or `KeepOutCrossed` before anything moves, also for more than 10 mm without homing.
         """
         by, target = Point(dx_mm, dy_mm), None
         if self.trusted:
@@ -159,26 +135,14 @@ class Gantry:
         return self._report(point)
 
     def position(self) -> Position:
-        """Read the position from the controller.
-
-        Raises
-        ------
-        StageError
-            The controller does not answer, is in an alarm, or the stage is moving.
-        """
+        """Read the position from the controller; raises `StageError` in an alarm or in motion, too."""
         with self._tracking_trust():
             point = self._controller.read_position()
         self._here = point if self.trusted else None
         return self._report(point)
 
     def verify_at(self, x_mm: float, y_mm: float) -> Position:
-        """Raise unless the stage stands at this position: the last check before an exposure.
-
-        Raises
-        ------
-        NotHomed, PositionLost, StageError
-            The stage is not known to be there; do not expose.
-        """
+        """Raise unless the stage is known to stand at this position: the last check before an exposure."""
         target = Point(x_mm, y_mm)
         self._require_trust(target)
         with self._tracking_trust():
@@ -197,13 +161,7 @@ class Gantry:
             self.trusted &= self._controller.stop()
 
     def recover(self) -> None:
-        """Make the controller accept commands again after an error, without moving, and read its settings again.
-
-        Raises
-        ------
-        StageError, WrongFirmware
-            The controller cannot be recovered; the message says what to do.
-        """
+        """Make the controller accept commands again after an error, without moving, and read its settings again."""
         self._here = None
         with self._tracking_trust():
             self.trusted &= self._controller.recover(self.settings.reconnect_s)
@@ -267,3 +225,13 @@ class Gantry:
         except BaseException:
             self.trusted &= self._controller.abort()
             raise
+
+
+def serial_stage(
+    settings: StageSettings, clock: Clock, traffic: TrafficLog | None, open_port: Callable[[], Port]
+) -> Gantry:
+    """Return a stage with GRBL or Marlin, not yet connected; `traffic` gets every byte sent and received."""
+    line = LineTransport(open_port, clock, traffic)
+    if settings.protocol == "grbl":
+        return Gantry(GrblController(line, settings.axes), settings, clock)
+    return Gantry(MarlinController(line, settings.axes, settings.travel_mm), settings, clock)

@@ -11,6 +11,9 @@ from msgspec import Struct
 
 type AxisIndex = Literal[0, 1]
 
+# Homing may take this long (s) even where settings predict less: a slow stage must not fail half way.
+MIN_HOMING_BOUND_S = 240.0
+
 
 class Point(NamedTuple):
     """A position on the stage, in machine coordinates."""

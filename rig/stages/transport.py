@@ -10,7 +10,7 @@ from serial.tools.list_ports import comports
 
 from faintfield.rig.clock import Clock
 from faintfield.rig.errors import StageLost, in_one_line
-from faintfield.rig.stages.protocol import AnswerTime
+from faintfield.rig.stages.protocol import AnswerTime, Point
 
 type Direction = Literal["sent", "received"]
 
@@ -49,13 +49,7 @@ class Port(Protocol):
 
 
 class SerialPort:
-    """A serial port, or another connection that pyserial has a URL for (`socket://host:port`).
-
-    Raises
-    ------
-    StageLost
-        The port cannot be opened; the message names the ports that exist.
-    """
+    """A serial port, or another connection that pyserial has a URL for (`socket://host:port`)."""
 
     def __init__(self, url: str, baud: int) -> None:
         self._url = url
@@ -94,22 +88,14 @@ class SerialPort:
     def _reported_as_lost(self) -> Iterator[None]:
         try:
             yield
-        except (OSError, TypeError) as failure:  # pyserial's own is an OSError; a closed port raises a TypeError
+        except (OSError, TypeError) as failure:  # the latter from a closed port
             raise StageLost(
                 f"{self._url}: the connection is lost ({in_one_line(failure)}); check cable and power, then home it"
             ) from failure
 
 
 class LineTransport:
-    """Sends bytes and receives lines, each within a time limit.
-
-    Parameters
-    ----------
-    open_port : callable
-        Opens the connection; called at each `open`.
-    clock, traffic : Clock, TrafficLog or None
-        Clock of the time limits; log of every byte sent and received.
-    """
+    """Sends bytes and receives lines, each within a time limit; `open_port` opens the connection at each `open`."""
 
     def __init__(self, open_port: Callable[[], Port], clock: Clock, traffic: TrafficLog | None = None) -> None:
         self.clock = clock
@@ -216,6 +202,12 @@ class Unknown(Struct, frozen=True):
     """A line of no known form, such as a damaged one."""
 
     text: str
+
+
+def motion_words(axes: tuple[str, str], point: Point, feed_mm_per_s: float) -> str:
+    """Return coordinates and feed of a command that moves."""
+    x, y = axes
+    return f"{x}{point.x_mm:.3f} {y}{point.y_mm:.3f} F{60.0 * feed_mm_per_s:.1f}"
 
 
 def restart_failure() -> StageLost:

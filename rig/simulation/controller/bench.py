@@ -10,8 +10,7 @@ from typing import Protocol
 from faintfield.rig.errors import StageLost
 from faintfield.rig.simulation.controller.firmware import SimulatedFirmware
 from faintfield.rig.simulation.controller.wire import SimulatedClock, Wire
-from faintfield.rig.stages.drivers import make_stage
-from faintfield.rig.stages.gantry import Gantry
+from faintfield.rig.stages.gantry import Gantry, serial_stage
 from faintfield.rig.stages.protocol import Point, StageSettings
 from faintfield.rig.stages.transport import Port, SerialPort, TrafficLog
 
@@ -187,7 +186,7 @@ class Bench:
     def stage(self, settings: StageSettings | None = None, traffic: TrafficLog | None = None) -> Gantry:
         """Return the driver for this controller, not yet connected; by default with the firmware's protocol."""
         settings = settings or StageSettings(protocol=self.firmware.protocol, port=self.link.url)
-        return make_stage(settings, self.clock, traffic, self.open_port)
+        return serial_stage(settings, self.clock, traffic, self.open_port)
 
     def true_position(self) -> Point:
         """Return the true position of the carriages, whatever the controller reports."""

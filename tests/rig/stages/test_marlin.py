@@ -8,7 +8,7 @@ from faintfield.rig.errors import NotHomed, StageRejected, StageTimeout, WrongFi
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.stages.gantry import Gantry
-from faintfield.rig.stages.marlin.controller import MarlinController
+from faintfield.rig.stages.marlin import MarlinController
 from faintfield.rig.stages.protocol import Box, Point, StageSettings
 from tests.faults.stage_faults import restart_unseen
 from tests.rig.stages.benches import firmware, homed

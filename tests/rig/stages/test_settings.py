@@ -3,9 +3,8 @@
 import pytest
 
 from faintfield.rig.errors import WrongFirmware
-from faintfield.rig.stages.grbl.settings import GrblSettings
-from faintfield.rig.stages.marlin import messages as marlin
-from faintfield.rig.stages.marlin.settings import marlin_identity
+from faintfield.rig.stages import marlin_messages as marlin
+from faintfield.rig.stages.grbl_messages import GrblSettings
 from faintfield.rig.stages.protocol import Box, Identity, MotionLimits
 
 GRBL = {
@@ -34,7 +33,7 @@ def of_marlin(*changes: tuple[str, str], axes: tuple[str, str] = ("X", "Y"), tra
     for old, new in changes:
         assert old in lines
         lines = lines.replace(old, new)
-    return marlin_identity(map(marlin.parse, lines.splitlines()), axes, travel)
+    return marlin.marlin_identity(map(marlin.parse, lines.splitlines()), axes, travel)
 
 
 def test_identity_of_grbl() -> None:

@@ -1,7 +1,7 @@
 """Explains alarms, errors and states of GRBL and grblHAL: what they mean, if the position is kept, and what to do."""
 
 from faintfield.rig.errors import StageAlarm, StageRejected
-from faintfield.rig.stages.grbl.messages import Report
+from faintfield.rig.stages.grbl_messages import Report
 
 SOFT_LIMIT_ALARM = 2
 """The only alarm that keeps the position."""

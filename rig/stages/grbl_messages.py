@@ -1,24 +1,125 @@
-"""Derives travel, rates and tolerances from GRBL's settings, and refuses settings that make positions unsafe."""
+"""Parses the lines that GRBL 1.1 sends, and derives travel, rates and tolerances from its settings.
+
+Responses (`ok`, `error:N`) answer commands; GRBL sends all other lines unasked. A line that does not match a known form
+exactly is `Unknown`, so that a damaged line is never taken for a response.
+"""
 
 import re
+from collections.abc import Callable
 
 from msgspec import Struct
 
 from faintfield.rig.errors import WrongFirmware
 from faintfield.rig.stages.motion import timeout_s
-from faintfield.rig.stages.protocol import Box, Identity, MotionLimits
+from faintfield.rig.stages.protocol import MIN_HOMING_BOUND_S, Box, Identity, MotionLimits
+from faintfield.rig.stages.transport import Ok, Unknown
+
+_NUMBER = r"-?\d{1,7}(?:\.\d{1,6})?"
+_VECTOR = rf"{_NUMBER}(?:,{_NUMBER}){{1,5}}"
 
 # Reports and commands have three decimals, and each rounds by up to half a micrometre.
 _ROUNDING_MM = 0.001
-
-# Homing may take this long (s) even where the settings predict less: a slow stage must not fail half way.
-_MIN_HOMING_BOUND_S = 240.0
 
 # The soft limits of jogs, in the settings of grblHAL only.
 _HAL_SETTING = 40
 
 # The value of $1 that keeps the motors on between motions.
 _KEEP_MOTORS_ON = 255
+
+
+class ErrorCode(Struct, frozen=True):
+    """The controller has refused a command."""
+
+    code: int
+
+
+class Alarm(Struct, frozen=True):
+    """The controller has stopped."""
+
+    code: int
+
+
+class Banner(Struct, frozen=True):
+    """The controller has just started."""
+
+
+class GrblSetting(Struct, frozen=True):
+    """One `$` setting."""
+
+    number: int
+    value: str
+
+
+class Feedback(Struct, frozen=True):
+    """A message in brackets: its kind (`MSG`, `VER`, `OPT`, ...) and text."""
+
+    kind: str
+    text: str
+
+
+class Report(Struct, frozen=True):
+    """A real-time status report.
+
+    `substate` is the number after the state; `Hold:0` means that the stage has come to rest. `position` (mm) is in
+    machine coordinates if `is_machine`, otherwise in work coordinates. `offset` (mm), which only some reports carry, is
+    to be added to the latter. `pins` are the letters of the active inputs; that of an axis stands for its limit switch.
+    """
+
+    state: str
+    substate: int | None
+    position: tuple[float, ...]
+    is_machine: bool
+    offset: tuple[float, ...] | None
+    pins: str
+
+    @property
+    def emergency_stop(self) -> bool:
+        """Return whether the emergency stop is pressed, which grblHAL reports among the inputs."""
+        return "E" in self.pins
+
+    @property
+    def is_moving(self) -> bool:
+        """Return whether the stage moves or slows down."""
+        slowing = (self.state, self.substate) in (("Hold", 1), ("Door", 2), ("Door", 3))
+        return self.state in ("Jog", "Run") or slowing
+
+
+type Message = Ok | ErrorCode | Alarm | Banner | GrblSetting | Feedback | Report | Unknown
+
+
+def parse(line: str) -> Message:
+    """Return `line` as a message."""
+    return next((make(match) for form, make in _FORMS if (match := re.fullmatch(form, line))), Unknown(line))
+
+
+def _report(match: re.Match[str]) -> Report:
+    state, substate, frame, position, fields = match.groups()
+    offset = re.search(rf"\|WCO:({_VECTOR})(?=\||$)", fields)
+    pins = re.search(r"\|Pn:([A-Z]+)(?=\||$)", fields)
+    return Report(
+        state=state,
+        substate=None if substate is None else int(substate),
+        position=tuple(map(float, position.split(","))),
+        is_machine=frame == "M",
+        offset=None if offset is None else tuple(map(float, offset[1].split(","))),
+        pins="" if pins is None else pins[1],
+    )
+
+
+# The forms of lines, each with the function that makes its message of a match.
+_FORMS: tuple[tuple[str, Callable[[re.Match[str]], Message]], ...] = (
+    ("ok", lambda _: Ok()),
+    (
+        r"<(Idle|Run|Hold|Jog|Alarm|Door|Check|Home|Sleep|Tool)(?::(\d{1,2}))?"
+        rf"\|([MW])Pos:({_VECTOR})((?:\|[^|<>]*)*)>",
+        _report,
+    ),
+    (r"error:(\d{1,3})", lambda match: ErrorCode(int(match[1]))),
+    (r"ALARM:(\d{1,3})", lambda match: Alarm(int(match[1]))),
+    (rf"\$(\d{{1,3}})=({_NUMBER})", lambda match: GrblSetting(int(match[1]), match[2])),
+    (r"\[([A-Za-z0-9]+):(.*)\]", lambda match: Feedback(match[1], match[2])),
+    (r"(?:Grbl|GrblHAL) \d{1,2}\.\d{1,2}[a-z]?(?: .*)?", lambda _: Banner()),
+)
 
 
 class GrblSettings(Struct, frozen=True):
@@ -30,10 +131,7 @@ class GrblSettings(Struct, frozen=True):
     def identity(self, axes: tuple[int, ...]) -> Identity:
         """Return firmware, travel, rates and tolerances of the controller, for the two axes of these numbers.
 
-        Raises
-        ------
-        WrongFirmware
-            The firmware is not GRBL 1.1, or a setting makes positions unsafe; the message says what to set.
+        Raises `WrongFirmware` if the firmware is not GRBL 1.1, or a setting makes positions unsafe.
         """
         version = self.build.get("VER", "")
         if not re.match(r"v?1\.1", version):
@@ -55,7 +153,8 @@ class GrblSettings(Struct, frozen=True):
                 rate_mm_per_s=(self._number(110 + x) / 60.0, self._number(110 + y) / 60.0),
                 acceleration_mm_per_s2=(self._number(120 + x), self._number(120 + y)),
             ),
-            tolerance_mm=(self._tolerance(x), self._tolerance(y)),
+            # Half a motor step, and the rounding of reports
+            tolerance_mm=(0.5 / self._number(100 + x) + _ROUNDING_MM, 0.5 / self._number(100 + y) + _ROUNDING_MM),
             homing_bound_s=self._homing_bound_s(axes),
             homes_together="H" not in self._options(),
             pull_off_mm=self._number(27),
@@ -78,15 +177,11 @@ class GrblSettings(Struct, frozen=True):
             return margin_mm - length_mm, 0.0 - margin_mm  # not -0.0, which reads badly
         return (0.0, length_mm - margin_mm) if homes_low else (margin_mm - length_mm, 0.0)
 
-    def _tolerance(self, axis: int) -> float:
-        """Return half a motor step plus the rounding of reports, in mm."""
-        return 0.5 / self._number(100 + axis) + _ROUNDING_MM
-
     def _homing_bound_s(self, axes: tuple[int, ...]) -> float:
         """Return a bound for homing: the whole travel at the seek rate, and twice the slow search."""
         seek_s = 60.0 * max(self._number(130 + axis) for axis in axes) / self._number(25)
         locate_s = 4.0 * 60.0 * self._number(27) / self._number(24)
-        return max(_MIN_HOMING_BOUND_S, timeout_s(seek_s + locate_s))
+        return max(MIN_HOMING_BOUND_S, timeout_s(seek_s + locate_s))
 
     def _is_hal(self) -> bool:
         """Return whether the firmware is grblHAL: it says so, or has a setting that GRBL does not have."""

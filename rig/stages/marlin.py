@@ -8,11 +8,10 @@ from collections.abc import Sequence
 from contextlib import suppress
 
 from faintfield.rig.errors import StageAlarm, StageLost, StageRejected, StageTimeout, WrongFirmware
-from faintfield.rig.stages.marlin import messages as marlin
-from faintfield.rig.stages.marlin.settings import marlin_identity
+from faintfield.rig.stages import marlin_messages as marlin
 from faintfield.rig.stages.motion import timeout_s
 from faintfield.rig.stages.protocol import AnswerTime, AxisIndex, Box, Identity, Point
-from faintfield.rig.stages.transport import LineTransport, Ok, restart_failure
+from faintfield.rig.stages.transport import LineTransport, Ok, motion_words, restart_failure
 
 # Waits in s: for the first line after the port was opened and the boot loader has run; for the answer to a command; for
 # the echo of a marker.
@@ -62,7 +61,7 @@ class MarlinController:
         first, second = self._read_settings(), self._read_settings()
         if first != second:
             raise StageLost("the settings read differently twice in a row: the line is disturbed; try a shorter cable")
-        return marlin_identity((*about, *first), self._axes, self._travel_mm)
+        return marlin.marlin_identity((*about, *first), self._axes, self._travel_mm)
 
     def home(self, axis: AxisIndex | None, bound_s: float) -> AnswerTime:
         """Home the named axis or both, and no others, such as a focus drive."""
@@ -74,9 +73,8 @@ class MarlinController:
 
     def follow(self, path: Sequence[Point], feed_mm_per_s: float, predicted_s: float) -> Point:
         """Queue one motion per point, wait for the last to end, and read the position."""
-        x, y = self._axes
         for point in path:
-            self._command(f"G1 {x}{point.x_mm:.3f} {y}{point.y_mm:.3f} F{60.0 * feed_mm_per_s:.1f}")
+            self._command(f"G1 {motion_words(self._axes, point, feed_mm_per_s)}")
         self._command("M400", timeout_s(predicted_s))
         return self.read_position()
 
@@ -97,10 +95,8 @@ class MarlinController:
 
     def switches(self) -> frozenset[AxisIndex]:
         """Return the axes with a closed limit switch."""
-        messages = self._command("M119")
-        closed = {
-            message.name[0].upper() for message in messages if isinstance(message, marlin.Switch) and message.closed
-        }
+        switches = [message for message in self._command("M119") if isinstance(message, marlin.Switch)]
+        closed = {switch.name[0].upper() for switch in switches if switch.closed}
         return frozenset(index for index in (0, 1) if self._axes[index] in closed)
 
     def stop(self) -> bool:
@@ -113,8 +109,7 @@ class MarlinController:
         """Send the emergency stop, which firmware with an emergency parser obeys at once."""
         with suppress(StageLost):  # a stage that cannot be reached cannot be stopped
             self._line.send(b"M410\n")
-            # Its ok belongs to no numbered line and must not be taken for the next answer.
-            self._discard_input()
+            self._discard_input()  # its ok belongs to no numbered line and must not be taken for the next answer
         return False
 
     def recover(self, wait_s: float) -> bool:
@@ -143,9 +138,8 @@ class MarlinController:
         `ok` is the first that counts.
         """
         for _ in range(_MAX_STARTS):
-            marker = self._new_marker()
+            marker, echoed = self._new_marker(), False
             self._line.send(marlin.numbered(0, "M110 N0") + f"M118 {marker}\n".encode("ascii"))
-            echoed = False
             for text in self._line.lines_until(self._clock.now_s() + _ECHO_S):
                 if echoed and isinstance(marlin.parse(text), Ok):
                     self._line_number = 0

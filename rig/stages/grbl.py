@@ -1,0 +1,337 @@
+"""Drives GRBL 1.1 and grblHAL: jogs in machine coordinates, polled until two reports in a row are idle.
+
+Jogs (`$J=`) are the safest motion that GRBL has: it refuses a target outside the travel without an alarm, a jog can be
+cancelled without losing the position, and the parser's state does not change. With `G53` the target is in machine
+coordinates, whatever work offset is stored in the controller.
+"""
+
+import re
+from collections.abc import Sequence
+from contextlib import suppress
+from operator import truediv
+
+from faintfield.rig.errors import StageError, StageLost, StageTimeout, WrongFirmware
+from faintfield.rig.stages import grbl_messages as grbl
+from faintfield.rig.stages.grbl_failures import (
+    CRITICAL_ALARMS,
+    HOMING_REQUIRED_ALARM,
+    LOCKED_ERRORS,
+    SOFT_LIMIT_ALARM,
+    alarm_failure,
+    error_failure,
+    state_failure,
+)
+from faintfield.rig.stages.motion import timeout_s
+from faintfield.rig.stages.protocol import AnswerTime, AxisIndex, Identity, Point
+from faintfield.rig.stages.transport import LineTransport, Ok, motion_words, restart_failure
+
+# GRBL's real-time characters.
+_CANCEL_JOG, _RESET, _HOLD, _STATUS_REQUEST = b"\x85", b"\x18", b"!", b"?"
+
+# Between status requests, in s; GRBL's documentation recommends at most five a second.
+_POLL_INTERVAL_S = 0.2
+
+# Waits in s: for the banner after the port was opened and the boot loader has run; for the banner after a reset; for
+# the status report of a board that did not restart; for the response to a command.
+_BOOT_S = 3.0
+_RESET_S = 0.4
+_FIRST_REPORT_S = 1.0
+_ANSWER_S = timeout_s(0.0)
+
+# Longest recovery besides slowing down, in s: enough for three resets, each with its wait for the banner.
+_RECOVERY_S = 2.0
+
+# Reports in a row that show the same position before a motion that was told to stop counts as stuck.
+_UNCHANGED_REPORTS = 2
+
+# GRBL reports the work offset in at least every 30th report.
+_MAX_REPORTS_TO_OFFSET = 40
+
+
+class GrblController:
+    """A `Controller` that speaks GRBL 1.1 over `line`; `axes` are its letters for the two axes."""
+
+    def __init__(self, line: LineTransport, axes: tuple[str, str]) -> None:
+        self._line = line
+        self._clock = line.clock
+        self._axes = axes
+        self._index = tuple("XYZ".index(axis) for axis in axes)
+        self._braking_s = self._next_poll_s = 0.0
+        self._offset_mm: tuple[float, ...] | None = None
+        self._alarm: int | None = None
+        self._count_lost = False  # since the stage was homed
+        self._homing = False  # by the last command
+
+    def connect(self, wait_s: float = 0.0) -> None:
+        """Open the connection, waiting up to `wait_s` for its port, and wait for the banner, as most boards restart."""
+        self._offset_mm = self._alarm = None
+        self._count_lost, self._homing = True, False
+        self._line.open(wait_s)
+        if self._await_banner(_BOOT_S):
+            return
+        # Boards with native USB keep running. The newline makes other firmware answer too; GRBL answers it with an ok,
+        # which has to be read here so that the first command does not take it for its own.
+        self._line.send(_STATUS_REQUEST + b"\n")
+        reported = False
+        for text in self._line.lines_until(self._clock.now_s() + _FIRST_REPORT_S):
+            _refuse_other_firmware(text)
+            reported = reported or isinstance(grbl.parse(text), grbl.Report)
+        # A reset ends what an earlier program may have left, and revives a GRBL that an alarm has silenced.
+        if not self._reset(_FIRST_REPORT_S) and not reported:
+            raise StageTimeout(
+                f"no answer as from GRBL within {_BOOT_S + 2.0 * _FIRST_REPORT_S:g} s, and none to a reset; "
+                "check power, baud rate and protocol of the controller"
+            )
+
+    def identify(self) -> Identity:
+        """Read build information and settings, the settings twice since the line has no checksum."""
+        build = {message.kind: message.text for message in self._command("$I") if isinstance(message, grbl.Feedback)}
+        first, second = self._read_settings(), self._read_settings()
+        if first != second:
+            numbers = sorted(first.keys() | second.keys())
+            differing = ", ".join(f"${number}" for number in numbers if first.get(number) != second.get(number))
+            raise StageLost(f"{differing} read differently twice in a row: the line is disturbed; try a shorter cable")
+        identity = grbl.GrblSettings(first, build).identity(self._index)
+        motion = identity.motion
+        self._braking_s = max(map(truediv, motion.rate_mm_per_s, motion.acceleration_mm_per_s2))
+        for _ in range(_MAX_REPORTS_TO_OFFSET):
+            if self._poll().is_machine or self._offset_mm is not None:
+                return identity
+        raise WrongFirmware("work positions are reported without their offset; set $10=1 for machine positions")
+
+    def home(self, axis: AxisIndex | None, bound_s: float) -> AnswerTime:
+        """Home within `bound_s`: GRBL answers nothing until the switches are found."""
+        self._command("$H" if axis is None else f"$H{self._axes[axis]}", bound_s)
+        time = self._line.answer_time
+        self._wait_until_still(0.0)
+        self._alarm, self._count_lost = None, False
+        return time
+
+    def follow(self, path: Sequence[Point], feed_mm_per_s: float, predicted_s: float) -> Point:
+        """Queue one jog per point and wait for the last to end."""
+        for point in path:
+            self._command(f"$J=G90 G21 G53 {motion_words(self._axes, point, feed_mm_per_s)}")
+        return self._wait_until_still(predicted_s)
+
+    def jog(self, by: Point, feed_mm_per_s: float, predicted_s: float, *, unlock: bool) -> Point:
+        """Jog by a distance, first clearing a lock if `unlock`."""
+        if unlock and self._poll().state == "Alarm":
+            self._command("$X")
+        self._command(f"$J=G91 G21 {motion_words(self._axes, by, feed_mm_per_s)}")
+        return self._wait_until_still(predicted_s)
+
+    def read_position(self) -> Point:
+        """Return the machine position of a new report; raises unless the state is idle."""
+        report = self._poll()
+        if report.state != "Idle":
+            raise state_failure(report, self._alarm)
+        return self._machine_point(report)
+
+    def switches(self) -> frozenset[AxisIndex]:
+        """Return the axes whose limit input is active."""
+        pins = self._poll().pins
+        return frozenset(index for index in (0, 1) if self._axes[index] in pins)
+
+    def stop(self) -> bool:
+        """Cancel the jog: GRBL slows down within its acceleration and keeps its count."""
+        self._line.send(_CANCEL_JOG)
+        self._wait_until_still(self._braking_s)
+        return True
+
+    def abort(self) -> bool:
+        """Cancel the jog, or reset while homing, which nothing else interrupts; reset what does not end."""
+        with suppress(StageError):  # a stage that cannot be reached cannot be stopped
+            self._line.send(_RESET if self._homing else _CANCEL_JOG)
+            if not self._homing:
+                self._bring_to_rest()
+                return not self._count_lost
+        return False
+
+    def recover(self, wait_s: float) -> bool:
+        """Bring GRBL to a state that accepts commands; a lock is cleared only if the position was kept."""
+        if not self._line.is_open:
+            self.connect(wait_s)
+            return False
+        self._line.send(b"\n")  # ends a damaged line, which would otherwise be joined to the next
+        report = self._bring_to_rest()
+        if report.state == "Alarm":
+            # A controller that has restarted unseen reports zero.
+            restarted = self._machine_point(report) == (0.0, 0.0)
+            if self._alarm != SOFT_LIMIT_ALARM or self._count_lost or restarted:
+                return False
+            self._alarm = None
+            self._command("$X")
+            return True
+        return not self._count_lost
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._line.close()
+
+    def _command(self, text: str, bound_s: float = _ANSWER_S) -> list[grbl.Message]:
+        """Send one command, wait for its response, and return the messages before the response."""
+        self._read_until(self._clock.now_s())  # what has come unasked is not the answer
+        self._homing = text.startswith("$H")
+        self._line.send(text.encode("ascii") + b"\n")
+        deadline_s = self._clock.now_s() + bound_s
+        messages: list[grbl.Message] = []
+        while (message := self._receive(deadline_s)) is not None:
+            if isinstance(message, Ok):
+                return messages
+            if isinstance(message, grbl.ErrorCode):
+                if message.code in LOCKED_ERRORS:
+                    report = self._poll()
+                    if report.state not in ("Idle", "Jog", "Run"):
+                        raise state_failure(report, self._alarm)
+                raise error_failure(text, message.code)
+            messages.append(message)
+        raise StageTimeout(
+            f"no answer to {text!r} within {bound_s:g} s; check cable and power, recover and home the stage"
+        )
+
+    def _poll(self) -> grbl.Report:
+        """Request a status report and return it."""
+        self._read_until(self._clock.now_s())
+        while self._clock.now_s() < self._next_poll_s:
+            self._receive(self._next_poll_s)
+        self._next_poll_s = self._clock.now_s() + _POLL_INTERVAL_S
+        self._line.send(_STATUS_REQUEST)
+        deadline_s = self._clock.now_s() + _ANSWER_S
+        while (message := self._receive(deadline_s)) is not None:
+            if isinstance(message, grbl.Report):
+                return message
+        raise StageTimeout(
+            f"no status report within {_ANSWER_S:g} s; check cable and power, recover and home the stage"
+        )
+
+    def _bring_to_rest(self) -> grbl.Report:
+        """Stop what moves, end what is on hold, and return a report of the state `Idle` or `Alarm`.
+
+        A soft reset at rest keeps the position, and forgets the rest of a motion that was on hold. A motion that is
+        told to stop and neither moves nor ends (a jog of grblHAL after its door was opened) is reset as well, which
+        loses the position.
+        """
+        within_s = _RECOVERY_S + self._braking_s
+        deadline_s = self._clock.now_s() + within_s
+        last: tuple[str, tuple[float, ...]] | None = None
+        unchanged, was_reset = 0, False
+        while self._clock.now_s() + _POLL_INTERVAL_S + _RESET_S < deadline_s:
+            report = self._poll_despite_failures()
+            state = None if report is None else (report.state, report.position)
+            unchanged = unchanged + 1 if state is not None and state == last else 0
+            last = state
+            if report is not None:
+                if report.state == "Alarm" and report.emergency_stop:
+                    raise state_failure(report, self._alarm)
+                critical = not was_reset and (report.substate or self._alarm) in CRITICAL_ALARMS
+                if report.state == "Idle" or (report.state == "Alarm" and not critical):
+                    return report
+                if report.is_moving and unchanged < _UNCHANGED_REPORTS:
+                    self._line.send({"Jog": _CANCEL_JOG, "Run": _HOLD}.get(report.state, b""))
+                    continue
+                if report.state == "Door" and was_reset:
+                    raise state_failure(report, self._alarm)
+                self._count_lost = self._count_lost or report.is_moving
+            # After critical alarms GRBL answers nothing but a reset, and ignores one that comes too early.
+            self._reset(_RESET_S)
+            was_reset, unchanged = True, 0
+        self._count_lost = True
+        self._line.send(_RESET)
+        raise StageTimeout(
+            f"the controller is not ready {within_s:g} s after it was told to stop, and was reset; "
+            "switch it off and on, then home it"
+        )
+
+    def _poll_despite_failures(self) -> grbl.Report | None:
+        self._line.send(_STATUS_REQUEST)
+        self._next_poll_s = self._clock.now_s() + _POLL_INTERVAL_S
+        newest: grbl.Report | None = None
+        for text in self._line.lines_until(self._next_poll_s):
+            message = grbl.parse(text)
+            self._note(message)
+            if isinstance(message, grbl.Report):
+                newest = message
+        return newest
+
+    def _wait_until_still(self, predicted_s: float) -> Point:
+        """Poll until two reports in a row are idle at the same position, and return it.
+
+        One report is not enough: between accepting a jog and starting it, GRBL is idle for a moment.
+        """
+        started_s = self._clock.now_s()
+        self._read_until(started_s + predicted_s)
+        last: Point | None = None
+        while self._clock.now_s() < started_s + timeout_s(predicted_s):
+            report = self._poll()
+            if report.state == "Idle":
+                point = self._machine_point(report)
+                if point == last:
+                    return point
+                last = point
+            elif report.state in ("Jog", "Run"):
+                last = None
+            else:
+                raise state_failure(report, self._alarm)
+        raise StageTimeout(
+            f"the stage still moves after {timeout_s(predicted_s):.1f} s, where {predicted_s:.1f} s were expected; "
+            "it was told to stop: recover and home it"
+        )
+
+    def _machine_point(self, report: grbl.Report) -> Point:
+        values = report.position
+        if not report.is_machine:
+            if self._offset_mm is None:
+                raise StageTimeout("a work position without its offset; set $10=1 for machine positions")
+            values = tuple(work + shift for work, shift in zip(values, self._offset_mm, strict=False))
+        if max(self._index) >= len(values):
+            raise WrongFirmware(f"the controller reports {len(values)} axes, not {self._axes}; set stage.axes")
+        return Point(*(values[index] for index in self._index))
+
+    def _read_settings(self) -> dict[int, str]:
+        messages = self._command("$$")
+        return {message.number: message.value for message in messages if isinstance(message, grbl.GrblSetting)}
+
+    def _read_until(self, deadline_s: float) -> None:
+        while self._receive(deadline_s) is not None:
+            pass
+
+    def _reset(self, within_s: float) -> bool:
+        self._line.send(_RESET)
+        return self._await_banner(within_s)
+
+    def _receive(self, deadline_s: float) -> grbl.Message | None:
+        """Return the next message, None at the deadline; raise an alarm or a restart, which can come at any time."""
+        text = self._line.next_line(deadline_s)
+        if text is None:
+            return None
+        message = grbl.parse(text)
+        self._note(message)
+        # grblHAL raises the alarm that it must be homed whenever it has started: that is no failure
+        if isinstance(message, grbl.Alarm) and message.code != HOMING_REQUIRED_ALARM:
+            raise alarm_failure(message.code)
+        if isinstance(message, grbl.Banner):
+            raise restart_failure()
+        return message
+
+    def _note(self, message: grbl.Message) -> None:
+        if isinstance(message, grbl.Report) and message.offset is not None:
+            self._offset_mm = message.offset
+        elif isinstance(message, grbl.Banner):
+            self._count_lost = True
+        elif isinstance(message, grbl.Alarm):
+            self._alarm = message.code
+            self._count_lost = self._count_lost or message.code != SOFT_LIMIT_ALARM
+
+    def _await_banner(self, within_s: float) -> bool:
+        for text in self._line.lines_until(self._clock.now_s() + within_s):
+            _refuse_other_firmware(text)
+            message = grbl.parse(text)
+            if isinstance(message, grbl.Banner):
+                return True
+            self._note(message)
+        return False
+
+
+def _refuse_other_firmware(text: str) -> None:
+    if re.search(r"marlin|echo:unknown command|^start$", text, re.IGNORECASE):
+        raise WrongFirmware(f"the controller answers as Marlin ({text[:60]!r}); use protocol 'marlin'")

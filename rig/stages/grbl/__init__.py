@@ -1,1 +1,0 @@
-"""The driver for GRBL 1.1 and grblHAL."""
