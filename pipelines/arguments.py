@@ -1,4 +1,4 @@
-"""Types of command-line arguments, with limits that are checked before a command runs."""
+"""Types of command-line arguments, apart from the code that acts on them: numbers within limits, and words."""
 
 from typing import Annotated, Any, Literal
 
@@ -27,3 +27,10 @@ type NotNegative = Annotated[float, _within(0)]
 type NotNegativeOrAuto = Annotated[float | Literal["auto"], _within(0)]
 type Fraction = Annotated[float, _within(1e-9, 1)]
 type SizePx = Annotated[tuple[int, int], _within(2)]
+
+type Method = Literal["pmlem", "backprojection", "mlem", "pmlem-osl", "joint", "occlusion"]
+type PriorName = Literal["tv", "patches", "learned", "auto"]
+type SceneKind = Literal["dark_scene", "bright"]
+type FigureNumber = Literal[2, 3, 4]
+type LensName = Literal["opencv5", "opencv8", "opencv4", "pinhole"]
+type PaperName = Literal["A4", "A3", "A2", "letter"]

@@ -1,7 +1,7 @@
-"""The launcher: runs a command, prints its result, and turns failures into exit codes.
+"""The launcher: lists the commands, runs one, prints its result, and turns failures into exit codes.
 
-A command is a function of its arguments that returns its result, a JSON-able object. `pipelines.registry` lists the
-commands by name, so that a module is imported only when its command runs.
+A command is a function of its arguments that returns its result, a JSON-able object. Its module is imported only when
+the command runs or its help is shown.
 """
 
 import os
@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from json import dumps
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from cyclopts import App, CycloptsError, CycloptsPanel, Group, Parameter
 
@@ -18,12 +18,57 @@ import faintfield
 from faintfield.pipelines.console import framed_console, inform, visible
 from faintfield.pipelines.errors import NAMED_FAILURES, FileFailed, MemoryShort, WrongUsage
 from faintfield.pipelines.log_file import logged
-from faintfield.pipelines.registry import register_commands
 
 DONE, FAILED, WRONG_USAGE = 0, 1, 2
 
-# Options of every command; listed last.
-EVERY_COMMAND = Group("Every command", sort_key=9)
+_COMMANDS = "faintfield.pipelines.commands"
+
+_AT_THE_RIG, _FILES = Group("At the rig", sort_key=2), Group("Other people's files", sort_key=5)
+_EVERY_COMMAND = Group("Every command", sort_key=9)
+
+# An example of each command, without "faintfield", by group and module, in the order in which an experiment needs them;
+# the first word is its name. A test parses each.
+COMMANDS: dict[tuple[Group, str], tuple[str, ...]] = {
+    (Group("Try it without hardware", sort_key=1), "simulation"): (
+        "demo first-demo --quick",
+        "simulate scene --rows 5 --columns 5 --size-px 320 240",
+        "darken bright dark --snr 0.16 --seed 1",
+    ),
+    (_AT_THE_RIG, "capture"): (
+        "init rig.toml",
+        "check rig.toml --remember",
+        "plan rig.toml --light-e 0.97 --sigma-e 0.3 --exposures-ms 50 100 --grids 5x5 7x7",
+        "board boards.pdf --paper A3 --boards 3",
+        "capture rig.toml session --page",
+        "verify session",
+    ),
+    (Group("Calibrate", sort_key=3), "calibration"): (
+        "noise session --out results",
+        "geometry boards --depth-mm 500 --depth-mm 700",
+    ),
+    (Group("Reconstruct", sort_key=4), "reconstruction"): (
+        "run session --depth-mm 500 --depth-mm 700",
+        "reconstruct dark --geometry boards --depth-mm 500 --depth-mm 700 --out planes",
+        "report planes",
+        "view planes",
+        "figures figures --only 4",
+    ),
+}
+IMPORTS = (
+    "import grid pictures bright --pitch-mm 50 --fx-px 600",
+    "import colmap sparse/0 set --images images",
+    "import mrcal cameras set --images images",
+    "import nerfstudio transforms.json set --mm-per-unit 1000",
+    "import poses poses.csv set --fx-px 600 --images images",
+    "import emva1288 descriptor.txt noise",
+)
+EXPORTS = (
+    "export colmap set sparse",
+    "export mrcal set cameras",
+    "export nerfstudio set transforms",
+    "export zarr sweep sweep.ome.zarr",
+    "export emva1288 noise emva1288",
+)
 
 _START = """Start with: faintfield demo first-demo
 
@@ -40,24 +85,84 @@ app = App(
     default_parameter=Parameter(negative=()),
     result_action="return_value",
 )
-# `run` reports an interrupt in one line.
+# `launch` reports an interrupt in one line
 app.suppress_keyboard_interrupt = app.meta.suppress_keyboard_interrupt = False
-register_commands(app)
+
+
+def _register(parent: App, name: str, target: str, example: str, place: int, group: Group | None = None) -> None:
+    """Register a command with the part of its docstring before the parameters, read from its source.
+
+    Importing all modules would take seconds.
+    """
+    module, _, function = target.partition(":")
+    source = (Path(__file__).parent / "commands" / f"{module}.py").read_text("utf-8")
+    parent.command(
+        f"{_COMMANDS}.{target}",
+        name=name,
+        help=source.partition(f"\ndef {function}(")[2].split('"""')[1].partition("\n    Parameters\n")[0],
+        group=group,
+        sort_key=place,
+        help_epilogue=f"Example: faintfield {example}",
+        help_format="markdown",
+    )
+
+
+def _register_verb(examples: Sequence[str], words: str) -> None:
+    """Register `import` or `export` with its commands."""
+    verb = examples[0].split()[0]
+    epilogue = f"Example: faintfield {examples[0]}"
+    app.command(App(name=verb, help=words, group=_FILES, help_epilogue=epilogue, help_format="plaintext"))
+    for place, example in enumerate(examples, start=1):
+        name = example.split()[1]
+        _register(app[verb], name, f"{verb}s:{verb}_{name}", example, place)
+
+
+for (_group, _module), _examples in COMMANDS.items():
+    for _place, _example in enumerate(_examples, start=1):
+        _name = _example.split()[0]
+        _register(app, _name, f"{_module}:{_name}", _example, _place, _group)
 app.command(
-    "faintfield.pipelines.completion:install_completion",
+    f"{_COMMANDS}.stage:app",
+    name="stage",
+    help="Bring up a stage: identify it, home it, move it, test it.",
+    group=_AT_THE_RIG,
+    sort_key=2.5,
+)
+_register_verb(IMPORTS, "Make a set of images and poses, or of frames, from other people's files.")
+_register_verb(EXPORTS, "Write lens and poses of a set, planes, or dark and flat frames, for other people's programs.")
+for _flag in ("--help", "--version"):
+    app[_flag].group = _EVERY_COMMAND
+
+
+@app.command(
     name="--install-completion",
     help="Complete commands and options with the tab key of your shell.",
-    group=EVERY_COMMAND,
+    group=_EVERY_COMMAND,
 )
-for _flag in ("--help", "--version"):
-    app[_flag].group = EVERY_COMMAND
+def _install_completion(
+    *,
+    shell: Literal["zsh", "bash", "fish", "powershell"] | None = None,
+    output: Annotated[Path | None, Parameter(name=["-o", "--output"])] = None,
+) -> None:
+    """Install shell completion for this application.
+
+    Parameters
+    ----------
+    shell
+        Shell type for completion. If not specified, attempts to auto-detect current shell.
+    output
+        Output path for the completion script. If not specified, uses shell-specific default.
+    """
+    from cyclopts.completion.install import create_install_completion_command  # takes as long as all of the launcher
+
+    create_install_completion_command(app.install_completion, add_to_startup=True)(shell=shell, output=output)
 
 
 @app.meta.default
 def _launch(
     *tokens: Annotated[str, Parameter(show=False, allow_leading_hyphen=True)],
-    json: Annotated[bool, Parameter(group=EVERY_COMMAND, show_default=False)] = False,
-    log: Annotated[Path | None, Parameter(group=EVERY_COMMAND)] = None,
+    json: Annotated[bool, Parameter(group=_EVERY_COMMAND, show_default=False)] = False,
+    log: Annotated[Path | None, Parameter(group=_EVERY_COMMAND)] = None,
 ) -> None:
     """See in the dark: reconstruct the planes of a scene from a grid of photon-starved images.
 

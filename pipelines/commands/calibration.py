@@ -3,8 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, overload
 
-from faintfield.pipelines.arguments import Positive
-from faintfield.pipelines.choices import LensName
+from faintfield.pipelines.arguments import LensName, Positive
 from faintfield.pipelines.errors import WrongUsage
 
 if TYPE_CHECKING:

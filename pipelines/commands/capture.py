@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from faintfield.pipelines.arguments import Count, Positive
-from faintfield.pipelines.choices import PaperName
+from faintfield.pipelines.arguments import Count, PaperName, Positive
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import OutputExists
 from faintfield.pipelines.planning.options import PlanOptions

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import msgspec
 from cyclopts import Parameter
 
-from faintfield.pipelines.arguments import Count, Positive, Seed, SizePx
-from faintfield.pipelines.choices import FigureNumber, LensName, SceneKind
+from faintfield.pipelines.arguments import Count, FigureNumber, LensName, Positive, SceneKind, Seed, SizePx
 from faintfield.pipelines.console import inform, working
 from faintfield.pipelines.paper.figure_records import Figure2, Figure3, Figure4
 from faintfield.pipelines.reconstruction.options import DEFAULTS, Options

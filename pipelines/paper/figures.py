@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.pipelines.choices import FigureNumber
+from faintfield.pipelines.arguments import FigureNumber
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.files import check_free, exclusive, remove, write_json, write_whole
 from faintfield.pipelines.formats.frames import read_frame

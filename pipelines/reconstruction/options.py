@@ -8,8 +8,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from faintfield.pipelines.arguments import Count, NotNegativeOrAuto, Positive
-from faintfield.pipelines.choices import Method, PriorName
+from faintfield.pipelines.arguments import Count, Method, NotNegativeOrAuto, Positive, PriorName
 from faintfield.pipelines.errors import WrongUsage
 from faintfield.recon.names import LikelihoodName, PenaltyName
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import msgspec
 
 from faintfield.calib.board import Board
-from faintfield.pipelines.choices import PaperName
+from faintfield.pipelines.arguments import PaperName
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import WrongUsage
 from faintfield.pipelines.formats.board_pdf import FOOT_MM, MARGIN_MM, board_pdf

@@ -6,7 +6,7 @@ from typing import get_args
 
 import msgspec
 
-from faintfield.pipelines.choices import Method
+from faintfield.pipelines.arguments import Method
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.files import check_free, write_json, write_record
 from faintfield.pipelines.formats.results.records import JOINT_METHODS, METRICS_FILE, Metrics

@@ -6,13 +6,13 @@ from pathlib import Path
 import msgspec
 
 from faintfield.calib.geometry import GeometrySettings
+from faintfield.pipelines.arguments import LensName
 from faintfield.pipelines.calibration.geometry import (
     MeasuredGeometry,
     geometry_files,
     geometry_record,
     measure_geometry,
 )
-from faintfield.pipelines.choices import LensName
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.results.geometry import (
     DEFAULT_DEPTHS_MM,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import msgspec
 
-from faintfield.pipelines.choices import SceneKind
+from faintfield.pipelines.arguments import SceneKind
 from faintfield.pipelines.console import inform, working
 from faintfield.pipelines.errors import WrongUsage
 from faintfield.pipelines.formats.files import exclusive

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import msgspec
 
-from faintfield.pipelines.choices import LensName
+from faintfield.pipelines.arguments import LensName
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import NAMED_FAILURES, MissingFile, WrongUsage
 from faintfield.pipelines.formats.files import Hashes, exclusive

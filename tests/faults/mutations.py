@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 
 import cv2
 
-from faintfield.pipelines import registry
+from faintfield.pipelines import launcher
 from faintfield.pipelines.cli import run
 from faintfield.recon import compile_kernels
 from tests.faults import mutation_operations
@@ -133,7 +133,7 @@ def warm_up() -> None:
     cv2.setNumThreads(1)
     # A mutation of a huge file must fail here, not take the memory of all
     resource.setrlimit(resource.RLIMIT_DATA, (2 * MAX_EXTRA_BYTES, resource.RLIM_INFINITY))
-    folder = Path(registry.__file__).parent / "commands"
+    folder = Path(launcher.__file__).parent / "commands"
     for path in folder.rglob("*.py"):
         module = ".".join(path.relative_to(folder).with_suffix("").parts)
         if path.stem != "__init__":

@@ -10,7 +10,7 @@ import pytest
 
 from faintfield.pipelines import cli, launcher
 from faintfield.pipelines.errors import BadValue
-from faintfield.pipelines.registry import COMMANDS, EXPORTS, IMPORTS
+from faintfield.pipelines.launcher import COMMANDS, EXPORTS, IMPORTS
 from faintfield.recon.errors import NotConverged
 from tests.pipelines.conftest import Command
 

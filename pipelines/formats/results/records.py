@@ -14,7 +14,7 @@ from typing import Annotated, Literal
 
 from msgspec import UNSET, Meta, Struct, UnsetType
 
-from faintfield.pipelines.choices import Method as Method
+from faintfield.pipelines.arguments import Method as Method
 from faintfield.pipelines.formats.provenance import Provenance
 from faintfield.pipelines.formats.units import StatedUnits
 

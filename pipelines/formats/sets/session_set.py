@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.lens import Lens
-from faintfield.pipelines.choices import SceneKind as SceneKind
+from faintfield.pipelines.arguments import SceneKind as SceneKind
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.files import sha256

@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from faintfield.pipelines.choices import PriorName as PriorName
+from faintfield.pipelines.arguments import PriorName as PriorName
 from faintfield.pipelines.formats.results.records import SolveRecord
 from faintfield.recon.likelihood.images import Image, LikelihoodName
 from faintfield.recon.solver.penalties import PenaltyName
