@@ -22,10 +22,9 @@ from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.depth.luminance import default_bins, luminance
 from faintfield.pipelines.reconstruction.depth.search import between_pixels, nodes_of
 from faintfield.recon.surface.confidence import COEFFICIENTS, RIGHT_WITHIN, SURE, features
-from faintfield.recon.surface.estimate import first_depths, halves, next_depths
+from faintfield.recon.surface.estimate import equal_steps, first_depths, halves, next_depths
 from faintfield.recon.surface.evidence import DepthEvidence
 from faintfield.recon.surface.goodness import explained_share
-from faintfield.recon.surface.sweep import equal_steps
 
 # Rounds of depth and light; every so many samples along each axis are used; weight of the prior.
 _ROUNDS, _STRIDE, _PRIOR = 4, 2, 1e-3

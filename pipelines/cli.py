@@ -4,7 +4,7 @@ import sys
 from collections.abc import Sequence
 
 import faintfield
-from faintfield.recon.compiling import on_compiling
+from faintfield.recon.names import on_compiling
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

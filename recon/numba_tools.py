@@ -19,7 +19,7 @@ from numba import types
 from numba.core import cgutils, event
 from numba.extending import intrinsic, overload
 
-from faintfield.recon.compiling import on_compiling
+from faintfield.recon.names import on_compiling
 
 # Options of all compiled code: sums may be reordered, but infinities and NaN keep their meaning, because callers test
 # for them.

@@ -12,8 +12,7 @@ from scipy.stats import norm, poisson
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.likelihood.pixel_models import LEAST_SQUARES, POISSON_GAUSSIAN, SHIFTED_POISSON
 from faintfield.recon.operator import kernels
-from faintfield.recon.operator.detector_maps import DetectorMaps
-from faintfield.recon.operator.geometry import scene_geometry
+from faintfield.recon.operator.geometry import DetectorMaps, scene_geometry
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.occlusion import Occluders, hiding_of
 from faintfield.recon.operator.placement import EDGE_TOLERANCE, UNSEEN

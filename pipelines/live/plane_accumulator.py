@@ -15,8 +15,7 @@ from faintfield.pipelines.reconstruction.channels import lattice_noise, view_ele
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
 from faintfield.pipelines.reconstruction.planes.penalised import MAX_PASSES, Objective
 from faintfield.pipelines.reconstruction.planes.solutions import Settings
-from faintfield.recon.depth.focus import FocusMeasure
-from faintfield.recon.depth.running import RunningPlane, SeenByView, seen_by_view
+from faintfield.recon.depth.focus import FocusMeasure, RunningPlane, SeenByView, seen_by_view
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages, Image, binned
 from faintfield.recon.solver.data_fit import SceneProblem

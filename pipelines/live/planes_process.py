@@ -29,8 +29,8 @@ from faintfield.pipelines.live.planes_messages import (
 )
 from faintfield.pipelines.live.planes_scene import LiveScene, dark_frames, live_scene
 from faintfield.pipelines.live.terminal import display_levels
-from faintfield.recon.compiling import on_compiling
 from faintfield.recon.errors import ReconstructionError
+from faintfield.recon.names import on_compiling
 from faintfield.rig.errors import RigError
 from faintfield.rig.session.session import FRAMES, read_plan
 

@@ -39,7 +39,7 @@ from faintfield.pipelines.reconstruction.request import Request
 from faintfield.pipelines.reconstruction.run import Outcome, reconstruct_set
 from faintfield.pipelines.simulation.options import SyntheticOptions
 from faintfield.pipelines.simulation.synthetic_set import NOISE_FREE, write_synthetic_set
-from faintfield.recon.smoothing import blurred
+from faintfield.recon.likelihood.images import blurred
 
 PAGE_FILE = "figures.html"
 _CURVES_FILE = "figure4_curves.json"

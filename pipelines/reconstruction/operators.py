@@ -13,7 +13,7 @@ from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.channels import ChannelLayout
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages, Image, binned
-from faintfield.recon.operator.detector_maps import DetectorMaps
+from faintfield.recon.operator.geometry import DetectorMaps
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.occlusion import Occluders
 from faintfield.recon.operator.plane_operator import PlaneOperator

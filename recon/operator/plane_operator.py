@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.recon.likelihood.images import Image
-from faintfield.recon.operator.detector_maps import DetectorMaps
-from faintfield.recon.operator.geometry import Surface, window_geometry
+from faintfield.recon.operator.geometry import DetectorMaps, Surface, window_geometry
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.kernels import SceneGeometry
 from faintfield.recon.operator.scene_operator import SceneOperator

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator import kernels
-from faintfield.recon.operator.detector_maps import DetectorMaps
-from faintfield.recon.operator.geometry import Surface, scene_geometry
+from faintfield.recon.operator.geometry import DetectorMaps, Surface, scene_geometry
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.occlusion import Occluders, hiding_of
 from faintfield.recon.operator.sweeps import CompiledSweeps, Sweeps

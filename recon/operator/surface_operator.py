@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.recon.errors import GeometryMismatch
-from faintfield.recon.operator.detector_maps import DetectorMaps
+from faintfield.recon.operator.geometry import DetectorMaps
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.placement import UNSEEN
 from faintfield.recon.operator.plane_operator import PlaneOperator

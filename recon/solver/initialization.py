@@ -3,9 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.recon.likelihood.images import ElementalImages, Image
+from faintfield.recon.likelihood.images import ElementalImages, Image, blurred
 from faintfield.recon.operator.scene_operator import SceneOperator, ViewSelection
-from faintfield.recon.smoothing import blurred
 
 # Spacings of the blur, which has a standard deviation of 2 samples.
 _START_BLUR = (1, 1, 1, 1, 2)

@@ -7,10 +7,9 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.recon.likelihood.images import Image
+from faintfield.recon.likelihood.images import Image, blurred
 from faintfield.recon.operator.occlusion import opacity
 from faintfield.recon.operator.scene_operator import SceneOperator
-from faintfield.recon.smoothing import blurred
 from faintfield.recon.solver.data_fit import DataFit
 from faintfield.recon.solver.initialization import well_seen_samples
 from faintfield.recon.solver.penalties import Penalty, differences

@@ -13,7 +13,7 @@ from scipy.ndimage import distance_transform_edt
 
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.numba_tools import compiled
-from faintfield.recon.surface.blur import gaussian
+from faintfield.recon.surface.pinhole_views import gaussian
 
 # A difference between neighbours, in steps of the sweep, that counts as the edge of something nearer.
 EDGE_STEPS = 3.0

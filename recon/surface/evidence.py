@@ -12,8 +12,7 @@ from faintfield.recon.likelihood.images import Image
 from faintfield.recon.operator.surface_operator import SurfaceOperator
 from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.solver.proximal import DualField
-from faintfield.recon.surface.blur import gaussian
-from faintfield.recon.surface.pinhole_views import UNKNOWN, PinholeViews, gather
+from faintfield.recon.surface.pinhole_views import UNKNOWN, PinholeViews, gather, gaussian
 from faintfield.recon.threads import run_in_threads
 
 # Weights of total variation in units of the noise: of the light at each depth, and of the light of the surface.

@@ -1,9 +1,10 @@
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
-"""The views as ideal pinhole cameras see them, and their sums over what each depth brings together, compiled."""
+"""The views as ideal pinhole cameras see them, their sums over what each depth brings together, and a blur."""
 
 from dataclasses import dataclass
 from functools import cached_property
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -180,3 +181,16 @@ def _gather(pictures, relief, tolerance, half, matrices, q, lattice, sums):
                         picture[lower + column_step + index(n)] - picture[lower + index(n)]
                     )
                     total[at + index(n + 1) * size] += high + down * (low - high)
+
+
+def gaussian(image: Image, scale: float) -> NDArray[np.float32]:
+    """Return an image (row, column), or a volume (row, column, depth), blurred over rows and columns.
+
+    Parameters
+    ----------
+    image : float array
+        At most 512 depths.
+    scale : float
+        Standard deviation of the blur in samples. Edges are mirrored.
+    """
+    return np.asarray(cv2.GaussianBlur(np.ascontiguousarray(image, np.float32), (0, 0), scale), np.float32)

@@ -13,9 +13,8 @@ from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.formats.sets.stated import rounded_depth
 from faintfield.pipelines.reconstruction.depth.comparison import BinnedViews, Compared, binned_views
 from faintfield.pipelines.reconstruction.depth.significance import check_places
-from faintfield.recon.depth.agreement import DepthEstimate
+from faintfield.recon.depth.agreement import DepthEstimate, Significance
 from faintfield.recon.depth.focus import MIN_SAMPLES, SURE, likeliest_depth_mm, places_of_focus
-from faintfield.recon.depth.significance import Significance
 from faintfield.recon.errors import NothingInFocus
 
 # Depths of a search, and searches, each in the range in which the last found anything.

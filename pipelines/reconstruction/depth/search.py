@@ -20,9 +20,8 @@ from faintfield.pipelines.reconstruction.depth.comparison import BETWEEN_PIXELS
 from faintfield.pipelines.reconstruction.depth.luminance import luminance
 from faintfield.pipelines.reconstruction.depth.significance import check_places
 from faintfield.recon.errors import GeometryMismatch, NothingInFocus
-from faintfield.recon.surface.estimate import SurfaceEstimate, estimate_surface
+from faintfield.recon.surface.estimate import SurfaceEstimate, equal_steps, estimate_surface, found_range
 from faintfield.recon.surface.pinhole_views import PinholeViews
-from faintfield.recon.surface.sweep import equal_steps, found_range
 
 # Fewest views whose halves can find depths by each other's light.
 _MIN_VIEWS = 4

@@ -12,7 +12,7 @@ from faintfield.calib.homography import fronto_parallel_rt_ref_plane, transfer
 from faintfield.pipelines.console import inform, progress, working
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.depth.comparison import BinnedViews
-from faintfield.recon.depth.significance import Significance, disagreement, significance
+from faintfield.recon.depth.agreement import Significance, disagreement, significance
 from faintfield.recon.errors import NothingInFocus
 from faintfield.recon.likelihood.images import binned
 

@@ -11,11 +11,9 @@ from faintfield.pipelines.formats.results.records import PriorRecord, SolveRecor
 from faintfield.pipelines.reconstruction.planes.penalised import Objective, certified, with_sigma
 from faintfield.pipelines.reconstruction.planes.solutions import PriorName, Settings, Solution, mean_e
 from faintfield.recon.likelihood.images import Image
-from faintfield.recon.prior.answers import ProposalAnswers
-from faintfield.recon.prior.evidence import Evidence, evidence_of_planes
-from faintfield.recon.prior.misfit import misfits
-from faintfield.recon.prior.patches import patch_candidates
-from faintfield.recon.prior.proposal import Candidates, PlaneProposal, propose, regions_of
+from faintfield.recon.prior.collaborative import patch_candidates
+from faintfield.recon.prior.evidence import Evidence, evidence_of_planes, misfits
+from faintfield.recon.prior.proposal import Candidates, PlaneProposal, ProposalAnswers, propose, regions_of
 from faintfield.recon.solver.cross_validation import MIN_VIEWS
 from faintfield.recon.solver.uncertainty import Answers, LocalProblem
 

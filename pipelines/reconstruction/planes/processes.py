@@ -17,7 +17,7 @@ from typing import Any
 import numba
 
 from faintfield.pipelines.errors import ClusterFailed
-from faintfield.recon.compiling import on_compiling
+from faintfield.recon.names import on_compiling
 
 # Loads what takes longest before the first kernel runs.
 _PRELOADED = "faintfield.pipelines.reconstruction.planes.preloaded"

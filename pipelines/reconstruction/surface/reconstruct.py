@@ -53,11 +53,11 @@ from faintfield.pipelines.reconstruction.surface.files import SurfaceMaps, write
 from faintfield.pipelines.reconstruction.surface.parallax import aperture_of
 from faintfield.pipelines.reconstruction.surface.request import SurfaceRequest
 from faintfield.recon.operator.surface_operator import SurfaceOperator
-from faintfield.recon.prior.patches import refined
+from faintfield.recon.prior.collaborative import refined
 from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.surface.confidence import RIGHT_WITHIN, SURE, UNKNOWN_BELOW
 from faintfield.recon.surface.estimate import SurfaceEstimate
-from faintfield.recon.surface.held_out import Prediction
+from faintfield.recon.surface.goodness import Prediction
 
 # Bytes of a sample in the files: TIFFs of one number and of one per colour, a point, and the picture on the page; and
 # bytes of previews, film and page, which do not grow with the picture.

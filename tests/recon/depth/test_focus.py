@@ -5,8 +5,14 @@ import pytest
 from numpy.typing import NDArray
 
 from faintfield.recon.depth.agreement import Agreement
-from faintfield.recon.depth.focus import FocusMeasure, focus_measure, likeliest_depth_mm, sharp_depths_mm
-from faintfield.recon.depth.running import RunningPlane, seen_by_view
+from faintfield.recon.depth.focus import (
+    FocusMeasure,
+    RunningPlane,
+    focus_measure,
+    likeliest_depth_mm,
+    seen_by_view,
+    sharp_depths_mm,
+)
 from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.solver.initialization import back_projection

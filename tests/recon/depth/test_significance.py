@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from faintfield.recon.depth.significance import disagreement, significance
+from faintfield.recon.depth.agreement import disagreement, significance
 
 VIEWS = 6
 

@@ -17,6 +17,7 @@ from faintfield.recon.likelihood.images import (
     ElementalImages,
     Image,
     LikelihoodName,
+    blurred,
     read_noise_share,
     select_likelihood,
 )
@@ -28,7 +29,6 @@ from faintfield.recon.likelihood.pixel_models import (
     form_ratio_of_block,
 )
 from faintfield.recon.numba_tools import compiled, exponential, index, logarithm, pointer
-from faintfield.recon.smoothing import blurred
 
 
 @compiled

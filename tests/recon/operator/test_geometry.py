@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from faintfield.calib.homography import plane_from_ray, ray_from_surface
 from faintfield.calib.lens import Lens
 from faintfield.recon.errors import GeometryMismatch
-from faintfield.recon.operator.detector_maps import DetectorMaps
-from faintfield.recon.operator.geometry import scene_geometry, window_geometry
+from faintfield.recon.operator.geometry import DetectorMaps, scene_geometry, window_geometry
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.operator.surface_operator import SurfaceOperator

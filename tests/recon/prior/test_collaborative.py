@@ -5,9 +5,14 @@ import pytest
 from scipy.fft import dctn, idctn
 
 from faintfield.recon.likelihood.images import ElementalImages, Image
-from faintfield.recon.prior.collaborative import Patches, collaborative_wiener, wiener_and_thresholded
+from faintfield.recon.prior.collaborative import (
+    Patches,
+    collaborative_wiener,
+    patch_candidates,
+    refined,
+    wiener_and_thresholded,
+)
 from faintfield.recon.prior.evidence import Evidence, Noise, noise_of_back_projection
-from faintfield.recon.prior.patches import patch_candidates, refined
 from faintfield.recon.solver.initialization import back_projection
 from tests.recon.displaced import SHAPE, views_displaced_by
 

@@ -12,10 +12,8 @@ from scipy.optimize import LinearConstraint, minimize
 from faintfield.pipelines.reconstruction.planes.penalised import Objective
 from faintfield.pipelines.reconstruction.planes.solutions import Settings
 from faintfield.recon.likelihood.images import Image
-from faintfield.recon.prior.evidence import Evidence, evidence_of_planes
-from faintfield.recon.prior.misfit import Misfit, misfits
-from faintfield.recon.prior.mixture import Scores, best_mixture, scores
-from faintfield.recon.prior.proposal import propose
+from faintfield.recon.prior.evidence import Evidence, Misfit, evidence_of_planes, misfits
+from faintfield.recon.prior.proposal import Scores, best_mixture, propose, scores
 from faintfield.recon.solver.data_fit import SceneProblem
 from tests.recon.displaced import dark_views, pieces
 from tests.recon.operator_contract import dense_matrix

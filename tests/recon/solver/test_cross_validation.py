@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from faintfield.recon.likelihood.images import ElementalImages, Image, PixelLikelihood
-from faintfield.recon.solver import windows
+from faintfield.recon.solver import cross_validation
 from faintfield.recon.solver.cross_validation import cross_validated_weight, validation_views
 from faintfield.recon.solver.data_fit import DataFit, SceneProblem
 from faintfield.recon.solver.initialization import smooth_start, universal_penalty_weight
@@ -62,8 +62,8 @@ def test_windows_choose_nearly_the_weight_of_whole(monkeypatch: pytest.MonkeyPat
     problem = SceneProblem(operator, images)
     guess = universal_penalty_weight(operator, images, smooth_start(operator, images))
     whole = cross_validated_weight(problem, guess, Penalty())
-    monkeypatch.setattr(windows, "SIDE", 32)
-    monkeypatch.setattr(windows, "_MIN_SAMPLES", 4_096)
+    monkeypatch.setattr(cross_validation, "SIDE", 32)
+    monkeypatch.setattr(cross_validation, "_MIN_SAMPLES", 4_096)
     parts = cross_validated_weight(problem, guess, Penalty(), level_e=float(truth.mean()))
     assert whole.solution is not None
     assert parts.solution is None
@@ -131,15 +131,15 @@ def problem_of(shape: tuple[int, int], right: NDArray[np.float64] = FEW_SAMPLES)
 
 @pytest.fixture
 def small_windows(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(windows, "SIDE", 8)
-    monkeypatch.setattr(windows, "_MIN_SAMPLES", 8 * 8 * 6)
+    monkeypatch.setattr(cross_validation, "SIDE", 8)
+    monkeypatch.setattr(cross_validation, "_MIN_SAMPLES", 8 * 8 * 6)
 
 
 @pytest.mark.usefixtures("small_windows")
 def test_windows_are_spread_and_do_not_meet() -> None:
     problem = problem_of((64, 96))
     used = np.zeros((64, 96), int)
-    for window in windows.windows_of(problem, 4):
+    for window in cross_validation.windows_of(problem, 4):
         column, row = np.array(window.operator.grids[0].origin_mm).astype(int)
         assert window.operator.grids[0].shape == (8, 8)
         assert window.images is problem.images
@@ -156,7 +156,7 @@ def test_windows_are_spread_and_do_not_meet() -> None:
 @pytest.mark.usefixtures("small_windows")
 @pytest.mark.parametrize(("shape", "least"), [((64, 11), 0), ((19, 20), 0), ((2000, 16), 11), ((16, 2000), 11)])
 def test_only_large_planes_have_windows(shape: tuple[int, int], least: int) -> None:
-    count = len(windows.windows_of(problem_of(shape), 4))
+    count = len(cross_validation.windows_of(problem_of(shape), 4))
     assert count >= least
     assert (count == 0) == (least == 0)
 
@@ -164,6 +164,8 @@ def test_only_large_planes_have_windows(shape: tuple[int, int], least: int) -> N
 @pytest.mark.usefixtures("small_windows")
 def test_windows_with_few_views_are_left_out() -> None:
     shifts = np.where(np.arange(9) < 6, 60.0, FEW_SAMPLES)  # six of nine views see only the right
-    columns = [window.operator.grids[0].origin_mm[0] for window in windows.windows_of(problem_of((64, 96), shifts), 4)]
+    columns = [
+        window.operator.grids[0].origin_mm[0] for window in cross_validation.windows_of(problem_of((64, 96), shifts), 4)
+    ]
     assert columns
     assert min(columns) >= 60

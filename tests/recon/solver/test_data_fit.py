@@ -8,12 +8,11 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from faintfield.recon.likelihood.images import ElementalImages, Image, LikelihoodName
+from faintfield.recon.likelihood.images import ElementalImages, Image, LikelihoodName, blurred
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.occlusion import Occluders
 from faintfield.recon.operator.scene_operator import SceneOperator
 from faintfield.recon.prior.evidence import evidence_of_planes
-from faintfield.recon.smoothing import blurred
 from faintfield.recon.solver.data_fit import DataFit, SceneProblem
 from faintfield.recon.solver.initialization import back_projection, mean_light_e, smooth_start, universal_penalty_weight
 from faintfield.recon.solver.pmlem import PmlemIterate, pmlem

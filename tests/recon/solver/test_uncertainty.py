@@ -8,12 +8,10 @@ import pytest
 from faintfield.pipelines.reconstruction.planes.penalised import Objective, certified, solve_pmlem
 from faintfield.pipelines.reconstruction.planes.solutions import PriorName, Settings
 from faintfield.pipelines.reconstruction.planes.solve import solve
-from faintfield.recon.likelihood.images import Image
-from faintfield.recon.prior.answers import ProposalAnswers
+from faintfield.recon.likelihood.images import Image, blurred
+from faintfield.recon.prior.collaborative import patch_candidates
 from faintfield.recon.prior.evidence import evidence_of_planes
-from faintfield.recon.prior.patches import patch_candidates
-from faintfield.recon.prior.proposal import propose
-from faintfield.recon.smoothing import blurred
+from faintfield.recon.prior.proposal import ProposalAnswers, propose
 from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.solver.uncertainty import LocalFit, LocalProblem, local_fits, standard_deviation

@@ -9,11 +9,10 @@ from scipy.ndimage import gaussian_filter
 
 from faintfield.recon.errors import NothingInFocus
 from faintfield.recon.surface.confidence import RIGHT_WITHIN
-from faintfield.recon.surface.estimate import halves
+from faintfield.recon.surface.estimate import equal_steps, found_range, halves
 from faintfield.recon.surface.evidence import DepthEvidence
-from faintfield.recon.surface.held_out import predicted, seen_of, squared_errors
+from faintfield.recon.surface.goodness import predicted, seen_of, squared_errors
 from faintfield.recon.surface.pinhole_views import UNKNOWN, PinholeViews
-from faintfield.recon.surface.sweep import equal_steps, found_range
 from tests.recon import surface_scene
 from tests.recon.surface_scene import DEPTHS, FAR, FARTHEST, LEVEL_E, NEAR, NEAREST, NODES, SHAPE
 

@@ -7,9 +7,8 @@ from scipy.optimize import minimize
 from scipy.sparse import csr_array
 
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.surface.generalized_variation import PiecewisePlane
-from faintfield.recon.surface.paths import lowest, sum_over_paths
 from faintfield.recon.surface.pinhole_views import UNKNOWN, PinholeViews, gather
+from faintfield.recon.surface.regularization import PiecewisePlane, lowest, sum_over_paths
 
 ONE_STEP, ANY_STEP = 0.7, 2.2
 DIRECTIONS = [(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1) if down or right]

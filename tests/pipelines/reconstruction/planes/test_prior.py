@@ -20,8 +20,8 @@ from faintfield.pipelines.reconstruction.planes.solutions import Settings
 from faintfield.pipelines.reconstruction.planes.solve import solve
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages, Image
+from faintfield.recon.prior.collaborative import patch_candidates
 from faintfield.recon.prior.evidence import Evidence
-from faintfield.recon.prior.patches import patch_candidates
 from faintfield.recon.solver.data_fit import SceneProblem
 from tests.pipelines.conftest import Command, run_undrawn
 from tests.pipelines.forms import check_proposal, plane_files, read_record

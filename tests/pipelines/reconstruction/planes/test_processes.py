@@ -16,7 +16,7 @@ import pytest
 
 from faintfield.pipelines.errors import ClusterFailed
 from faintfield.pipelines.reconstruction.planes.processes import in_processes
-from faintfield.recon import compiling
+from faintfield.recon import names
 from tests.patience import HANG_S
 
 
@@ -69,7 +69,7 @@ def _fail(job: int) -> int:
 
 
 def _announce(_: object) -> None:
-    for announce in compiling.on_compiling:
+    for announce in names.on_compiling:
         announce()
 
 
@@ -111,8 +111,8 @@ def test_failure_comes_with_traceback_and_ends_processes(job: int, failure: type
 
 def test_compiling_is_announced_once_for_all_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     announced: list[str] = []
-    monkeypatch.setattr(compiling, "on_compiling", [lambda: announced.append("compiling")])
-    monkeypatch.setattr("faintfield.pipelines.reconstruction.planes.processes.on_compiling", compiling.on_compiling)
+    monkeypatch.setattr(names, "on_compiling", [lambda: announced.append("compiling")])
+    monkeypatch.setattr("faintfield.pipelines.reconstruction.planes.processes.on_compiling", names.on_compiling)
     assert len(list(in_processes(2, _announce, range(4)))) == 4
     assert announced == ["compiling"]
 
