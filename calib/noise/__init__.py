@@ -3,8 +3,8 @@
 `SeriesSums` reduces frames to sufficient statistics, and `calibrate` turns these into numbers, maps and warnings.
 """
 
+from faintfield.calib.estimate import Estimate
 from faintfield.calib.noise.calibrate import calibrate
-from faintfield.calib.noise.estimate import Estimate
 from faintfield.calib.noise.maps.measure import NoiseMaps
 from faintfield.calib.noise.misfit import TransferPoint
 from faintfield.calib.noise.result import NoiseCalibration

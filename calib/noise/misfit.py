@@ -25,14 +25,6 @@ _NOTABLE_FRACTION, _NOTABLE_DRIFT = 0.005, 0.1
 
 
 @dataclass(frozen=True)
-class Scatter:
-    """Deviance of one grouping of a series' noise, and its degrees of freedom."""
-
-    deviance: float
-    freedom: int
-
-
-@dataclass(frozen=True)
 class SeriesGoodness:
     """Goodness of fit of one series.
 
@@ -40,22 +32,25 @@ class SeriesGoodness:
     ----------
     series : Series
         The series.
+    left_out : str, optional
+        Why it was left out.
     noise_excess, noise_se : float, optional
         Variance over that of the model, minus 1, with its standard error under Gaussian noise; None for one frame.
     level_residual_dn : float, optional
         Level minus that of the model; None where the light of a flat is not known.
-    blocks, rows, columns, frames : Scatter, optional
-        Scatter of the noise over blocks of pixels, rows, columns and frames.
+    blocks, rows, columns, by_frame : float, optional
+        Deviance of the noise over blocks of pixels, rows, columns and frames, per degree of freedom.
     """
 
     series: Series
-    noise_excess: float | None
-    noise_se: float | None
-    level_residual_dn: float | None
-    blocks: Scatter | None = None
-    rows: Scatter | None = None
-    columns: Scatter | None = None
-    frames: Scatter | None = None
+    left_out: str | None = None
+    noise_excess: float | None = None
+    noise_se: float | None = None
+    level_residual_dn: float | None = None
+    blocks: float | None = None
+    rows: float | None = None
+    columns: float | None = None
+    by_frame: float | None = None
 
 
 @dataclass(frozen=True)
@@ -105,19 +100,19 @@ def series_goodness(fitted: SeriesFit) -> tuple[SeriesGoodness, ...]:
     goodness = []
     for j, item in enumerate((*fitted.darks, *fitted.flats)):
         if item.frames < 2:
-            goodness.append(SeriesGoodness(item, None, None, residuals[j]))
+            goodness.append(SeriesGoodness(item, level_residual_dn=residuals[j]))
             continue
         excess = float(within[j] / ((item.frames - 1) * moments.freedom * noise[j])) - 1
         sums = moments.noise[j]
         expected = noise[j] if item.conditions.kind == "dark" else flat_variances_of_nodes(fit, sums)
-        scatter = [_scatter(*sums.scatter(groups, expected)) for groups in (sums.blocks, sums.rows, sums.columns)]
+        scatter = [_deviance(*sums.scatter(groups, expected)) for groups in (sums.blocks, sums.rows, sums.columns)]
         # The variance of a frame over its pixels is that of noise and fixed pattern.
         noise_dn2 = float(noise[j])
         pattern_dn2 = max(float(item.spreads_dn2.mean()) - noise_dn2, 0.0)
         chance = (2 * noise_dn2**2 + 4 * noise_dn2 * pattern_dn2) / float((~item.suspect).sum())
-        scatter.append(Scatter(float(item.spreads_dn2.var() * item.frames / chance), item.frames - 1))
+        scatter.append(float(item.spreads_dn2.var() * item.frames / chance) / (item.frames - 1))
         se = float(np.sqrt(2 / max(freedom[j], 1.0)))
-        goodness.append(SeriesGoodness(item, excess, se, residuals[j], *scatter))
+        goodness.append(SeriesGoodness(item, None, excess, se, residuals[j], *scatter))
     return tuple(goodness)
 
 
@@ -136,10 +131,11 @@ def _light_residuals(fit: NoiseFit, moments: Moments) -> list[float | None]:
     return residuals
 
 
-def _scatter(ratio: Array, freedom: Array) -> Scatter:
-    """Return the scatter of a series' noise over groups of pixels about its own mean."""
+def _deviance(ratio: Array, freedom: Array) -> float | None:
+    """Return the deviance of a series' noise over groups about its own mean, per degree of freedom if there is any."""
     mean = np.average(ratio, weights=freedom)
-    return Scatter(float(np.sum(0.5 * freedom * (ratio / mean - 1) ** 2)), ratio.size - 1)
+    deviance = float(np.sum(0.5 * freedom * (ratio / mean - 1) ** 2))
+    return deviance / (ratio.size - 1) if ratio.size > 1 else None
 
 
 def frame_warnings(fitted: SeriesFit, saturation: Saturation) -> list[str]:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.errors import NotIdentifiable
-from faintfield.calib.noise.estimate import Estimate
+from faintfield.calib.estimate import Estimate
 from faintfield.calib.noise.maps.measure import NoiseMaps
 from faintfield.calib.noise.misfit import SeriesGoodness, TransferPoint
 from faintfield.calib.noise.series.flats import Saturation

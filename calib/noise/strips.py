@@ -6,8 +6,9 @@ Maps of large sensors may lie in files, so that memory holds only the strips tha
 import mmap
 import operator
 import os
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import reduce
@@ -78,6 +79,26 @@ def release() -> None:
 def usable_cores() -> int:
     """Return the number of processor cores that this process may use."""
     return len(os.sched_getaffinity(0))
+
+
+def read_ahead[Item, Content](
+    items: Iterable[Item], read: Callable[[Item], Content], workers: int = 2
+) -> Iterator[tuple[Item, Content]]:
+    """Yield each item with what `read` makes of it in a thread, in order; at most `workers` wait to be taken."""
+    waiting: deque[tuple[Item, Future[Content]]] = deque()
+    with ThreadPoolExecutor(workers) as pool:
+        try:
+            for item in items:
+                if len(waiting) == workers:
+                    first, content = waiting.popleft()
+                    yield first, content.result()
+                waiting.append((item, pool.submit(read, item)))
+            while waiting:
+                first, content = waiting.popleft()
+                yield first, content.result()
+        finally:
+            for _, content in waiting:
+                content.cancel()
 
 
 def over_strips[T](work: Callable[[slice], T], shape: tuple[int, ...], parts: int | None = None) -> list[T]:

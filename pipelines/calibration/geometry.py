@@ -23,8 +23,7 @@ from faintfield.calib.geometry import (
 from faintfield.calib.geometry.homings import HomingShift
 from faintfield.calib.geometry.stage import StageReport, approach_directions, stage_report
 from faintfield.calib.mrcal_loader import load_mrcal
-from faintfield.calib.noise.strips import usable_cores
-from faintfield.pipelines.calibration.reading_ahead import read_ahead
+from faintfield.calib.noise.strips import read_ahead, usable_cores
 from faintfield.pipelines.console import inform, progress, working
 from faintfield.pipelines.formats.exchange.mrcal import camera_model_text
 from faintfield.pipelines.formats.provenance import provenance

@@ -1,78 +1,95 @@
-"""A sensor's noise from a noise set: each phase of its mosaic calibrated, as the record and the maps of the result."""
+"""A sensor measured: the frames of a noise set reduced to statistics, and each phase of its mosaic calibrated."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
-from msgspec import UNSET
 from numpy.typing import NDArray
 
 from faintfield.calib.errors import CalibrationError
-from faintfield.calib.noise import Estimate, NoiseCalibration, calibrate
-from faintfield.calib.noise.strips import release
+from faintfield.calib.estimate import Estimate
+from faintfield.calib.noise import NoiseCalibration, Series, SeriesSums, calibrate
+from faintfield.calib.noise.strips import read_ahead
 from faintfield.pipelines.calibration.noise_emva import EmvaMeasurement, measure_emva
-from faintfield.pipelines.calibration.noise_fit import fit_record
-from faintfield.pipelines.calibration.noise_frames import MosaicPhase, Readout, read_series
-from faintfield.pipelines.console import working
-from faintfield.pipelines.formats.files import sha256
-from faintfield.pipelines.formats.provenance import provenance
-from faintfield.pipelines.formats.results.noise import CovarianceRecord, NoiseRecord, PhaseRecord, Quantities
-from faintfield.pipelines.formats.results.noise_fit import Measured
-from faintfield.pipelines.formats.sets.noise_set import (
-    FILE_NAME,
-    NoiseSet,
-    scene_temperature_warnings,
-    temperature_notes,
-)
-from faintfield.rig.session.session import PLAN
+from faintfield.pipelines.console import progress, working
+from faintfield.pipelines.errors import BadValue, UnreadableImage, WrongBitDepth, WrongSize
+from faintfield.pipelines.formats.frames import Frame, at_phase, mosaic_period, read_frame
+from faintfield.pipelines.formats.sets.noise_set import FrameSeries, NoiseSet, Region
 
 # Black levels of masked pixels and of covered ones differ by less in a sound camera.
 _BLACK_TOLERANCE_DN = 2.0
 
-# Maps by their name in the file, with the fill for pixels that were not calibrated; these are masked anyway.
-_MAPS = {
-    "offset_dn": 0.0,
-    "offset_variance_dn2": 0.0,
-    "dark_current_e_per_s": 0.0,
-    "dark_current_variance_e2_per_s2": 0.0,
-    "read_noise_e": 1.0,
-    "read_noise_se_e": 0.0,
-    "relative_response": 1.0,
-    "relative_response_se": 0.0,
-    "vignetting": 1.0,
-}
-_GAIN_MAPS = {"gain_dn_per_e": 1.0, "gain_se_dn_per_e": 0.0}
+
+@dataclass(frozen=True)
+class MosaicPhase:
+    """The pixels of one phase of the colour filter mosaic; of the whole sensor when there are no filters.
+
+    Attributes
+    ----------
+    phase, period : (int, int)
+        Row and column of its first pixel, and the distance to the next.
+    colour : str
+        Letter of its filter, "" without filters.
+    series : list of Series
+        Statistics of its pixels.
+    black_dn : list of float
+        Black level stated in each dark's file, from the sensor's masked pixels where it has any.
+    """
+
+    phase: tuple[int, int]
+    period: tuple[int, int]
+    colour: str
+    series: list[Series] = field(default_factory=list)
+    black_dn: list[float] = field(default_factory=list)
+
+    @property
+    def name(self) -> str:
+        """Name of the phase in messages and file names, "" when it is the only one."""
+        return f"{self.colour}_r{self.phase[0]}c{self.phase[1]}" if self.colour else ""
+
+    def of(self, pixels: NDArray[Any]) -> NDArray[Any]:
+        """Return the phase's part of an array (row, column), as a view."""
+        return at_phase(pixels, self.phase, self.period)
+
+
+@dataclass(frozen=True)
+class Readout:
+    """All frames of a noise set, reduced.
+
+    Attributes
+    ----------
+    size_px : (int, int)
+        Width and height of a frame.
+    rows, columns : slice
+        Region that was used.
+    mosaic : tuple of str, optional
+        Colour filters.
+    saturation_dn : float
+        As stated in `noise.toml`, else by the file, else the last value of the files' type.
+    phases : list of MosaicPhase
+        One per phase of the mosaic.
+    """
+
+    size_px: tuple[int, int]
+    rows: slice
+    columns: slice
+    mosaic: tuple[str, ...] | None
+    saturation_dn: float
+    phases: list[MosaicPhase]
 
 
 @dataclass(frozen=True)
 class SensorCalibration:
-    """The calibration of a sensor.
+    """A sensor's frames, and for each phase of its mosaic the calibration and what the report by EMVA 1288 shows."""
 
-    Attributes
-    ----------
-    folder : Path
-        Of the noise set.
-    settings : NoiseSet
-        The frames that were used.
-    readout : Readout
-        The layout of the frames.
-    phases : list of NoiseCalibration
-        One per phase of the mosaic, in the order of `readout.phases`.
-    emva : list of EmvaMeasurement
-        Likewise, what the report by EMVA 1288 shows.
-    """
-
-    folder: Path
-    settings: NoiseSet
+    frames: FrameSeries
     readout: Readout
     phases: list[NoiseCalibration]
     emva: list[EmvaMeasurement]
 
 
-def calibrate_sensor(folder: Path, settings: NoiseSet) -> SensorCalibration:
+def calibrate_sensor(frames: FrameSeries) -> SensorCalibration:
     """Read the frames of a noise set and calibrate every phase of the mosaic.
 
     Raises
@@ -80,74 +97,87 @@ def calibrate_sensor(folder: Path, settings: NoiseSet) -> SensorCalibration:
     InputError, CalibrationError
         A frame cannot be used, or the frames do not determine the noise; the message says what to record.
     """
-    readout = read_series(folder, settings)
+    readout = _read_frames(frames)
     with working("fitting noise and response"):
         phases = [_calibrate_phase(phase, readout.saturation_dn) for phase in readout.phases]
-    warmth = {str(folder / frame.file): it for frame in settings.frame if (it := frame.temperature_c) is not None}
-    emva = [measure_emva(*of_phase, warmth) for of_phase in zip(readout.phases, phases, strict=True)]
-    return SensorCalibration(folder, settings, readout, phases, emva)
+    emva = [
+        measure_emva(phase.name, phase.series, calibration, frames.temperature_c)
+        for phase, calibration in zip(readout.phases, phases, strict=True)
+    ]
+    return SensorCalibration(frames, readout, phases, emva)
 
 
-def noise_record(sensor: SensorCalibration) -> NoiseRecord:
-    """Return the record of a calibration, without the hash of its maps."""
-    readout, phases, settings = sensor.readout, sensor.phases, sensor.settings
-    records = [_phase_record(*of_phase) for of_phase in zip(readout.phases, phases, sensor.emva, strict=True)]
-    bad_pixels: dict[str, Any] = {
-        f"{kind}_pixels": np.argwhere(_interleave(readout, [getattr(c, kind) for c in phases], fill=False)).tolist()
-        for kind in ("hot", "noisy", "dead")
-    }
-    temperature_c, warnings = temperature_notes(settings)
-    warnings += scene_temperature_warnings(sensor.folder, settings)
-    warnings += [warning for calibration in phases for warning in calibration.warnings]
-    means = {name: _mean([c.estimates[name] for c in phases]) for name in phases[0].estimates if _is_quantity(name)}
-    return NoiseRecord(
-        **_records(means),
-        covariance=_covariance(phases),
-        likelihood=" / ".join(dict.fromkeys(str(c.likelihood) for c in phases)),
-        saturation_dn=_saturation(phases),
-        size_px=readout.size_px,
-        mosaic=readout.mosaic or UNSET,
-        planes=records if readout.mosaic else UNSET,
-        **bad_pixels,
-        temperature_c=temperature_c,
-        frames=settings.frame,
-        warnings=list(dict.fromkeys(warnings)),
-        provenance=provenance("noise", {}, _input_hashes(sensor.folder, settings)),
-        fit=UNSET if readout.mosaic else fit_record(phases[0]),
-        emva1288=UNSET if readout.mosaic else sensor.emva[0].record(),
-    )
+def _read_frames(frames: FrameSeries) -> Readout:
+    """Read every frame once, a few ahead of their turn, and reduce it."""
+    readout = _layout(next(iter(frames.series.values()))[0], frames.settings)
+    queue = [(conditions, path) for conditions, paths in frames.series.items() for path in paths]
+    sums: list[SeriesSums] = []
+    read = read_ahead(queue, lambda entry: read_frame(entry[1], readout.size_px, of="the other frames"))
+    for index, ((conditions, path), frame) in enumerate(progress(read, "reading frames", len(queue))):
+        if index == 0 or conditions != queue[index - 1][0]:
+            sums = [SeriesSums(conditions, readout.saturation_dn) for _ in readout.phases]
+        pixels = _check_frame(frame, path, readout)[readout.rows, readout.columns]
+        for phase, phase_sums in zip(readout.phases, sums, strict=True):
+            phase_sums.add(str(path), phase.of(pixels))
+            if conditions.kind == "dark" and frame.black_dn is not None:
+                phase.black_dn.append(float(frame.black_dn[phase.phase]))
+            if index + 1 == len(queue) or conditions != queue[index + 1][0]:
+                phase.series.append(phase_sums.series())
+    return readout
 
 
-def noise_maps(sensor: SensorCalibration) -> Iterator[tuple[str, NDArray[Any]]]:
-    """Yield name and array of the maps of `noise_maps.npz` (row, column): float32, but the bool `mask`."""
-    for name, parts, fill in _parts_of_maps(sensor.phases):
-        yield name, _interleave(sensor.readout, parts, fill)
-        release()
+def _layout(first: Path, settings: NoiseSet) -> Readout:
+    """Return the layout of all frames, from the first one and the settings."""
+    frame = read_frame(first)
+    if frame.pixels_dn.ndim != 2 or not np.issubdtype(frame.pixels_dn.dtype, np.integer):
+        raise UnreadableImage(
+            f"{first}: holds {frame.pixels_dn.dtype} of shape {frame.pixels_dn.shape}; the noise of a sensor shows "
+            "only in whole digital numbers, one per pixel: give raw files or grey frames, not photographs"
+        )
+    height, width = frame.pixels_dn.shape
+    mosaic = settings.mosaic or frame.mosaic
+    period = mosaic_period(mosaic)
+    rows, columns = _slices(settings.region, (height, width), period)
+    phases = [MosaicPhase((r, c), period, "" if mosaic is None else mosaic[r][c]) for r, c in np.ndindex(*period)]
+    last_dn = float(np.iinfo(frame.pixels_dn.dtype).max)
+    if settings.saturation_dn and settings.saturation_dn > last_dn:
+        raise BadValue(
+            f"saturation_dn = {settings.saturation_dn:g}; the {frame.pixels_dn.dtype} values of {first} end at "
+            f"{last_dn:g}; state the value from which the converter saturates, or leave it out"
+        )
+    saturation_dn = settings.saturation_dn or frame.saturation_dn or last_dn
+    return Readout((width, height), rows, columns, mosaic, saturation_dn, phases)
 
 
-def _parts_of_maps(phases: Sequence[NoiseCalibration]) -> Iterator[tuple[str, list[NDArray[Any]], float]]:
-    """Yield the name of each map, its part of each phase, and the value of pixels that were not calibrated."""
-    yield "mask", [c.maps.unusable for c in phases], True
-    for name, fill in _MAPS.items():
-        parts = [getattr(c.maps, name) for c in phases]
-        if all(part is not None for part in parts):
-            yield name, parts, fill
-    if len(phases) > 1 or phases[0].maps.gain_dn_per_e is not None:
-        gains = [_gain_map(c) for c in phases]
-        for (name, fill), kept in zip(_GAIN_MAPS.items(), zip(*gains, strict=True), strict=True):
-            whole = [part for part in kept if part is not None]
-            if len(whole) == len(phases):
-                yield name, whole, fill
+def _slices(region: Region | None, shape: tuple[int, int], period: tuple[int, int]) -> tuple[slice, slice]:
+    """Return the region as slices of whole periods of the mosaic."""
+    if region is None:
+        return slice(0, shape[0] // period[0] * period[0]), slice(0, shape[1] // period[1] * period[1])
+    spans = {"rows": region.rows, "columns": region.columns}
+    for (key, (first, end)), size, step in zip(spans.items(), shape, period, strict=True):
+        if not 0 <= first < end <= size or first % step or (end - first) % step:
+            raise BadValue(
+                f"region.{key} = [{first}, {end}]; it must lie within 0…{size}, its first below its end, and hold "
+                f"whole periods ({step}) of the mosaic"
+            )
+    return slice(*region.rows), slice(*region.columns)
 
 
-def _gain_map(calibration: NoiseCalibration) -> tuple[NDArray[np.float32] | None, NDArray[np.float32] | None]:
-    """Return the gain of each pixel of a phase, its gain for all where pixels have none of their own; and its error."""
-    maps, gain = calibration.maps, calibration.estimates["gain_dn_per_e"].value
-    if gain is None:
-        return None, None
-    if maps.gain_dn_per_e is not None:
-        return maps.gain_dn_per_e, maps.gain_se_dn_per_e
-    return np.broadcast_to(np.float32(gain), maps.offset_dn.shape), None
+def _check_frame(frame: Frame, path: Path, readout: Readout) -> NDArray[Any]:
+    """Return a frame's pixels; a frame unlike the first is refused."""
+    pixels = frame.pixels_dn
+    width, height = readout.size_px
+    if pixels.shape != (height, width):
+        shape = " x ".join(str(length) for length in pixels.shape[1::-1] + pixels.shape[2:])
+        raise WrongSize(
+            f"{path}: is {shape} px, the other frames {width} x {height} px; record it again with the same region of "
+            "interest and binning, or leave it out"
+        )
+    if not np.issubdtype(pixels.dtype, np.integer):
+        raise WrongBitDepth(
+            f"{path}: holds {pixels.dtype} pixels; noise is measured in whole digital numbers; record raw files"
+        )
+    return pixels
 
 
 def _calibrate_phase(phase: MosaicPhase, saturation_dn: float) -> NoiseCalibration:
@@ -157,28 +187,27 @@ def _calibrate_phase(phase: MosaicPhase, saturation_dn: float) -> NoiseCalibrati
         calibration = calibrate(phase.series, saturation_dn)
     except CalibrationError as failure:
         raise type(failure)(f"{prefix}{failure}") from failure
-    calibration, impossible = _without_impossible_efficiency(calibration)
-    warnings = [*calibration.warnings, *_black_level_warnings(phase, calibration), *impossible]
-    return replace(calibration, warnings=tuple(prefix + warning for warning in warnings))
+    warnings = [*calibration.warnings, *_black_level_warnings(phase, calibration.estimates["offset_dn"])]
+    estimates = calibration.estimates
+    if why := _why_impossible(estimates["quantum_efficiency"]):
+        estimates = estimates | {"quantum_efficiency": Estimate(None, why=why)}
+        warnings.append(why)
+    return replace(calibration, estimates=estimates, warnings=tuple(prefix + warning for warning in warnings))
 
 
-def _without_impossible_efficiency(calibration: NoiseCalibration) -> tuple[NoiseCalibration, list[str]]:
-    """Return a calibration without a quantum efficiency that is certainly above 100 %, and a warning if it was."""
-    efficiency = calibration.estimates["quantum_efficiency"]
+def _why_impossible(efficiency: Estimate) -> str:
+    """Return why a quantum efficiency that is certainly above 100 % cannot be, "" for any other."""
     if efficiency.value is None or efficiency.ci95 is None or efficiency.ci95[0] <= 1.0:
-        return calibration, []
-    why = (
+        return ""
+    return (
         f"the flats hold {efficiency.value:.4g} electrons per stated photon (95 %: {efficiency.ci95[0]:.4g} to "
         f"{efficiency.ci95[1]:.4g}; limit 1): the photons, or the pixel area that they were computed with, are wrong, "
         "or the light is not the one that was measured; correct `photons` (the mean per pixel and exposure)"
     )
-    estimates = {**calibration.estimates, "quantum_efficiency": Estimate(None, why=why)}
-    return replace(calibration, estimates=estimates), [why]
 
 
-def _black_level_warnings(phase: MosaicPhase, calibration: NoiseCalibration) -> list[str]:
+def _black_level_warnings(phase: MosaicPhase, offset: Estimate) -> list[str]:
     """Return a warning where masked pixels and covered ones disagree on the black level."""
-    offset = calibration.estimates["offset_dn"]
     if not phase.black_dn or offset.value is None:
         return []
     black_dn = sum(phase.black_dn) / len(phase.black_dn)
@@ -188,72 +217,3 @@ def _black_level_warnings(phase: MosaicPhase, calibration: NoiseCalibration) -> 
         f"the darks' offset is {offset.value:.1f} DN, the black level stated in the files {black_dn:.1f} DN (at most "
         f"{_BLACK_TOLERANCE_DN:g} DN apart is usual); the lens was not quite covered, or the amplifier glows"
     ]
-
-
-def _phase_record(phase: MosaicPhase, calibration: NoiseCalibration, emva: EmvaMeasurement) -> PhaseRecord:
-    """Return the entry of one phase in noise.json."""
-    return PhaseRecord(
-        phase=phase.phase,
-        colour=phase.colour,
-        likelihood=str(calibration.likelihood),
-        masked_black_dn=float(np.mean(phase.black_dn)) if phase.black_dn else None,
-        fit=fit_record(calibration),
-        emva1288=emva.record(),
-        **_records({name: it for name, it in calibration.estimates.items() if _is_quantity(name)}),
-    )
-
-
-def _interleave(readout: Readout, parts: Sequence[NDArray[Any]], fill: float | bool) -> NDArray[Any]:
-    """Return the phases' arrays interleaved to the size of a frame."""
-    width, height = readout.size_px
-    whole = np.full((height, width), fill, parts[0].dtype)
-    region = whole[readout.rows, readout.columns]
-    for phase, part in zip(readout.phases, parts, strict=True):
-        phase.of(region)[...] = part
-    return whole
-
-
-def _mean(estimates: Sequence[Estimate]) -> Estimate:
-    """Return the mean over phases, or the reason why one of them has no value."""
-    if len(estimates) == 1:
-        return estimates[0]
-    unknown = next((estimate for estimate in estimates if estimate.value is None), None)
-    if unknown is not None:
-        return unknown
-    count = len(estimates)
-    value = sum(estimate.value or 0.0 for estimate in estimates) / count
-    se = float(np.sqrt(sum((estimate.se or 0.0) ** 2 for estimate in estimates))) / count
-    return Estimate(value, se, (value - 1.96 * se, value + 1.96 * se))
-
-
-def _records(estimates: Mapping[str, Estimate]) -> dict[str, Any]:
-    """Return the entries of estimates in noise.json."""
-    return msgspec.convert(estimates, dict[str, Measured], from_attributes=True)
-
-
-def _is_quantity(name: str) -> bool:
-    """Return whether a quantity has a key of its own in noise.json."""
-    return name in Quantities.__struct_fields__
-
-
-def _saturation(phases: Sequence[NoiseCalibration]) -> Measured | float:
-    """Return the value from which a pixel is saturated: of the phase that saturates first."""
-    first = min(phases, key=lambda c: c.saturation_dn)
-    if first.saturation.limit == "full well":
-        return Measured(first.saturation_dn, ci95=first.saturation.interval_dn)
-    return first.saturation_dn
-
-
-def _covariance(calibrations: Sequence[NoiseCalibration]) -> CovarianceRecord:
-    """Return names and matrix; of the phases' mean where there are several."""
-    names = calibrations[0].covariance[0]
-    if any(c.covariance[0] != names for c in calibrations):
-        return CovarianceRecord([], [])
-    matrix = np.sum([c.covariance[1] for c in calibrations], axis=0) / len(calibrations) ** 2
-    return CovarianceRecord(list(names), matrix.tolist())
-
-
-def _input_hashes(folder: Path, settings: NoiseSet) -> dict[str, str]:
-    """Return the SHA-256 of the set's description and of its frames, by name."""
-    described_in = FILE_NAME if (folder / FILE_NAME).is_file() else PLAN
-    return {name: sha256(folder / name) for name in [described_in, *(frame.file for frame in settings.frame)]}

@@ -1,19 +1,19 @@
 """The report by EMVA 1288 of a calibrated sensor: which images it shows, and the quantities that follow."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.calib.noise import Estimate, NoiseCalibration, Series
+from faintfield.calib.estimate import Estimate
+from faintfield.calib.noise import NoiseCalibration, Series
 from faintfield.calib.noise.emva.nonuniformity import Nonuniformity, TemporalNoise, nonuniformity, temporal_noise
 from faintfield.calib.noise.emva.quantities import derived_quantities, gather_inputs
 from faintfield.calib.noise.fit.temperature import dark_current_doubling
 from faintfield.calib.noise.strips import map_of, mean_over
-from faintfield.pipelines.calibration.noise_frames import MosaicPhase
-from faintfield.pipelines.formats.results.noise_fit import EmvaImageRecord, EmvaRecord, Measured
+from faintfield.pipelines.formats.results.noise_fit import EmvaImageRecord, EmvaRecord
 
 # The bright image is the series of the most frames within so much of half of saturation, or else the nearest to it.
 _BRIGHT_SHARE, _BRIGHT_WITHIN = 0.5, 0.1
@@ -85,20 +85,17 @@ class EmvaMeasurement:
         """Return the part of noise.json."""
         return EmvaRecord(
             dark_noise_exposure_s=self.exposure_s,
-            **{
-                name: Measured(estimate.value, estimate.se, estimate.ci95, estimate.why)
-                for name, estimate in self.estimates.items()
-            },
+            **self.estimates,
             dark_image=self.dark.record() if self.dark else None,
             bright_image=self.bright.record() if self.bright else None,
         )
 
 
 def measure_emva(
-    phase: MosaicPhase, calibration: NoiseCalibration, temperature_c: Mapping[str, float]
+    name: str, series: Sequence[Series], calibration: NoiseCalibration, temperature_c: Mapping[str, float]
 ) -> EmvaMeasurement:
     """Return the quantities of EMVA 1288 of one phase; `temperature_c` is that of each frame by its name."""
-    darks = [item for item in phase.series if item.conditions.kind == "dark"]
+    darks = [item for item in series if item.conditions.kind == "dark"]
     exposure_s = _exposure_s(calibration)
     dark, bright = _dark_image(darks, calibration, exposure_s), _bright_image(darks, calibration)
     inputs = gather_inputs(
@@ -110,7 +107,7 @@ def measure_emva(
     estimates = derived_quantities(inputs, exposure_s)
     estimates |= _dsnu(dark, calibration) | _prnu(bright, calibration)
     estimates["dark_current_doubling_k"] = _doubling(darks, temperature_c)
-    return EmvaMeasurement(phase.name, calibration, tuple(phase.series), exposure_s, estimates, dark, bright)
+    return EmvaMeasurement(name, calibration, tuple(series), exposure_s, estimates, dark, bright)
 
 
 def _charge_error(calibration: NoiseCalibration) -> float:

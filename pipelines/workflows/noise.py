@@ -3,8 +3,9 @@
 from pathlib import Path
 
 from faintfield.calib.noise.strips import maps_by
-from faintfield.pipelines.calibration.noise import calibrate_sensor, noise_maps, noise_record
+from faintfield.pipelines.calibration.noise import calibrate_sensor
 from faintfield.pipelines.calibration.noise_comparison import CHANCE, MapChange, NoiseComparison, compare_noise
+from faintfield.pipelines.calibration.noise_record import noise_maps, noise_record
 from faintfield.pipelines.console import inform, working
 from faintfield.pipelines.errors import MissingFile
 from faintfield.pipelines.formats.files import removed_if_empty
@@ -30,19 +31,19 @@ def measure_sensor(folder: Path, out: Path | None = None) -> NoiseRecord:
     """Measure a sensor from the frames in a folder, and write the result with its pages, there if not to `out`."""
     if not folder.exists():
         raise MissingFile(f"{folder}: no such folder; name a folder with {FILE_NAME} and frames")
-    folder, settings = load_noise_set(folder)
-    out = out or folder
+    frames = load_noise_set(folder)
+    out, title = out or frames.folder, frames.folder.resolve().name
     with removed_if_empty(out), maps_by(maps_in_files(out)):
-        sensor = calibrate_sensor(folder, settings)
+        sensor = calibrate_sensor(frames)
         with working("drawing the pages"):
             pages = {
                 f"noise_page{f'_{phase.name}' if phase.name else ''}.png": draw_page(
-                    calibration, f"{folder.resolve().name} {phase.name}"
+                    calibration, f"{title} {phase.name}"
                 )
                 for phase, calibration in zip(sensor.readout.phases, sensor.phases, strict=True)
             }
             record = noise_record(sensor)
-            pages[EMVA_PAGE] = emva_page(folder.resolve().name, record, sensor.emva).encode()
+            pages[EMVA_PAGE] = emva_page(title, record, sensor.emva).encode()
         record = write_noise(out, record, noise_maps(sensor), pages)
     _inform_of(record)
     inform(f"{out / NOISE_FILE}")

@@ -153,7 +153,7 @@ def test_genicam_camera_on_simulated_grbl_stage(tmp_path: Path, monkeypatch: pyt
     # and counts from its first number.
     frame_ids = [int(str(exposure.metadata["frame_id"])) for _, exposure in sorted(sent.items())]
     assert all(after in (before + 1, frame_ids[0]) for before, after in pairwise(frame_ids)), frame_ids
-    _, noise = load_noise_set(session)  # its ramp has no noise that could be measured
+    noise = load_noise_set(session).settings  # its ramp has no noise that could be measured
     assert [(frame.kind, frame.exposure_s) for frame in noise.frame] == [
         *[("dark", exposure_s) for exposure_s in (0.0012, 0.0013) for _ in range(8)],
         *[("flat", exposure_s) for exposure_s in (0.005, 0.009) for _ in range(4)],

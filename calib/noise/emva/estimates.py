@@ -9,9 +9,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import stats
 
+from faintfield.calib.estimate import Estimate, interval, root
 from faintfield.calib.noise.emva.light_estimates import light_estimates, quantum_efficiency, why_noise_denies
 from faintfield.calib.noise.emva.nonuniformity import nonuniformity, temporal_noise
-from faintfield.calib.noise.estimate import Estimate, interval, root
 from faintfield.calib.noise.fit.series_fit import NoiseLikelihood, SeriesFit
 from faintfield.calib.noise.likelihood.gaussian import dark_variances_dn2, main_quantities
 from faintfield.calib.noise.likelihood.maximum import NoiseFit

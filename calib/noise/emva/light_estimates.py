@@ -3,7 +3,7 @@
 import numpy as np
 from scipy import stats
 
-from faintfield.calib.noise.estimate import Estimate, root
+from faintfield.calib.estimate import Estimate, root
 from faintfield.calib.noise.fit.series_fit import SeriesFit
 from faintfield.calib.noise.likelihood.gaussian import flat_variances_dn2, level_variances_dn2
 from faintfield.calib.noise.likelihood.maximum import NoiseFit

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from faintfield.calib.noise.estimate import Estimate, root
+from faintfield.calib.estimate import Estimate, root
 from faintfield.calib.noise.series.statistics import Series
 from faintfield.calib.noise.strips import Array, Mask, map_of, mean_over, over_strips, total_of
 

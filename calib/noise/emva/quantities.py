@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from faintfield.calib.noise.estimate import Estimate, interval
+from faintfield.calib.estimate import Estimate, interval
 from faintfield.calib.noise.likelihood.rounding import ROUNDING_DN2
 from faintfield.calib.noise.strips import Array
 

@@ -7,7 +7,7 @@ import numpy as np
 from scipy import stats
 from scipy.optimize import minimize_scalar
 
-from faintfield.calib.noise.estimate import Estimate, interval
+from faintfield.calib.estimate import Estimate, interval
 from faintfield.calib.noise.likelihood.maximum import NoiseFit
 from faintfield.calib.noise.likelihood.moments import Moments
 from faintfield.calib.noise.series.statistics import Conditions, Series

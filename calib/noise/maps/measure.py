@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.calib.noise.estimate import Estimate
+from faintfield.calib.estimate import Estimate
 from faintfield.calib.noise.fit.series_fit import NoiseLikelihood, SeriesFit
 from faintfield.calib.noise.likelihood.response import charge_dn, charge_slope
 from faintfield.calib.noise.maps.defects import noisy_pixels, telegraph_pixels, variance_ratio

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from faintfield.calib.noise.estimate import Estimate, interval
+from faintfield.calib.estimate import Estimate, interval
 from faintfield.calib.noise.strips import (
     Array,
     Map,

@@ -25,7 +25,7 @@ from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.reading import is_file, read_text
 from faintfield.pipelines.formats.results.noise import NoiseFrame
 from faintfield.pipelines.formats.sets.noise_set import FILE_NAME as NOISE_SET_FILE
-from faintfield.pipelines.formats.sets.noise_set import NoiseSet, group_frames, load_noise_set, write_noise_set
+from faintfield.pipelines.formats.sets.noise_set import NoiseSet, load_noise_set, write_noise_set
 from faintfield.pipelines.formats.toml_files import inside
 
 DESCRIPTOR = "descriptor.txt"
@@ -93,13 +93,13 @@ def export_data(folder: Path, out: Path, *, overwrite: bool = False) -> Exported
     """
     if not folder.exists():
         raise MissingFile(f"{folder}: no such folder; name a noise set or a session")
-    folder, settings = load_noise_set(folder)
-    series = _ordered(folder, settings)
+    noise_set = load_noise_set(folder)
+    settings, series = noise_set.settings, _ordered(noise_set.series)
     first = read_frame(series[0][1][0])
     bits = _bits(settings, first)
     sources = [path for _, paths in series for path in paths]
     replace = DESCRIPTOR if overwrite else None
-    with writing_folder(out, replace_if=replace, reads=[folder, *sources]) as building:
+    with writing_folder(out, replace_if=replace, reads=[noise_set.folder, *sources]) as building:
         (building / "images").mkdir()
         names = {}
         for index, source in enumerate(progress(sources, "writing images")):
@@ -207,16 +207,15 @@ def descriptor_text(images: Sequence[tuple[Conditions, Sequence[str]]], bits: in
     return "\n".join(lines) + "\n"
 
 
-def _ordered(folder: Path, settings: NoiseSet) -> list[tuple[Conditions, list[Path]]]:
+def _ordered(series: dict[Conditions, list[Path]]) -> list[tuple[Conditions, list[Path]]]:
     """Return the series with their frames, flats by their level and then darks, as the standard's data have them."""
-    series = list(group_frames(folder, settings).items())
-    for conditions, paths in series:
+    for conditions, paths in series.items():
         if conditions.kind == "flat" and not conditions.photons:
             raise BadValue(
                 f"{paths[0]}: states no photons, which an EMVA 1288 descriptor gives for every bright image; add "
                 "photons to its entry, or leave it out"
             )
-    return sorted(series, key=lambda item: (item[0].kind != "flat", item[0].level, item[0].exposure_s))
+    return sorted(series.items(), key=lambda item: (item[0].kind != "flat", item[0].level, item[0].exposure_s))
 
 
 def _bits(settings: NoiseSet, first: Frame) -> int:

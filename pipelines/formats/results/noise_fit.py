@@ -4,14 +4,10 @@ from typing import Literal
 
 from msgspec import Struct
 
+from faintfield.calib.estimate import Estimate
 
-class Measured(Struct, frozen=True, omit_defaults=True):
-    """A measured number with its standard error and 95 % interval, or the reason why there is none."""
-
-    value: float | None
-    se: float | None = None
-    ci95: tuple[float, float] | None = None
-    why: str | None = None
+# A number as the file has it: with its standard error and 95 % interval, or the reason why there is none.
+Measured = Estimate
 
 
 class ResponseRecord(Struct, frozen=True):

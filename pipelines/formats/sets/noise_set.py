@@ -1,6 +1,7 @@
 """The noise set: a folder of dark and flat frames with `noise.toml`, or those frames of a session."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -16,7 +17,7 @@ from faintfield.pipelines.formats.reading import is_file
 from faintfield.pipelines.formats.results.noise import NoiseFrame, TemperatureRange
 from faintfield.pipelines.formats.toml_files import inside, read_toml, write_toml
 from faintfield.rig.session.changes import present_settings
-from faintfield.rig.session.session import has_session, taken_frames
+from faintfield.rig.session.session import PLAN, has_session, taken_frames
 
 FILE_NAME = "noise.toml"
 
@@ -53,30 +54,88 @@ class NoiseSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
     dark_current_doubling_k: float | None = None
 
 
-def load_noise_set(folder: Path) -> tuple[Path, NoiseSet]:
-    """Return a noise set and the folder that its file names are relative to: `noise.toml`, or a session's frames.
+@dataclass(frozen=True)
+class FrameSeries:
+    """The frames of a noise set or a session, checked, in series of one kind, exposure, light and temperature.
+
+    Attributes
+    ----------
+    folder : Path
+        Folder that file names are relative to.
+    settings : NoiseSet
+        Names of the frames and what is stated of them.
+    series : dict of Conditions to list of Path
+        Frames by what they have in common, darks first, each kind by exposure.
+    warnings : list of str
+        Problems of the temperatures.
+    described_in : str
+        File that names the frames.
+    """
+
+    folder: Path
+    settings: NoiseSet
+    series: dict[Conditions, list[Path]]
+    warnings: list[str]
+    described_in: str = FILE_NAME
+
+    @property
+    def file_names(self) -> list[str]:
+        """Names of all files that the series follow from."""
+        return [self.described_in, *(frame.file for frame in self.settings.frame)]
+
+    @property
+    def temperature_c(self) -> dict[str, float]:
+        """Temperature of each frame by its path, where it is stated."""
+        frames = self.settings.frame
+        return {str(self.folder / it.file): it.temperature_c for it in frames if it.temperature_c is not None}
+
+    @property
+    def temperature_range(self) -> TemperatureRange | None:
+        """Range of the temperatures, None if none is stated."""
+        known = _known(self.settings)
+        return TemperatureRange(float(np.mean(known)), min(known), max(known)) if known else None
+
+
+def load_noise_set(folder: Path) -> FrameSeries:
+    """Return the series of a noise set, or of a session: `noise.toml` if there is one, else the session's frames.
 
     Raises
     ------
     MissingFile, BadValue
-        The file is missing, is not what it should be, or names a frame that is not there.
+        A file is missing, is not what it should be, or names a frame that is not there or whose exposure is not known.
     """
     if has_session(folder) and not is_file(folder / FILE_NAME):
-        return folder, _of_session(folder)
+        settings, scene_c = _of_session(folder)
+        warnings = [*_temperature_warnings(settings), *_scene_warnings(settings, scene_c)]
+        return FrameSeries(folder, settings, group_frames(folder, settings), warnings, PLAN)
     path = folder if is_file(folder) else folder / FILE_NAME
     settings = read_toml(path, NoiseSet)
-    folder = path.parent
+    _check_settings(path, settings)
+    return FrameSeries(
+        path.parent, settings, group_frames(path.parent, settings), _temperature_warnings(settings), path.name
+    )
+
+
+def _check_settings(path: Path, settings: NoiseSet) -> None:
+    """Refuse settings without frames, files that are missing or named twice, and impossible numbers."""
     if not settings.frame:
         raise BadValue(f"{path}: names no frame; give a [[frame]] with file, kind and exposure_s for each")
     seen: set[Path] = set()
     for index, frame in enumerate(settings.frame):
-        image = inside(folder, frame.file, f"{path}: frame[{index}].file")
+        image = inside(path.parent, frame.file, f"{path}: frame[{index}].file")
         if not is_file(image):
             raise MissingFile(f"{image}: is named by {path} but missing; put it there or remove its entry")
         if image in seen:
             raise BadValue(f"{path}: {frame.file} is named twice; remove one of the entries")
         seen.add(image)
-        _check_numbers(path, frame)
+        for key, value, most in (
+            ("exposure_s", frame.exposure_s, MAX_EXPOSURE_S),
+            ("photons", frame.photons, _MAX_PHOTONS),
+        ):
+            if value is not None and not 0 <= value <= most:
+                raise BadValue(f"{path}: {frame.file}: {key} = {value}; give a number from 0 to {most:g}")
+        if frame.temperature_c is not None and not -273.15 <= frame.temperature_c < 200:
+            raise BadValue(f"{path}: {frame.file}: temperature_c = {frame.temperature_c}; give degrees Celsius")
     doubling_k = settings.dark_current_doubling_k
     if doubling_k is not None and not _MIN_DOUBLING_K <= doubling_k <= _MAX_DOUBLING_K:
         raise BadValue(
@@ -88,28 +147,30 @@ def load_noise_set(folder: Path) -> tuple[Path, NoiseSet]:
         raise BadValue(
             f'{path}: mosaic = {list(mosaic)}; give rows of equal length, at most {MAX_PERIOD_PX}, such as ["RG", "GB"]'
         )
-    return folder, settings
 
 
-def _of_session(folder: Path) -> NoiseSet:
-    """Return the dark and flat frames of a session; each step of flats is a light level."""
-    rig = present_settings(folder)
-    light = [step.photons_per_s for step in rig.step]
-    frames = [
-        NoiseFrame(
+def _of_session(folder: Path) -> tuple[NoiseSet, list[float]]:
+    """Return the dark and flat frames of a session, each step of flats a light level; and temperatures of its scene."""
+    rig, frames, scene_c = present_settings(folder), list[NoiseFrame](), list[float]()
+    for planned, taken, path in taken_frames(folder):
+        temperature_c = taken.record.temperature_c
+        if planned.kind == "dark_scene" and temperature_c is not None:
+            scene_c.append(temperature_c)
+        if planned.kind not in ("dark", "flat"):
+            continue
+        photons_per_s = rig.step[planned.step].photons_per_s
+        frame = NoiseFrame(
             file=str(path.relative_to(folder)),
             kind=planned.kind,
             exposure_s=planned.exposure_s,
-            temperature_c=taken.record.temperature_c,
+            temperature_c=temperature_c,
             level=planned.sweep if planned.kind == "flat" else 0,
-            photons=None if (photons_per_s := light[planned.step]) is None else photons_per_s * planned.exposure_s,
+            photons=None if photons_per_s is None else photons_per_s * planned.exposure_s,
         )
-        for planned, taken, path in taken_frames(folder)
-        if planned.kind in ("dark", "flat")
-    ]
+        frames.append(frame)
     if not frames:
         raise BadValue(f"{folder}: the session has no dark frame yet; capture its dark and flat steps first")
-    return NoiseSet(1, frames, saturation_dn=rig.checks.saturation_dn, mosaic=rig.mosaic)
+    return NoiseSet(1, frames, saturation_dn=rig.checks.saturation_dn, mosaic=rig.mosaic), scene_c
 
 
 def write_noise_set(folder: Path, settings: NoiseSet) -> None:
@@ -140,119 +201,93 @@ def group_frames(folder: Path, settings: NoiseSet) -> dict[Conditions, list[Path
         level, photons = (frame.level, frame.photons) if frame.kind == "flat" else (0, None)
         conditions = Conditions(frame.kind, float(f"{exposure_s:.6g}"), level, photons)
         groups.setdefault(conditions, []).append((path, frame.temperature_c))
-    found = _by_temperature(groups, settings)
-    return dict(sorted(found.items(), key=lambda item: _order(item[0])))
+    series = _by_temperature(groups, settings)
 
+    def order(conditions: Conditions) -> tuple[str, float, int, float]:
+        return conditions.kind, conditions.exposure_s, conditions.level, conditions.temperature_c or 0.0
 
-def _order(conditions: Conditions) -> tuple[str, float, int, float]:
-    """Return what series are sorted by."""
-    return conditions.kind, conditions.exposure_s, conditions.level, conditions.temperature_c or 0.0
+    return {conditions: series[conditions] for conditions in sorted(series, key=order)}
 
 
 def _by_temperature(
     groups: dict[Conditions, list[tuple[Path, float | None]]], settings: NoiseSet
 ) -> dict[Conditions, list[Path]]:
     """Return the series, darks of different temperatures apart, with what their dark current was."""
-    known = [frame.temperature_c for frame in settings.frame if frame.temperature_c is not None]
-    warmth = [
-        frame.temperature_c for frame in settings.frame if frame.kind == "dark" and frame.temperature_c is not None
-    ]
-    several, doubling_k = bool(warmth) and np.ptp(warmth) > _STEADY_K, settings.dark_current_doubling_k
-    found: dict[Conditions, list[Path]] = {}
+    known, of_darks = _known(settings), _known(settings, "dark")
+    several, doubling_k = bool(of_darks) and np.ptp(of_darks) > _STEADY_K, settings.dark_current_doubling_k
+    series: dict[Conditions, list[Path]] = {}
     for conditions, frames in groups.items():
-        for part in _alike(frames) if several and conditions.kind == "dark" else [frames]:
-            of_part, own = [pixels for _, pixels in part if pixels is not None], conditions
-            if of_part and several:
-                own = replace(own, temperature_c=float(np.mean(of_part)))
-            if of_part and doubling_k is not None:
-                factor = dark_factor(float(np.mean(of_part)), float(np.mean(known)), doubling_k)
+        for part in _split_by_temperature(frames) if several and conditions.kind == "dark" else [frames]:
+            stated, own = [temperature_c for _, temperature_c in part if temperature_c is not None], conditions
+            if stated and several:
+                own = replace(own, temperature_c=float(np.mean(stated)))
+            if stated and doubling_k is not None:
+                factor = dark_factor(float(np.mean(stated)), float(np.mean(known)), doubling_k)
                 own = replace(own, dark_factor=factor)
-            found.setdefault(own, []).extend(path for path, _ in part)
-    return found
+            series.setdefault(own, []).extend(path for path, _ in part)
+    return series
 
 
-def _alike(frames: list[tuple[Path, float | None]]) -> list[list[tuple[Path, float | None]]]:
+def _split_by_temperature(frames: list[tuple[Path, float | None]]) -> list[list[tuple[Path, float | None]]]:
     """Return darks of one exposure, those of different temperatures apart, each part in the order of the frames.
 
     A part ends at a gap, or where a slow drift would make its dark current differ. Frames without a temperature are one
     part.
     """
-    known = sorted({frame for _, frame in frames if frame is not None})
-    firsts: list[float] = []
-    for index, warmth in enumerate(known):
-        if index == 0 or warmth - known[index - 1] > _STEADY_K or warmth - firsts[-1] > _NEAR_SCENE_K:
-            firsts.append(warmth)
+    known = sorted({temperature_c for _, temperature_c in frames if temperature_c is not None})
+    firsts = known[:1]
+    for before, after in pairwise(known):
+        if after - before > _STEADY_K or after - firsts[-1] > _NEAR_SCENE_K:
+            firsts.append(after)
     parts: dict[float | None, list[tuple[Path, float | None]]] = {}
-    for path, frame in frames:
-        first = None if frame is None else max(first for first in firsts if first <= frame)
-        parts.setdefault(first, []).append((path, frame))
+    for path, temperature_c in frames:
+        first = None if temperature_c is None else max(first for first in firsts if first <= temperature_c)
+        parts.setdefault(first, []).append((path, temperature_c))
     return list(parts.values())
 
 
-def temperature_notes(settings: NoiseSet) -> tuple[TemperatureRange | None, list[str]]:
-    """Return the range of the frames' temperatures, None without any, and warnings about it."""
+def _known(settings: NoiseSet, *kinds: str) -> list[float]:
+    """Return the temperatures that are stated, of all frames or of some kinds."""
+    frames = (frame for frame in settings.frame if not kinds or frame.kind in kinds)
+    return [frame.temperature_c for frame in frames if frame.temperature_c is not None]
+
+
+def _temperature_warnings(settings: NoiseSet) -> list[str]:
+    """Return warnings about temperatures that are not stated, or not steady."""
     missing = [frame.file for frame in settings.frame if frame.temperature_c is None]
-    known = [frame.temperature_c for frame in settings.frame if frame.temperature_c is not None]
-    warnings = []
+    known, warnings = _known(settings), list[str]()
     if missing:
         warnings.append(
             f"{missing[0]}: no temperature is stated (nor for {len(missing) - 1} others); dark current changes by "
             "10 % per kelvin, so that the result holds only at the temperature of these frames"
         )
-    if not known:
-        return None, warnings
-    if np.ptp(known) > _STEADY_K and settings.dark_current_doubling_k is not None:
-        warnings.append(
-            f"the temperature ran from {min(known):g} to {max(known):g} °C; dark current is taken to double every "
-            f"{settings.dark_current_doubling_k:g} K, and is that at {np.mean(known):.1f} °C"
-        )
-    elif np.ptp(known) > _STEADY_K:
-        warnings.append(
-            f"the temperature ran from {min(known):g} to {max(known):g} °C, which moves the dark current by "
-            f"{10 * np.ptp(known):.0f} %; let the camera settle before recording"
-        )
-    return TemperatureRange(float(np.mean(known)), min(known), max(known)), warnings
+    if known and np.ptp(known) > _STEADY_K:
+        effect, doubling_k = f"{10 * np.ptp(known):.0f} %; let the camera settle", settings.dark_current_doubling_k
+        effect = f", which moves the dark current by {effect} before recording"
+        if doubling_k is not None:
+            effect = f"; dark current is taken to double every {doubling_k:g} K, and is that at {np.mean(known):.1f} °C"
+        warnings.append(f"the temperature ran from {min(known):g} to {max(known):g} °C{effect}")
+    return warnings
 
 
-def scene_temperature_warnings(folder: Path, settings: NoiseSet) -> list[str]:
-    """Return a warning about the darks of a session that are warmer or colder than its dark scene, if there are any.
+def _scene_warnings(settings: NoiseSet, scene_c: list[float]) -> list[str]:
+    """Return a warning about the darks of a session that are warmer or colder than its dark scene.
 
-    Frames whose temperature is not known are passed over, and so are sets that belong to no session.
+    Frames whose temperature is not known are passed over.
     """
-    if not has_session(folder) or is_file(folder / FILE_NAME):
-        return []
-    temperatures = [
-        entry.record.temperature_c for frame, entry, _ in taken_frames(folder) if frame.kind == "dark_scene"
-    ]
-    scene = [found for found in temperatures if found is not None]
-    if not scene:
-        return []
-    scene_c = float(np.median(scene))
-    darks = [
+    away = [
         (frame.file, frame.temperature_c)
         for frame in settings.frame
-        if frame.kind == "dark" and frame.temperature_c is not None
+        if scene_c and frame.kind == "dark" and frame.temperature_c is not None
+        if abs(frame.temperature_c - float(np.median(scene_c))) > _NEAR_SCENE_K
     ]
-    away = [(file, found) for file, found in darks if abs(found - scene_c) > _NEAR_SCENE_K]
     if not away:
         return []
-    low, high = min(found for _, found in away), max(found for _, found in away)
-    names = ", ".join(file for file, _ in away[:_MAX_NAMED]) + (", …" if len(away) > _MAX_NAMED else "")
+    files, temperatures_c = zip(*away, strict=True)
+    names = ", ".join(files[:_MAX_NAMED]) + (", …" if len(files) > _MAX_NAMED else "")
     return [
-        f"{len(away)} of {len(darks)} dark frames are more than {_NEAR_SCENE_K:g} K away from the scene ({names}): "
-        f"they have {low:.1f} to {high:.1f} °C, the {len(scene)} frames of the scene {min(scene):.1f} to "
-        f"{max(scene):.1f} °C; "
+        f"{len(away)} of {len(_known(settings, 'dark'))} dark frames are more than {_NEAR_SCENE_K:g} K away from the "
+        f"scene ({names}): they have {min(temperatures_c):.1f} to {max(temperatures_c):.1f} °C, the {len(scene_c)} "
+        f"frames of the scene {min(scene_c):.1f} to {max(scene_c):.1f} °C; "
         "take them again at the scene's temperature, as camera.settle_temperature_c makes sure of"
     ]
-
-
-def _check_numbers(path: Path, frame: NoiseFrame) -> None:
-    """Refuse impossible exposures, temperatures and photons."""
-    for key, value, most in (
-        ("exposure_s", frame.exposure_s, MAX_EXPOSURE_S),
-        ("photons", frame.photons, _MAX_PHOTONS),
-    ):
-        if value is not None and not 0 <= value <= most:
-            raise BadValue(f"{path}: {frame.file}: {key} = {value}; give a number from 0 to {most:g}")
-    if frame.temperature_c is not None and not -273.15 <= frame.temperature_c < 200:
-        raise BadValue(f"{path}: {frame.file}: temperature_c = {frame.temperature_c}; give degrees Celsius")

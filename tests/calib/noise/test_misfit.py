@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from faintfield.calib.estimate import Estimate
 from faintfield.calib.noise import Conditions, Series, calibrate, measure_series
-from faintfield.calib.noise.estimate import Estimate
 from faintfield.calib.noise.fit.scatter import trend_dn2, without_odd
 from faintfield.calib.noise.fit.temperature import Warmth, settle_temperature, with_doubling_error
 from faintfield.calib.noise.likelihood.maximum import NoiseFit

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from faintfield.calib.estimate import interval, root
 from faintfield.calib.noise import Conditions, calibrate, measure_series
 from faintfield.calib.noise.emva.estimates import _in_electrons, _levels_quantile, _why_no_current, _why_no_gain
-from faintfield.calib.noise.estimate import interval, root
 from faintfield.calib.noise.fit.series_fit import NoiseLikelihood, _shared_noise_dn2, choose_likelihood
 from faintfield.calib.noise.likelihood.marginal import Counts
 from faintfield.calib.noise.likelihood.maximum import NoiseFit

@@ -157,7 +157,7 @@ def test_masked_pixels_unlike_darks_raise_warning(tmp_path: Path, monkeypatch: p
         level = np.array([[100.0, 100.0], [100.0, 140.0]])
         return Frame(tifffile.imread(path), ("RG", "GB"), level, 4095.0, 1.0)
 
-    monkeypatch.setattr("faintfield.pipelines.calibration.noise_frames.read_frame", raw_frame)
+    monkeypatch.setattr("faintfield.pipelines.calibration.noise.read_frame", raw_frame)
     folder, out = write_frames(tmp_path / "set", take_set(*specimen(16), frames=2)), tmp_path / "out"
     result = measure_sensor(folder, out)
     assert {path.name for path in out.iterdir()} >= {"noise.json", "noise_maps.npz", "emva1288_report.html"}

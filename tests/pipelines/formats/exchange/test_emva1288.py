@@ -15,7 +15,7 @@ from faintfield.pipelines.formats.exchange.emva1288 import read_descriptor
 from faintfield.pipelines.formats.files import sha256
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.results.noise_fit import Measured
-from faintfield.pipelines.formats.sets.noise_set import group_frames, load_noise_set
+from faintfield.pipelines.formats.sets.noise_set import load_noise_set
 from tests.calib.noise.darkroom import expose, specimen
 from tests.pipelines.noise_sets import measure_sensor, take_set, write_frames
 
@@ -55,8 +55,9 @@ def test_reference_data_become_a_noise_set(tmp_path: Path) -> None:
     (tmp_path / "data" / "images" / "d_0.png").rename(tmp_path / "data" / "d_1.png")
     descriptor.write_text(DESCRIPTOR.replace("images\\d_0.png", "d_1.png"))
     assert import_emva1288(descriptor, tmp_path / "set").frames == 8
-    folder, settings = load_noise_set(tmp_path / "set")
-    assert folder == tmp_path / "set"
+    noise_set = load_noise_set(tmp_path / "set")
+    settings = noise_set.settings
+    assert noise_set.folder == tmp_path / "set"
     assert settings.saturation_dn == 4095
     flats = [(frame.exposure_s, frame.level, frame.photons) for frame in settings.frame if frame.kind == "flat"]
     assert flats == [(0.1, 0, 1000.0)] * 2 + [(0.2, 1, 6000.0)] * 2
@@ -100,10 +101,10 @@ def test_exported_region_is_imported_again(tmp_path: Path) -> None:
     assert (result.frames, result.bits, result.size_px) == (8, 12, (28, 16))
     import_emva1288(tmp_path / "out" / "descriptor.txt", tmp_path / "again")
     before, after = load_noise_set(source), load_noise_set(tmp_path / "again")
-    assert before[1].saturation_dn == after[1].saturation_dn
-    series, copies = group_frames(*before), group_frames(*after)
-    assert list(series) == list(copies)
-    for kind, paths in series.items():
+    assert before.settings.saturation_dn == after.settings.saturation_dn
+    copies = after.series
+    assert list(before.series) == list(copies)
+    for kind, paths in before.series.items():
         for path, copy in zip(paths, copies[kind], strict=True):
             np.testing.assert_array_equal(read_frame(path).pixels_dn[4:20, 2:30], read_frame(copy).pixels_dn)
 

@@ -1,8 +1,7 @@
 """A measured value with its standard error and interval, or the reason why there is none."""
 
-from dataclasses import dataclass
-
 import numpy as np
+from msgspec import Struct
 
 _NO_SPREAD = "the values are not much likelier with a spread, so that none was fitted; record more darks"
 
@@ -13,18 +12,15 @@ _HIDDEN_SIGMA = 3.2
 _MAX_EXPONENT = 50.0
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """A measured value, or the reason why there is none.
+class Estimate(Struct, frozen=True, omit_defaults=True):
+    """A measured value with its standard error and 95 % confidence interval, or the reason why there is none.
 
     Attributes
     ----------
     value : float, optional
         None if the frames do not determine it.
-    se : float, optional
-        Standard error.
-    ci95 : tuple of float, optional
-        95 % confidence interval.
+    se, ci95 : float, tuple of float, optional
+        Standard error and interval.
     why : str, optional
         Why there is no value, and what to record to get one.
     """

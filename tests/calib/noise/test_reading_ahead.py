@@ -2,7 +2,7 @@
 
 import pytest
 
-from faintfield.pipelines.calibration.reading_ahead import read_ahead
+from faintfield.calib.noise.strips import read_ahead
 
 
 def test_items_come_in_order_and_few_wait() -> None:

@@ -1,0 +1,170 @@
+"""A calibrated sensor as its files have it: the record `noise.json`, and the maps of `noise_maps.npz`."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import msgspec
+import numpy as np
+from msgspec import UNSET
+from numpy.typing import NDArray
+
+from faintfield.calib.estimate import Estimate
+from faintfield.calib.noise import NoiseCalibration
+from faintfield.calib.noise.misfit import SeriesGoodness
+from faintfield.calib.noise.strips import release
+from faintfield.pipelines.calibration.noise import Readout, SensorCalibration
+from faintfield.pipelines.formats.files import sha256
+from faintfield.pipelines.formats.provenance import provenance
+from faintfield.pipelines.formats.results.noise import CovarianceRecord, NoiseRecord, PhaseRecord, Quantities
+from faintfield.pipelines.formats.results.noise_fit import FitRecord, GoodnessRecord, ResponseRecord, SaturationRecord
+
+# Maps by their name in the file, with the fill for pixels that were not calibrated; these are masked anyway.
+_MAPS = {
+    "offset_dn": 0.0,
+    "offset_variance_dn2": 0.0,
+    "dark_current_e_per_s": 0.0,
+    "dark_current_variance_e2_per_s2": 0.0,
+    "read_noise_e": 1.0,
+    "read_noise_se_e": 0.0,
+    "relative_response": 1.0,
+    "relative_response_se": 0.0,
+    "vignetting": 1.0,
+}
+_GAIN_MAPS = {"gain_dn_per_e": 1.0, "gain_se_dn_per_e": 0.0}
+
+
+def noise_record(sensor: SensorCalibration) -> NoiseRecord:
+    """Return the record of a calibration, without the hash of its maps."""
+    frames, readout, phases = sensor.frames, sensor.readout, sensor.phases
+    bad_pixels: dict[str, Any] = {
+        f"{kind}_pixels": np.argwhere(_interleave(readout, [getattr(c, kind) for c in phases], fill=False)).tolist()
+        for kind in ("hot", "noisy", "dead")
+    }
+    warnings = [*frames.warnings, *(warning for calibration in phases for warning in calibration.warnings)]
+    means: dict[str, Any] = {name: _mean([c.estimates[name] for c in phases]) for name in _quantities(phases[0])}
+    first = min(phases, key=lambda c: c.saturation_dn)  # the phase that saturates first
+    full_well = first.saturation.limit == "full well"
+    return NoiseRecord(
+        **means,
+        covariance=_covariance(phases),
+        likelihood=" / ".join(dict.fromkeys(str(c.likelihood) for c in phases)),
+        saturation_dn=Estimate(first.saturation_dn, ci95=first.saturation.interval_dn)
+        if full_well
+        else first.saturation_dn,
+        size_px=readout.size_px,
+        mosaic=readout.mosaic or UNSET,
+        planes=_phase_records(sensor) if readout.mosaic else UNSET,
+        **bad_pixels,
+        temperature_c=frames.temperature_range,
+        frames=frames.settings.frame,
+        warnings=list(dict.fromkeys(warnings)),
+        provenance=provenance("noise", {}, {name: sha256(frames.folder / name) for name in frames.file_names}),
+        fit=UNSET if readout.mosaic else _fit_record(phases[0]),
+        emva1288=UNSET if readout.mosaic else sensor.emva[0].record(),
+    )
+
+
+def _phase_records(sensor: SensorCalibration) -> list[PhaseRecord]:
+    return [
+        PhaseRecord(
+            phase=phase.phase,
+            colour=phase.colour,
+            likelihood=str(calibration.likelihood),
+            masked_black_dn=float(np.mean(phase.black_dn)) if phase.black_dn else None,
+            fit=_fit_record(calibration),
+            emva1288=emva.record(),
+            **_quantities(calibration),
+        )
+        for phase, calibration, emva in zip(sensor.readout.phases, sensor.phases, sensor.emva, strict=True)
+    ]
+
+
+def _quantities(calibration: NoiseCalibration) -> dict[str, Any]:
+    """Return the estimates that have a key of their own in noise.json."""
+    return {name: it for name, it in calibration.estimates.items() if name in Quantities.__struct_fields__}
+
+
+def _mean(estimates: Sequence[Estimate]) -> Estimate:
+    """Return the mean over phases, or the reason why one of them has no value."""
+    if len(estimates) == 1:
+        return estimates[0]
+    unknown = next((estimate for estimate in estimates if estimate.value is None), None)
+    if unknown is not None:
+        return unknown
+    count = len(estimates)
+    value = sum(estimate.value or 0.0 for estimate in estimates) / count
+    se = float(np.sqrt(sum((estimate.se or 0.0) ** 2 for estimate in estimates))) / count
+    return Estimate(value, se, (value - 1.96 * se, value + 1.96 * se))
+
+
+def _covariance(phases: Sequence[NoiseCalibration]) -> CovarianceRecord:
+    """Return names and matrix; of the phases' mean where there are several."""
+    names = phases[0].covariance[0]
+    if any(c.covariance[0] != names for c in phases):
+        return CovarianceRecord([], [])
+    matrix = np.sum([c.covariance[1] for c in phases], axis=0) / len(phases) ** 2
+    return CovarianceRecord(list(names), matrix.tolist())
+
+
+def _fit_record(calibration: NoiseCalibration) -> FitRecord:
+    """Return the record of saturation, response and scatter of one phase."""
+    estimates, saturation, response = calibration.estimates, calibration.saturation, calibration.response
+    bends = None
+    if response is not None:
+        bends = ResponseRecord([float(bend) for bend in response.bends_per_dn], float(response.up_to_dn))
+    names = ("saturation_e", "linearity_error", "noise_error", "drift_dn", "light_error", "lamp_flicker")
+    unused = (SeriesGoodness(series, why) for series, why in saturation.left_out)
+    return FitRecord(
+        saturation=msgspec.convert(saturation, SaturationRecord, from_attributes=True),
+        response=bends,
+        series=[_goodness_record(goodness) for goodness in (*calibration.goodness, *unused)],
+        telegraph_pixels=int(calibration.telegraph.sum()),
+        maps_absent=calibration.maps.absent,
+        **{name: estimates[name] for name in names},
+    )
+
+
+def _goodness_record(goodness: SeriesGoodness) -> GoodnessRecord:
+    numbers = {name: getattr(goodness, name) for name in GoodnessRecord.__struct_fields__[4:]}
+    conditions = goodness.series.conditions
+    return GoodnessRecord(conditions.kind, conditions.exposure_s, conditions.level, goodness.series.frames, **numbers)
+
+
+def noise_maps(sensor: SensorCalibration) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Yield name and array of the maps of `noise_maps.npz` (row, column): float32, but the bool `mask`."""
+    for name, parts, fill in _parts_of_maps(sensor.phases):
+        yield name, _interleave(sensor.readout, parts, fill)
+        release()
+
+
+def _parts_of_maps(phases: Sequence[NoiseCalibration]) -> Iterator[tuple[str, list[NDArray[Any]], float]]:
+    """Yield the name of each map, its part of each phase, and the value of pixels that were not calibrated."""
+    yield "mask", [c.maps.unusable for c in phases], True
+    for name, fill in _MAPS.items():
+        parts = [getattr(c.maps, name) for c in phases]
+        if all(part is not None for part in parts):
+            yield name, parts, fill
+    if len(phases) > 1 or phases[0].maps.gain_dn_per_e is not None:
+        gains = [_gain_map(c) for c in phases]
+        for (name, fill), kept in zip(_GAIN_MAPS.items(), zip(*gains, strict=True), strict=True):
+            whole = [part for part in kept if part is not None]
+            if len(whole) == len(phases):
+                yield name, whole, fill
+
+
+def _gain_map(calibration: NoiseCalibration) -> tuple[NDArray[np.float32] | None, NDArray[np.float32] | None]:
+    """Return the gain of each pixel of a phase, its gain for all where pixels have none of their own; and its error."""
+    maps, gain = calibration.maps, calibration.estimates["gain_dn_per_e"].value
+    if gain is None or maps.gain_dn_per_e is not None:
+        return maps.gain_dn_per_e, maps.gain_se_dn_per_e
+    return np.broadcast_to(np.float32(gain), maps.offset_dn.shape), None
+
+
+def _interleave(readout: Readout, parts: Sequence[NDArray[Any]], fill: float | bool) -> NDArray[Any]:
+    """Return the phases' arrays interleaved to the size of a frame."""
+    width, height = readout.size_px
+    whole = np.full((height, width), fill, parts[0].dtype)
+    region = whole[readout.rows, readout.columns]
+    for phase, part in zip(readout.phases, parts, strict=True):
+        phase.of(region)[...] = part
+    return whole
