@@ -11,7 +11,7 @@ from faintfield.pipelines.errors import OutputExists
 from faintfield.pipelines.planning.options import PlanOptions
 
 if TYPE_CHECKING:
-    from faintfield.pipelines.formats.results.prediction import PredictionRecord
+    from faintfield.pipelines.planning.prediction import PredictionRecord
     from faintfield.pipelines.workflows.board import BoardSheets
     from faintfield.pipelines.workflows.capture import Captured
     from faintfield.pipelines.workflows.check import RigCheck

@@ -1,4 +1,4 @@
-"""Knowledge of a rig before a capture: its sensor, its lens, and how fast it is."""
+"""Knowledge of a rig before a capture: its sensor, its lens, the light of the scene, and how fast it is."""
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -9,10 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.noise_model import NoiseModel
+from faintfield.pipelines.errors import BadValue, WrongUsage
+from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.reading import is_file, is_folder
 from faintfield.pipelines.formats.results.geometry import CameraPoses, read_geometry
-from faintfield.pipelines.formats.results.noise import NOISE_MAPS, NoiseRecord, read_maps, read_noise
+from faintfield.pipelines.formats.results.noise import (
+    NOISE_MAPS,
+    NoiseRecord,
+    read_fitted_noise,
+    read_maps,
+    read_noise,
+)
 from faintfield.pipelines.formats.results.noise_fit import Measured
+from faintfield.pipelines.planning.options import PlanOptions
 from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import RigError
@@ -24,6 +33,15 @@ from faintfield.rig.stages.protocol import MotionLimits
 # The response of a view is that of the pixels this near to where it sees a sample.
 _NEAR_PX = 4
 
+# Two-sided 95 % of the normal distribution.
+_Z95 = 1.96
+
+# Largest part of saturated pixels whose light is still that of the others.
+_MAX_SATURATED = 0.01
+
+# The middle of a flat reaches to either side by the frame's larger side over this.
+_MIDDLE_DIVISOR = 20
+
 _NOT_MEASURED = "no noise calibration; give the result of `faintfield noise` as --noise, or --read-noise-e"
 
 # Its objects take a while to draw.
@@ -32,17 +50,7 @@ _simulated_experiment = lru_cache(maxsize=1)(lab_experiment)
 
 @dataclass(frozen=True)
 class Sensor:
-    """Knowledge of the noise.
-
-    Attributes
-    ----------
-    source : str
-        Its source, in words.
-    record, path : NoiseRecord and Path, optional
-        The calibration that it is from, and its file.
-    model : NoiseModel, optional
-        Noise model of a simulated camera.
-    """
+    """Numbers of a sensor's noise, their `source` in words, and the calibration or the simulated camera's model."""
 
     source: str
     read_noise_e: Measured
@@ -55,15 +63,7 @@ class Sensor:
 
 
 def known_sensor(settings: RigSettings, noise: Path | None, **options: float | None) -> Sensor:
-    """Return what is known of the sensor: `options`, else measured (`noise`, a noise.json), else simulated.
-
-    `options` are named as attributes of `Sensor`.
-
-    Raises
-    ------
-    MissingFile, BadValue
-        noise.json cannot be read.
-    """
+    """Return the sensor by `options`, named as attributes of `Sensor`, else measured (`noise`), else simulated."""
     if noise is not None:
         sensor = _measured_sensor(noise)
     elif isinstance(settings.camera, SimulatedSettings):
@@ -96,19 +96,7 @@ def _simulated_sensor(settings: SimulatedSettings) -> Sensor:
 
 @dataclass(frozen=True)
 class KnownLens:
-    """Knowledge of the lens.
-
-    Attributes
-    ----------
-    f_px : Measured
-        Focal length in pixels.
-    size_px : (int, int), optional
-        Width and height of a frame.
-    centre_px : (float, float), optional
-        Point where the axis meets the detector.
-    response : array (row, column), optional
-        Relative response, vignetting included.
-    """
+    """Focal length, width and height of a frame, the point where the axis meets it, and the relative response."""
 
     f_px: Measured
     size_px: tuple[int, int] | None
@@ -118,14 +106,8 @@ class KnownLens:
     def responses(self, centres_mm: NDArray[np.float64], depth_mm: float | None) -> NDArray[np.float64]:
         """Return the response of each view (view,) where it sees the middle of the reference view; 0 if it does not.
 
+        `centres_mm` (view, 2) are the cameras relative to the reference camera, right and down.
         Without a depth, a lens or a response all views see it, or see it equally well.
-
-        Parameters
-        ----------
-        centres_mm : array (view, 2)
-            Positions of the cameras relative to the reference camera, right and down.
-        depth_mm : float, optional
-            Depth of the plane.
         """
         responses = np.ones(len(centres_mm))
         if depth_mm is None or self.f_px.value is None or self.size_px is None or self.centre_px is None:
@@ -145,13 +127,7 @@ def _mean_around(response: NDArray[np.floating], column: int, row: int) -> float
 
 
 def known_lens(settings: RigSettings, sensor: Sensor, geometry: Path | None, fx_px: float | None) -> KnownLens:
-    """Return what is known of the lens: stated, else measured (`geometry`, a geometry.json), else simulated.
-
-    Raises
-    ------
-    MissingFile, BadValue
-        geometry.json or the maps beside noise.json cannot be read.
-    """
+    """Return the lens as stated (`fx_px`), else measured (`geometry`, a geometry.json), else simulated."""
     camera = settings.camera
     simulated = _simulated_experiment(camera).optics if isinstance(camera, SimulatedSettings) else None
     size_px = sensor.record.size_px if sensor.record is not None else None
@@ -171,6 +147,113 @@ def known_lens(settings: RigSettings, sensor: Sensor, geometry: Path | None, fx_
     elif simulated is not None:
         response = simulated.relative_illumination()
     return KnownLens(f_px, size_px, centre_px, response)
+
+
+@dataclass(frozen=True)
+class Light:
+    """Light of the scene in electrons per pixel and second, and where it is from."""
+
+    e_per_s: Measured
+    source: str
+
+
+def planned_light(options: PlanOptions, exposure_s: float, sensor: Sensor) -> Light:
+    """Return the light of the scene: as stated, in a frame of `exposure_s` or per second, or measured in a frame.
+
+    Raises WrongUsage if not exactly one of these is given, BadValue if the frame shows no light to be measured.
+    """
+    per_frame_e, per_s, path = options.light_e, options.light_e_per_s, options.flat or options.test_frame
+    count = sum(value is not None for value in (per_frame_e, per_s, options.flat, options.test_frame))
+    if count != 1:
+        raise WrongUsage(
+            f"{count} lights are given, and one is wanted; give --light-e, --light-e-per-s, --flat or --test-frame"
+        )
+    if path is not None:
+        return _light_of_frame(path, options, sensor)
+    if (options.frame_exposure_ms, options.region_px) != (None, None):
+        raise WrongUsage("--frame-exposure-ms and --region-px are those of a frame; give --test-frame or --flat")
+    return Light(Measured(per_s if per_frame_e is None else per_frame_e / exposure_s), "as stated")
+
+
+def _light_of_frame(path: Path, options: PlanOptions, sensor: Sensor) -> Light:
+    """Return the light of a frame, with its interval: by the noise of its pixels, and by that of the calibration."""
+    frame = read_frame(path)
+    stated_ms = options.frame_exposure_ms
+    exposure_s = frame.exposure_s if stated_ms is None else 1e-3 * stated_ms
+    if exposure_s is None:
+        raise BadValue(f"{path}: states no exposure time; give --frame-exposure-ms")
+    if frame.pixels_dn.ndim != 2:
+        raise BadValue(f"{path}: is a colour picture; give a grey or raw frame as the sensor counts it")
+    height, width = frame.pixels_dn.shape
+    if sensor.model is not None:
+        model, unusable = sensor.model, np.zeros((height, width), bool)
+    elif sensor.path is not None:
+        fitted = read_fitted_noise(sensor.path, (width, height))
+        model, unusable = fitted.model, fitted.unusable
+    else:
+        raise BadValue(
+            f"{path}: its DN tell no electrons, as there is no noise calibration; give the result of `faintfield "
+            "noise` as --noise, or the light as --light-e"
+        )
+    where = _region(path, options, width, height)
+    usable = ~unusable[where]
+    saturated = model.saturated(frame.pixels_dn)[where] & usable
+    if not usable.any() or saturated.sum() > _MAX_SATURATED * usable.sum():
+        raise BadValue(
+            f"{path}: {saturated.sum()} of {usable.sum()} usable pixels are saturated, at most "
+            f"{_MAX_SATURATED:.0%} may be; expose it for less than {1e3 * exposure_s:g} ms"
+        )
+    usable &= ~saturated
+    count = int(usable.sum())
+    dark_e = np.broadcast_to(model.background_e(exposure_s), frame.pixels_dn.shape)[where][usable]
+    electrons = model.electrons(frame.pixels_dn)[where][usable]
+    light_e = float(np.mean(electrons, dtype=np.float64) - np.mean(dark_e))
+    known_e2 = float(np.mean(dark_e) + np.mean(model.read_variance_e2()))
+    variance_e2 = (max(light_e, 0.0) + known_e2) / count + _variance_of_calibration(sensor, light_e, exposure_s)
+    margin_e = _Z95 * variance_e2**0.5
+    low_e, high_e = light_e - margin_e, light_e + margin_e
+    if low_e <= 0:
+        raise BadValue(
+            f"{path}: shows {light_e:.3g} e⁻ per pixel (95 %: {low_e:.3g} to {high_e:.3g}), which may be none; "
+            f"expose it for longer than {1e3 * exposure_s:g} ms"
+        )
+    part = "its middle" if options.flat is not None and options.region_px is None else f"{count} pixels"
+    exact = "" if sensor.record is not None else ", the sensor's numbers taken as exact"
+    source = f"{path.name}, {1e3 * exposure_s:g} ms, mean of {part}{exact}"
+    ends = low_e / exposure_s, high_e / exposure_s
+    return Light(Measured(light_e / exposure_s, margin_e / _Z95 / exposure_s, ends), source)
+
+
+def _region(path: Path, options: PlanOptions, width: int, height: int) -> tuple[slice, slice]:
+    if options.region_px is not None:
+        left, upper, wide, high = options.region_px
+        if min(left, upper) < 0 or min(wide, high) < 1 or left + wide > width or upper + high > height:
+            raise BadValue(
+                f"{path}: --region-px {left} {upper} {wide} {high} is not within its {width} x {height} px; give left "
+                "column, upper row, width and height"
+            )
+        return slice(upper, upper + high), slice(left, left + wide)
+    if options.flat is None:
+        return slice(None), slice(None)
+    near = max(width, height) // _MIDDLE_DIVISOR + 1
+    row, column = height // 2, width // 2
+    return slice(max(row - near, 0), row + near), slice(max(column - near, 0), column + near)
+
+
+def _variance_of_calibration(sensor: Sensor, light_e: float, exposure_s: float) -> float:
+    """Return the variance in e⁻² of a mean `(dn − offset)/gain − D t` by its calibration, with the frame's jitter."""
+    record, gain = sensor.record, sensor.gain_dn_per_e.value
+    if record is None or gain is None:
+        return 0.0
+    charge_e = light_e + (record.dark_current_e_per_s.value or 0.0) * exposure_s
+    slopes = {"offset_dn": -1 / gain, "gain_dn_per_e": -charge_e / gain, "dark_current_e_per_s": -exposure_s}
+    jitter_e = (record.frame_jitter_dn.value or 0.0) / gain
+    names = record.covariance.names
+    if slopes.keys() <= {*names}:
+        slope = np.array([slopes.get(name, 0.0) for name in names])
+        return float(slope @ np.array(record.covariance.matrix) @ slope) + jitter_e**2
+    errors = [slope * (getattr(record, name).se or 0.0) for name, slope in slopes.items()]
+    return float(np.square(errors).sum()) + jitter_e**2
 
 
 @dataclass(frozen=True)

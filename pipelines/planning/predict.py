@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -14,14 +14,9 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.errors import WrongUsage
 from faintfield.pipelines.formats.results.noise_fit import Measured
-from faintfield.pipelines.formats.results.prediction import (
-    Alternative,
-    DepthPrediction,
-    FeaturePrediction,
-    PredictionRecord,
-)
-from faintfield.pipelines.planning.known import KnownLens, KnownPace, Sensor
-from faintfield.pipelines.planning.light import Light
+from faintfield.pipelines.planning.known import KnownLens, KnownPace, Light, Sensor
+from faintfield.pipelines.planning.options import PlanOptions
+from faintfield.pipelines.planning.prediction import Alternative, DepthPrediction, FeaturePrediction, PredictionRecord
 from faintfield.recon.metrics import expected_snr_from_powers
 from faintfield.recon.prediction import (
     depth_resolution_mm,
@@ -52,34 +47,6 @@ class View(NamedTuple):
     frames: int
 
 
-@dataclass(frozen=True)
-class Question:
-    """Request for a prediction.
-
-    Attributes
-    ----------
-    depths_mm, sides_px : sequence of float
-        Depths of planes, none if not known, and sides of features.
-    blur_px : float, optional
-        Standard deviation of the lens's blur.
-    rose_k : float
-        Standard deviations by which a visible feature stands out.
-    exposures_s, grids, frames : sequence
-        Exposure times, rows and columns, and frames at a node of the table; those of the rig.toml if empty.
-    sigma_e : float, optional
-        Largest σ of a sample that is wanted, in electrons of a frame of the rig.toml.
-    """
-
-    depths_mm: Sequence[float]
-    sides_px: Sequence[float]
-    blur_px: float | None
-    rose_k: float
-    exposures_s: Sequence[float]
-    grids: Sequence[tuple[int, int]]
-    frames: Sequence[int]
-    sigma_e: float | None
-
-
 def parse_grids(texts: Sequence[str]) -> list[tuple[int, int]]:
     """Return rows and columns of texts such as 5x7."""
     grids = []
@@ -91,20 +58,14 @@ def parse_grids(texts: Sequence[str]) -> list[tuple[int, int]]:
     return grids
 
 
-def scene_view(settings: RigSettings, exposures_s: Sequence[float]) -> tuple[float, View]:
-    """Return the exposure of one frame of the dark scene, and the view that the frames of a node add up to.
-
-    Raises
-    ------
-    WrongUsage
-        The rig.toml has no dark scene, and no exposure is asked for.
-    """
+def scene_view(settings: RigSettings, options: PlanOptions) -> tuple[float, View]:
+    """Return the exposure of one frame of the dark scene, and the view that the frames of a node add up to."""
     frames_s = [
         exposure_s
         for step in settings.steps()
         if step.kind == "dark_scene"
         for exposure_s in step.exposure_s * step.frames_per_node
-    ] or exposures_s[:1]
+    ] or [1e-3 * exposure_ms for exposure_ms in (options.exposures_ms or [])[:1]]
     if not frames_s:
         raise WrongUsage("the rig.toml has no dark_scene step; add one, or give --exposures-ms")
     return frames_s[0], View(sum(frames_s), len(frames_s))
@@ -112,14 +73,23 @@ def scene_view(settings: RigSettings, exposures_s: Sequence[float]) -> tuple[flo
 
 @dataclass(frozen=True)
 class Predictor:
-    """Prediction from what is known of the rig and the scene; for the pace, a reason if it is not known."""
+    """Prediction from what is known of the rig and the scene; for the pace, a reason if it is not known.
+
+    `exposure_s` is that of one frame of the dark scene, `view` all frames of a node. `depths_mm` is empty if no depth
+    is known, `grids` if only the rig's own is asked for.
+    """
 
     settings: RigSettings
+    options: PlanOptions
     sensor: Sensor
     lens: KnownLens
     pace: KnownPace | str
     light: Light
-    question: Question
+    exposure_s: float
+    view: View
+    depths_mm: Sequence[float]
+    sides_px: Sequence[float]
+    grids: Sequence[tuple[int, int]]
 
     @cached_property
     def pixel_share(self) -> float:
@@ -128,11 +98,11 @@ class Predictor:
         filters = "".join(self.settings.mosaic or measured or "X")
         return min(filters.count(letter) for letter in filters) / len(filters)
 
-    def record(self, rig: str, exposure_s: float, view: View) -> PredictionRecord:
-        """Return the whole prediction; `exposure_s` is that of a frame, `view` all frames of a node."""
-        grid, question = self.settings.grid, self.question
-        rows = self._alternatives(exposure_s, view)
-        reaching = [row for row in rows if _reaches(row, question.sigma_e)]
+    def record(self, rig: str) -> PredictionRecord:
+        """Return the whole prediction."""
+        grid, view, exposure_s, sigma_e = self.settings.grid, self.view, self.exposure_s, self.options.sigma_e
+        rows = self._alternatives()
+        reaching = [row for row in rows if _reaches(row, sigma_e)]
         return PredictionRecord(
             rig=rig,
             rows=grid.rows,
@@ -153,11 +123,11 @@ class Predictor:
             snr=self._snr(view),
             snr_linear=_finite(self._from_light(view, _snr_linear)),
             vignetting=None if self.lens.response is not None else "no flats in the noise calibration",
-            rose_k=question.rose_k,
-            depths=[self._depth(view, grid, depth_mm) for depth_mm in question.depths_mm or (None,)],
-            time_s=self._duration(grid, None, None)[0],
+            rose_k=self.options.rose_k,
+            depths=[self._depth(depth_mm) for depth_mm in self.depths_mm or (None,)],
+            time_s=self._duration(grid, {})[0],
             alternatives=rows,
-            wanted_sigma_e=question.sigma_e,
+            wanted_sigma_e=sigma_e,
             cheapest=min(reaching, key=lambda row: row.time_s.value or 0.0, default=None),
         )
 
@@ -174,13 +144,15 @@ class Predictor:
         return _with(of_view, self.light.e_per_s, self.sensor.read_noise_e, self.sensor.dark_current_e_per_s)
 
     def _snr(self, view: View) -> Measured:
+        pass
         return _finite(self._from_light(view, _snr_by_powers))
 
-    def _depth(self, view: View, grid: Grid, depth_mm: float | None) -> DepthPrediction:
+    def _depth(self, depth_mm: float | None) -> DepthPrediction:
+        grid = self.settings.grid
         centres_mm, response = self._views(grid, depth_mm)
         depth = Measured(depth_mm) if depth_mm is not None else Measured(None, why=_NO_DEPTH)
         scale = _with(lambda z, f: z / f, depth, self.lens.f_px)
-        blur = Measured(self.question.blur_px, why=_NO_BLUR if self.question.blur_px is None else None)
+        blur = Measured(self.options.blur_px, why=_NO_BLUR if self.options.blur_px is None else None)
         aperture_mm = grid.pitch_mm * (max(grid.rows, grid.columns) - 1)
         step = Measured(None, why="one node has no aperture")
         if aperture_mm > 0:
@@ -189,17 +161,15 @@ class Predictor:
             depth_mm=depth_mm,
             views=int(np.count_nonzero(response)),
             seen_by_all_mm=self._seen_by_all_mm(grid, scale.value),
-            sigma_e=self._sigma(view, response),
+            sigma_e=self._sigma(self.view, response),
             mm_per_px=scale,
             blur_mm=_with(lambda blur, mm: blur * mm, blur, scale),
             depth_step_mm=step,
-            features=[self._feature(view, centres_mm, response, side_px, depth) for side_px in self.question.sides_px],
+            features=[self._feature(centres_mm, response, side_px, depth) for side_px in self.sides_px],
         )
 
-    def _feature(
-        self, view: View, centres_mm: Array, response: Array, side_px: float, depth: Measured
-    ) -> FeaturePrediction:
-        contrast = self._contrast(view, response, side_px)
+    def _feature(self, centres_mm: Array, response: Array, side_px: float, depth: Measured) -> FeaturePrediction:
+        contrast = self._contrast(self.view, response, side_px)
         unknown = next((quantity for quantity in (depth, self.lens.f_px) if quantity.value is None), None)
         if unknown is None and len(np.unique(centres_mm[response > 0], axis=0)) < 2:
             unknown = Measured(None, why="one view tells no depth")
@@ -207,19 +177,18 @@ class Predictor:
             unknown = Measured(None, why="even a black square is not visible")
 
         def depth_sigma(light_e: float, information: Array) -> float:
-            black = {"side_px": side_px, "difference_e": light_e, "blur_px": self.question.blur_px or 0.0}
+            black = {"side_px": side_px, "difference_e": light_e, "blur_px": self.options.blur_px or 0.0}
             return depth_sigma_mm(depth.value or 0.0, self.lens.f_px.value or 0.0, centres_mm, information, **black)
 
         return FeaturePrediction(
             side_px=side_px,
             side_mm=_with(lambda z, f: side_px * (z / f), depth, self.lens.f_px),
             smallest_contrast=contrast,
-            depth_sigma_mm=unknown or self._from_information(view, response, depth_sigma),
+            depth_sigma_mm=unknown or self._from_information(self.view, response, depth_sigma),
         )
 
     def _contrast(self, view: View, response: Array, side_px: float) -> Measured:
-        """Return the contrast from which a square is visible."""
-        k, blur_px = self.question.rose_k, self.question.blur_px or 0.0
+        k, blur_px = self.options.rose_k, self.options.blur_px or 0.0
 
         def contrast(light_e: float, information: Array) -> float:
             return smallest_contrast(side_px, light_e, float(information.sum()), k=k, blur_px=blur_px)
@@ -251,7 +220,6 @@ class Predictor:
         return centres_mm, self.lens.responses(centres_mm, depth_mm)
 
     def _seen_by_all_mm(self, grid: Grid, mm_per_px: float | None) -> tuple[float, float] | None:
-        """Return width and height of the part of a plane that all views see."""
         if mm_per_px is None or self.lens.size_px is None:
             return None
         width, height = self.lens.size_px
@@ -259,17 +227,17 @@ class Predictor:
         high = height * mm_per_px - (grid.rows - 1) * grid.pitch_mm
         return max(wide, 0.0), max(high, 0.0)
 
-    def _alternatives(self, exposure_s: float, view: View) -> list[Alternative]:
-        question, grid = self.question, self.settings.grid
-        exposures_s = question.exposures_s or (exposure_s,)
-        grids = question.grids or ((grid.rows, grid.columns),)
-        alike = math.isclose(view.exposure_s, view.frames * exposure_s)
-        frames = question.frames or (view.frames if alike else 1,)
+    def _alternatives(self) -> list[Alternative]:
+        options, grid, view = self.options, self.settings.grid, self.view
+        exposures_s = [1e-3 * exposure_ms for exposure_ms in options.exposures_ms or ()] or (self.exposure_s,)
+        grids = self.grids or ((grid.rows, grid.columns),)
+        alike = math.isclose(view.exposure_s, view.frames * self.exposure_s)
+        frames = options.frames or (view.frames if alike else 1,)
         if (count := len(exposures_s) * len(grids) * len(frames)) > _MAX_ROWS:
             raise WrongUsage(f"the table has {count} rows, at most {_MAX_ROWS}; give fewer exposures, grids or frames")
-        return [self._alternative(*row, exposure_s) for row in product(grids, exposures_s, frames)]
+        return [self._alternative(*row) for row in product(grids, exposures_s, frames)]
 
-    def _alternative(self, shape: tuple[int, int], exposure_s: float, frames: int, reference_s: float) -> Alternative:
+    def _alternative(self, shape: tuple[int, int], exposure_s: float, frames: int) -> Alternative:
         if not 0 < exposure_s <= MAX_EXPOSURE_S:
             raise WrongUsage(
                 f"--exposures-ms {1e3 * exposure_s:g}: an exposure lasts {1e3 * MAX_EXPOSURE_S:g} ms at most; give "
@@ -278,11 +246,11 @@ class Predictor:
         try:
             check_frame_count(shape[0] * shape[1] * frames)
             grid = _about_the_centre(self.settings.grid, shape)
-            total_s, scene_s, why_not = self._duration(grid, exposure_s, frames)
+            total_s, scene_s, why_not = self._duration(grid, {"exposure_s": (exposure_s,), "frames_per_node": frames})
         except ValueError as failure:
             raise WrongUsage(str(failure)) from failure
         view = View(frames * exposure_s, frames)
-        responses = [self._views(grid, depth_mm)[1] for depth_mm in self.question.depths_mm or (None,)]
+        responses = [self._views(grid, depth_mm)[1] for depth_mm in self.depths_mm or (None,)]
         fewest = min(responses, key=lambda response: float(np.square(response).sum()))
         return Alternative(
             exposure_s=exposure_s,
@@ -290,22 +258,16 @@ class Predictor:
             columns=shape[1],
             frames_per_node=frames,
             snr=self._snr(view),
-            sigma_e=self._sigma(view, fewest, reference_s),
-            smallest_contrast=self._contrast(view, fewest, self.question.sides_px[0]),
+            sigma_e=self._sigma(view, fewest, self.exposure_s),
+            smallest_contrast=self._contrast(view, fewest, self.sides_px[0]),
             scene_s=scene_s,
             time_s=total_s,
             why_not=why_not,
         )
 
-    def _duration(
-        self, grid: Grid, exposure_s: float | None, frames: int | None
-    ) -> tuple[Measured, Measured, str | None]:
-        """Return the duration of the session and of its dark scene, and why it cannot be done.
-
-        Exposure and frames at a node are those of the dark scene; by default those of the rig.toml.
-        """
+    def _duration(self, grid: Grid, changes: dict[str, Any]) -> tuple[Measured, Measured, str | None]:
+        """Return the duration of the session and of its dark scene with `changes`, and why it cannot be done."""
         settings, pace = self.settings, self.pace
-        changes = {"exposure_s": (exposure_s,), "frames_per_node": frames} if exposure_s is not None else {}
         steps = [
             # The noise reference must be exposed like the dark scene
             msgspec.structs.replace(step, **changes) if step.kind in ("dark_scene", "noise_reference") else step
@@ -342,17 +304,14 @@ def _reaches(row: Alternative, sigma_e: float | None) -> bool:
 
 
 def _snr_by_powers(light_e: float, dark_e: float, noise_e: float) -> float:
-    """Return eq. (4) of a view of a uniform object."""
     return math.inf if dark_e == noise_e == 0 else expected_snr_from_powers(np.array([light_e]), dark_e, noise_e)
 
 
 def _snr_linear(light_e: float, _: float, noise_e: float) -> float:
-    """Return eq. (7) of a view of a uniform object."""
     return light_e / noise_e**2 if noise_e > 0 else math.inf
 
 
 def _finite(snr: Measured) -> Measured:
-    """Return an SNR, unknown if there is no noise to compare with."""
     return Measured(None, why="there is no noise to compare with") if snr.value == math.inf else snr
 
 

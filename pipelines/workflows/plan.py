@@ -7,13 +7,11 @@ from faintfield.pipelines.errors import WrongUsage
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE
 from faintfield.pipelines.formats.results.noise import NOISE_FILE
 from faintfield.pipelines.formats.results.noise_fit import Measured
-from faintfield.pipelines.formats.results.prediction import PredictionRecord
 from faintfield.pipelines.formats.rig_file import read_rig
-from faintfield.pipelines.planning.known import calibration_file, known_lens, known_pace, known_sensor
-from faintfield.pipelines.planning.light import planned_light
+from faintfield.pipelines.planning.known import calibration_file, known_lens, known_pace, known_sensor, planned_light
 from faintfield.pipelines.planning.options import PlanOptions
-from faintfield.pipelines.planning.predict import Predictor, Question, parse_grids, scene_view
-from faintfield.pipelines.planning.printing import print_prediction
+from faintfield.pipelines.planning.predict import Predictor, parse_grids, scene_view
+from faintfield.pipelines.planning.prediction import PredictionRecord, print_prediction
 
 
 def predict_capture(rig: Path, options: PlanOptions) -> PredictionRecord:
@@ -27,23 +25,14 @@ def predict_capture(rig: Path, options: PlanOptions) -> PredictionRecord:
         quantum_efficiency=options.quantum_efficiency,
     )
     lens = known_lens(settings, sensor, calibration_file(options.geometry, GEOMETRY_FILE, rig.parent), options.fx_px)
-    exposures_s = [1e-3 * exposure_ms for exposure_ms in options.exposures_ms or []]
-    exposure_s, view = scene_view(settings, exposures_s)
+    exposure_s, view = scene_view(settings, options)
     depths_mm = options.depth_mm or settings.scene.depth_mm
-    sides_px = [*(options.feature_px or []), *_in_px(options.feature_mm or [], depths_mm, lens.f_px)]
-    question = Question(
-        depths_mm,
-        sides_px or [10.0],
-        options.blur_px,
-        options.rose_k,
-        exposures_s,
-        parse_grids(options.grids or []),
-        options.frames or [],
-        options.sigma_e,
-    )
+    sides_px = [*(options.feature_px or []), *_in_px(options.feature_mm or [], depths_mm, lens.f_px)] or [10.0]
+    grids = parse_grids(options.grids or [])
     light = planned_light(options, exposure_s, sensor)
-    predictor = Predictor(settings, sensor, lens, known_pace(settings), light, question)
-    record = predictor.record(str(rig), exposure_s, view)
+    pace = known_pace(settings)
+    predictor = Predictor(settings, options, sensor, lens, pace, light, exposure_s, view, depths_mm, sides_px, grids)
+    record = predictor.record(str(rig))
     print_prediction(record)
     return record
 

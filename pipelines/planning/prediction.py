@@ -1,10 +1,14 @@
-"""A prediction in words, as `faintfield plan` prints it."""
+"""The record of what a capture will show, as `faintfield plan --json` prints it, and its text for people.
+
+A number that is not known says why; an interval is that of the light, if this was estimated from a frame.
+"""
 
 import math
 
+from msgspec import Struct
+
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.results.noise_fit import Measured
-from faintfield.pipelines.formats.results.prediction import Alternative, DepthPrediction, PredictionRecord
 from faintfield.rig.capture.guide import format_duration
 
 # Heads and widths of the table's columns.
@@ -12,6 +16,91 @@ _COLUMNS = (
     *(("exposure", 10), ("grid", 9), ("frames", 6), ("SNR", 8), ("sigma", 8), ("contrast", 8)),
     *(("scene", 9), ("session", 9)),
 )
+
+
+class FeaturePrediction(Struct, frozen=True, kw_only=True):
+    """A square of a size: the contrast from which it is visible, and how sure the depth of a black one is.
+
+    Contrast is the difference of its light to that of its surroundings over the latter; a black square has 1.
+    """
+
+    side_px: float
+    side_mm: Measured
+    smallest_contrast: Measured
+    depth_sigma_mm: Measured
+
+
+class DepthPrediction(Struct, frozen=True, kw_only=True):
+    """A plane at a depth, in the middle of the reference view; where all views see a sample if no depth is known.
+
+    `sigma_e` is the standard deviation of a sample, as wide as a pixel, of the unpenalised estimate, in electrons of
+    all frames of a view. `depth_step_mm` is the change of depth that moves a point by a pixel between the outermost
+    views, and `blur_mm` the standard deviation of the lens's blur on the plane.
+    """
+
+    depth_mm: float | None
+    views: int
+    seen_by_all_mm: tuple[float, float] | None
+    sigma_e: Measured
+    mm_per_px: Measured
+    blur_mm: Measured
+    depth_step_mm: Measured
+    features: list[FeaturePrediction]
+
+
+class Alternative(Struct, frozen=True, kw_only=True):
+    """One row of the table: another exposure, grid or number of frames, at the depth that the fewest views see.
+
+    `snr` is that of one elemental image by eq. (4), all its frames added up. `sigma_e` is in electrons of one frame of
+    the record's `exposure_s`, so that rows can be compared. `scene_s` and `time_s` are the durations of the dark scene
+    and of the whole session, without prompts. `why_not` says why the rig cannot do this.
+    """
+
+    exposure_s: float
+    rows: int
+    columns: int
+    frames_per_node: int
+    snr: Measured
+    sigma_e: Measured
+    smallest_contrast: Measured
+    scene_s: Measured
+    time_s: Measured
+    why_not: str | None = None
+
+
+class PredictionRecord(Struct, frozen=True, kw_only=True):
+    """Prediction of what a capture will show.
+
+    `exposure_s` is that of the first frame of the dark scene at a node, in which `light_e` and `photons` are expected,
+    and `total_exposure_s` that of all its frames. `snr` and `snr_linear` are those of an elemental image of a uniform
+    object, by eq. (4) and eq. (7). `pixel_share` is the part of the pixels that have the scarcest colour. `rose_k` is
+    by how many standard deviations a visible square stands out. `cheapest` is the shortest session that reaches
+    `wanted_sigma_e`. `vignetting` says why it is not known.
+    """
+
+    rig: str
+    rows: int
+    columns: int
+    pitch_mm: float
+    exposure_s: float
+    total_exposure_s: float
+    frames_per_node: int
+    noise_from: str
+    read_noise_e: Measured
+    dark_current_e_per_s: Measured
+    light_from: str
+    light_e: Measured
+    photons: Measured
+    pixel_share: float
+    snr: Measured
+    snr_linear: Measured
+    vignetting: str | None
+    rose_k: float
+    depths: list[DepthPrediction]
+    time_s: Measured
+    alternatives: list[Alternative]
+    wanted_sigma_e: float | None = None
+    cheapest: Alternative | None = None
 
 
 def print_prediction(record: PredictionRecord) -> None:
