@@ -12,15 +12,7 @@ _SCALE_BAR_MM = 100.0
 
 
 def board_pdf(boards: Sequence[Board], size_mm: tuple[float, float]) -> bytes:
-    """Return a PDF with a page per board.
-
-    Parameters
-    ----------
-    boards : sequence of Board
-        Each fits between the margins, above the foot.
-    size_mm : (float, float)
-        Width and height of a page.
-    """
+    """Return a PDF with a page of a width and height per board, which fits between its margins above the foot."""
     return _document([_page(board, *size_mm) for board in boards], size_mm)
 
 

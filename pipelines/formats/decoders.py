@@ -53,21 +53,9 @@ logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
 
 def decode_tiff(file: BufferedReader, path: Path, accept: Accept, number: int | None = None) -> NDArray[Any]:
-    """Return the picture of a TIFF; compressions for which tifffile needs extra packages are decoded by OpenCV.
+    """Return the picture of a TIFF, or that of a number in a stack; as any other function here, raise any exception.
 
-    Parameters
-    ----------
-    file, path
-        The file, and its name for messages.
-    accept : callable
-        Raises if the picture is too large.
-    number : int, optional
-        Which picture of a stack; without it the file must hold one.
-
-    Raises
-    ------
-    Exception
-        Of any type, when the file is damaged, or `accept` refuses its size.
+    Compressions for which tifffile needs extra packages are decoded by OpenCV.
     """
     with tifffile.TiffFile(file, name="frame", **_NO_SPECIAL_KIND) as tiff:
         page = tiff.pages.first if number is None else tiff.pages[number]
@@ -86,13 +74,7 @@ def decode_tiff(file: BufferedReader, path: Path, accept: Accept, number: int | 
 
 
 def count_pages(file: BufferedReader) -> int:
-    """Return how many pictures of the first one's size and type a TIFF holds from its beginning, at most 100 000.
-
-    Raises
-    ------
-    Exception
-        Of any type, when the file is damaged.
-    """
+    """Return how many pictures of the first one's size and type a TIFF holds from its beginning, at most 100 000."""
     with tifffile.TiffFile(file, name="frame", **_NO_SPECIAL_KIND) as tiff:
         first, count = tiff.pages.first, 1
         while count < _MAX_PAGES:
@@ -112,13 +94,7 @@ def count_pages(file: BufferedReader) -> int:
 
 
 def decode_photo(file: BufferedReader, accept: Accept) -> NDArray[Any]:
-    """Return the picture of a PNG or JPEG, (row, column) or (row, column, RGB), with its own depth and orientation.
-
-    Raises
-    ------
-    Exception
-        Of any type, when the file is damaged, or `accept` refuses its size.
-    """
+    """Return the picture of a PNG or JPEG, (row, column) or (row, column, RGB), with its own depth and orientation."""
     mark = next((mark for mark in _END_MARKS if file.peek(8).startswith(mark)), None)
     if mark is None:
         raise ValueError("not an image, or truncated")
@@ -162,7 +138,6 @@ def _require_honest_strips(page: tifffile.TiffPage, file: BufferedReader) -> Non
 
 
 def _png_size(file: BufferedReader) -> tuple[int, int, int]:
-    """Return width, height and bytes per pixel that the header of a PNG states."""
     width, height, depth, colour_type = struct.unpack(">16x2I2B", file.read(26))
     return width, height, _PNG_CHANNELS.get(colour_type, 4) * (2 if depth > 8 else 1)
 
@@ -185,7 +160,7 @@ def _jpeg_size(file: BufferedReader) -> tuple[int, int, int]:
 
 
 def decode_with_opencv(content: bytes) -> NDArray[Any]:
-    """Return the picture of a file's content, decoded by OpenCV."""
+    """Return the picture of a file's content, in the order red, green, blue."""
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the failure below says it in one line
     pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None:
@@ -194,7 +169,6 @@ def decode_with_opencv(content: bytes) -> NDArray[Any]:
 
 
 def _page_with_opencv(content: bytes, number: int) -> NDArray[Any]:
-    """Return one picture of a stack, decoded by OpenCV."""
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     buffer = np.frombuffer(content, np.uint8)
     done, pages = cv2.imdecodemulti(buffer, cv2.IMREAD_UNCHANGED, None, (number, number + 1))
@@ -204,7 +178,6 @@ def _page_with_opencv(content: bytes, number: int) -> NDArray[Any]:
 
 
 def _in_rgb(pixels: NDArray[Any]) -> NDArray[Any]:
-    """Return a picture of OpenCV, whose colours are blue, green, red, in our order."""
     if pixels.ndim == 3 and pixels.shape[2] >= 3:
         pixels = np.asarray(cv2.cvtColor(pixels[:, :, :3], cv2.COLOR_BGR2RGB))
     return pixels

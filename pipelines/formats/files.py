@@ -42,11 +42,7 @@ def writing(path: Path) -> Iterator[BinaryIO]:
     """Open a file for writing that appears at `path` whole or not at all.
 
     The bytes go to a temporary file in the same folder, which is flushed to the disk and then renamed in one step.
-
-    Raises
-    ------
-    DiskFull, CannotWrite
-        The file cannot be written. The temporary file is removed, and an earlier file at `path` is unchanged.
+    If it cannot be written (DiskFull, CannotWrite), it is removed, and an earlier file at `path` is unchanged.
     """
     with translated_write_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -65,7 +61,7 @@ def writing(path: Path) -> Iterator[BinaryIO]:
 
 
 def write_whole(path: Path, content: bytes | str) -> None:
-    """Write `content` to `path`, whole or not at all."""
+    """Write bytes, or text in UTF-8, whole or not at all."""
     with writing(path) as file:
         file.write(content.encode() if isinstance(content, str) else content)
 
@@ -86,21 +82,8 @@ def writing_folder(
 ) -> Iterator[Path]:
     """Yield a temporary folder, which becomes `out` when the block ends without an exception.
 
-    Parameters
-    ----------
-    out : Path
-        The final folder. It may exist if it is empty.
-    replace_if : str, optional
-        A file that marks a folder made earlier by the same command: such a folder is replaced.
-    replace_only : collection of str
-        Patterns: an earlier folder is replaced if every name in it matches one. For folders without a marking file.
-    reads : paths
-        Files and folders that the block reads, which must not be replaced.
-
-    Raises
-    ------
-    OutputExists
-        `out` holds something else, or something that is read.
+    An earlier `out` is replaced if it is empty, holds the file `replace_if`, or only names that match the patterns
+    `replace_only`; OutputExists if it holds something else, or a path of `reads`.
     """
     with translated_write_errors(out):
         out = out.resolve()
@@ -169,15 +152,8 @@ def removed_if_empty(folder: Path) -> Iterator[None]:
 def exclusive(folder: Path) -> Iterator[None]:
     """Lock a folder of results while the block runs, and first remove what a killed process left unfinished there.
 
-    The folder is created if missing, and removed if it stays empty.
+    The folder is created if missing, and removed if it stays empty; OutputBusy if another command is writing there.
     On a file system without locks, such as some network disks, nothing keeps a second command out.
-
-    Raises
-    ------
-    OutputBusy
-        Another command is writing there.
-    DiskFull, CannotWrite
-        The folder cannot be created, opened or locked.
     """
     with translated_write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -220,13 +196,7 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def require_room(path: Path, needed_bytes: int) -> None:
-    """Refuse to begin work whose results would not fit on the disk of `path`.
-
-    Raises
-    ------
-    DiskFull
-        Fewer than `needed_bytes` are free.
-    """
+    """Refuse to begin work whose results would not fit on the disk of `path` (DiskFull)."""
     free = _free_bytes(path)
     if free < needed_bytes:
         raise DiskFull(
@@ -242,7 +212,6 @@ def sha256(path: Path) -> str:
 
 @contextmanager
 def _naming_unreadable(path: Path) -> Iterator[None]:
-    """Turn the system's read errors into MissingFile with the path."""
     try:
         yield
     except OSError as failure:
@@ -264,7 +233,6 @@ def translated_write_errors(path: Path) -> Iterator[None]:
 
 
 def _free_bytes(path: Path) -> int:
-    """Return the free bytes on the disk where `path` is or would be."""
     existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
     return shutil.disk_usage(existing).free
 
@@ -283,7 +251,6 @@ class _Known(msgspec.Struct, frozen=True):
     sha256: str
 
     def is_of(self, state: os.stat_result) -> bool:
-        """Return whether the file is as it was."""
         then = (self.size, self.mtime_ns, self.ctime_ns, self.inode)
         return then == (state.st_size, state.st_mtime_ns, state.st_ctime_ns, state.st_ino)
 
@@ -291,10 +258,7 @@ class _Known(msgspec.Struct, frozen=True):
 class Hashes:
     """SHA-256 of the files of a folder, each computed again only if its size, inode or times of change differ.
 
-    Parameters
-    ----------
-    folder : Path
-        The folder; the hashes are stored in a hidden file in it, which may be removed at any time.
+    They are stored in a hidden file in the folder, which may be removed at any time.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -324,10 +288,7 @@ class Hashes:
         return digest
 
     def save(self) -> None:
-        """Store the hashes, except of files that had changed just before.
-
-        If the folder cannot be written to, nothing is stored, which costs time only.
-        """
+        """Store the hashes, except of files that had changed just before; in a folder that cannot be written, none."""
         if self._changed:
             with suppress(CannotWrite):
                 write_json(self._folder / CACHE_FILE, self._known)

@@ -50,12 +50,8 @@ def at_phase(pixels: NDArray[Any], phase: tuple[int, int], period: tuple[int, in
 class Lattice:
     """The detector pixels of one phase of a mosaic; all pixels without colour filters.
 
-    Attributes
-    ----------
-    first, step : (int, int)
-        Row and column of its first pixel, and the distance to its next.
-    shape : (int, int)
-        Rows and columns; an incomplete period at the far edges is left out.
+    `first` is row and column of its first pixel, `step` the distance to its next, and `shape` counts its rows and
+    columns; an incomplete period at the far edges is left out.
     """
 
     first: tuple[int, int]
@@ -69,21 +65,11 @@ class Lattice:
 
 @dataclass(frozen=True)
 class Frame:
-    """One exposure.
+    """One exposure, (row, column) or (row, column, RGB).
 
-    Attributes
-    ----------
-    pixels_dn : array
-        (row, column), or (row, column, colour) in the order red, green, blue.
-    mosaic : tuple of str, optional
-        Rows of the smallest period of the colour filter array, such as ("RG", "GB"); None without filters.
-    black_dn : array, optional
-        Black level of each phase of the mosaic (row, column of the period), from the sensor's masked pixels if it has
-        any, else as the camera states it; None if the file states none.
-    saturation_dn : float, optional
-        The white level that the camera states; None if the file states none.
-    exposure_s : float, optional
-        From EXIF; None if it is missing or zero.
+    `mosaic` has the rows of the smallest period of the colour filters, such as ("RG", "GB"). `black_dn` is the black
+    level of each phase, from the sensor's masked pixels if it has any, else as the camera states it. What a file does
+    not state is None.
     """
 
     pixels_dn: NDArray[Any]
@@ -115,10 +101,8 @@ def read_frame(
 
     Raises
     ------
-    MissingFile
-        There is no such file, or it cannot be opened.
-    WrongSize
-        The file does not have the size that is expected.
+    MissingFile, WrongSize
+        The file cannot be opened, or does not have the size that is expected.
     UnknownFormat
         Files of this kind cannot be decoded here; so does a raw file whose beginning is damaged.
     UnreadableImage
@@ -163,13 +147,7 @@ def read_frame(
 
 
 def pages_in(path: Path) -> int:
-    """Return how many pictures of one size and type a file holds, one after the other; 1 for all files but TIFF.
-
-    Raises
-    ------
-    MissingFile, UnreadableImage
-        The file cannot be opened, or is damaged.
-    """
+    """Return how many pictures of one size and type a file holds, one after the other; 1 for all files but TIFF."""
     if path.suffix.lower() not in TIFF_SUFFIXES:
         return 1
     with opened(path) as file:
@@ -180,7 +158,6 @@ def pages_in(path: Path) -> int:
 
 
 def _require_sane_size(path: Path, width: int, height: int, size_bytes: int) -> None:
-    """Refuse a picture without pixels, and one that is larger than any camera takes."""
     if not min(width, height) > 0:
         raise UnreadableImage(_cannot_decode(path, "no pixels"))
     if max(width, height) > MAX_SIDE_PX or width * height > MAX_PIXELS or size_bytes > MAX_FRAME_BYTES:
@@ -191,7 +168,6 @@ def _require_sane_size(path: Path, width: int, height: int, size_bytes: int) -> 
 
 
 def _decoded(file: BufferedReader, path: Path, suffix: str, accept: Accept, page: int | None) -> Frame:
-    """Return the frame in a file; decoders raise exceptions of any type."""
     if suffix in RAW_SUFFIXES:
         return _read_raw(file, path, accept)
     saturation_dn = None
@@ -208,7 +184,6 @@ def _decoded(file: BufferedReader, path: Path, suffix: str, accept: Accept, page
 
 
 def _read_raw(file: BufferedReader, path: Path, accept: Accept) -> Frame:
-    """Read the mosaic of a raw file, and its black level from the masked pixels."""
     import rawpy  # slow to load, and only raw files need it
 
     if (size := path.stat().st_size) > MAX_FRAME_BYTES:
@@ -272,6 +247,5 @@ def exif_exposure_s(path: Path) -> float | None:
 
 
 def _cannot_decode(path: Path, reason: str) -> str:
-    """Return the message for a file that cannot be decoded."""
     reason = " ".join(reason.split())
     return f"{path}: cannot be decoded ({reason}; {path.stat().st_size} bytes); take or copy the image again"

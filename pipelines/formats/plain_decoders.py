@@ -39,13 +39,6 @@ def decode_netpbm(file: BufferedReader, path: Path, accept: Accept) -> tuple[NDA
     """Return the picture of a binary PGM, PPM or PFM file, and the value of white that it states.
 
     Whole numbers have 8 bits, or 16 if white is above 255; float ones are as they stand in the file, top row first.
-
-    Raises
-    ------
-    UnknownFormat
-        The file is a bitmap of black and white, or holds its numbers as text.
-    Exception
-        Of any type, when the file is damaged, or `accept` refuses its size.
     """
     header = _NETPBM.match(file.read(_MAX_HEADER_BYTES))
     if header is None:
@@ -73,13 +66,7 @@ def decode_netpbm(file: BufferedReader, path: Path, accept: Accept) -> tuple[NDA
 
 
 def decode_bmp(file: BufferedReader, accept: Accept) -> NDArray[Any]:
-    """Return the picture of an uncompressed BMP, (row, column) or (row, column, RGB), of 8 bits.
-
-    Raises
-    ------
-    Exception
-        Of any type, when the file is damaged or compressed, or `accept` refuses its size.
-    """
+    """Return the picture of an uncompressed BMP, (row, column) or (row, column, RGB), of 8 bits."""
     head = file.read(34)
     if len(head) < 34 or not head.startswith(b"BM"):
         raise ValueError("not a BMP file, or truncated")
@@ -101,15 +88,7 @@ def decode_bmp(file: BufferedReader, accept: Accept) -> NDArray[Any]:
 
 
 def decode_exr(file: BufferedReader, path: Path, accept: Accept) -> NDArray[Any]:
-    """Return the picture of an OpenEXR file, of float values linear in light.
-
-    Raises
-    ------
-    UnknownFormat
-        The installed OpenCV was built without OpenEXR.
-    Exception
-        Of any type, when the file is damaged, or `accept` refuses its size.
-    """
+    """Return the picture of an OpenEXR file, of float values linear in light; UnknownFormat if OpenCV reads none."""
     width, height = _exr_size(file.read(_MAX_EXR_HEADER_BYTES))
     accept(width, height, 16 * width * height)
     if re.search(r"OpenEXR:\s+NO\b", cv2.getBuildInformation()):

@@ -22,14 +22,8 @@ type _Pose6 = tuple[float, float, float, float, float, float]
 class TiltedPlane:
     """A plane of any pose; as a `Place` it takes the position of a depth.
 
-    Attributes
-    ----------
-    name : str
-        Part of the names of its files.
-    rt_ref_plane : tuple of 6 floats
-        Rodrigues rad and mm, from plane to reference.
-    size_mm : (float, float), optional
-        Width and height around its origin; the part that the reference view sees if None.
+    `name` is part of the names of its files. `rt_ref_plane` is Rodrigues rad and mm, from plane to reference. `size_mm`
+    is width and height around its origin; the part that the reference view sees if None.
     """
 
     name: str
@@ -84,11 +78,6 @@ def read_plane_poses(paths: Sequence[Path]) -> list[TiltedPlane]:
 
     Each `[[plane]]` has a `name` and either `rt_ref_plane` (Rodrigues rad and mm, from plane to reference) or
     `point_mm` and `normal` in the reference frame; `size_mm` is optional.
-
-    Raises
-    ------
-    MissingFile, UnknownKey, BadValue
-        A file is not of this format, or two planes share a name.
     """
     planes: dict[str, TiltedPlane] = {}
     for path in paths:
@@ -103,7 +92,6 @@ def read_plane_poses(paths: Sequence[Path]) -> list[TiltedPlane]:
 
 
 def _plane(path: Path, pose: _Pose) -> TiltedPlane:
-    """Check one plane and return it."""
     where = f"{path}: plane '{pose.name}'"
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9-]{0,39}", pose.name):
         raise BadValue(f"{where}: is no name for files; take a letter and then letters, digits or hyphens, 40 at most")

@@ -16,21 +16,7 @@ _PACKAGES = ("faintfield", "numpy", "scipy", "numba", "opencv-contrib-python-hea
 
 
 class Provenance[Options](msgspec.Struct, frozen=True, kw_only=True):
-    """Provenance of a result: the last keys of its JSON file.
-
-    Attributes
-    ----------
-    units : StatedUnits, optional
-        The units of a result that is made of an elemental set.
-    command : str
-        The name of the command.
-    options : mapping or msgspec.Struct
-        Its options as they took effect.
-    inputs : dict
-        SHA-256 by file name.
-    versions : dict
-        Of Python and the packages that compute results.
-    """
+    """Provenance of a result, the last keys of its JSON: inputs by SHA-256, options as they took effect, versions."""
 
     units: StatedUnits | UnsetType = UNSET
     command: str
@@ -52,7 +38,7 @@ def provenance[Options](
 
 @cache  # finding them takes 10 ms
 def versions() -> dict[str, str]:
-    """Return the versions of the packages that compute results, by name; one that is not installed is left out."""
+    """Return the versions of Python and the packages that compute results; one that is not installed is left out."""
     found = {"python": platform.python_version()}
     for name in _PACKAGES:
         with suppress(PackageNotFoundError):  # mrcal is installed apart
@@ -61,19 +47,9 @@ def versions() -> dict[str, str]:
 
 
 def first_difference[Options](content: bytes, now: Provenance[Options]) -> str | None:
-    """Return in words the first difference between the provenance of a result and what it would be now, None if equal.
+    """Return in words how the provenance in a result's JSON differs from what it would be now, None if it does not.
 
-    Parameters
-    ----------
-    content : bytes
-        The result's JSON file; its provenance is under a key of its own, or among its other keys.
-    now : Provenance
-        Of the same result, were it made now.
-
-    Raises
-    ------
-    msgspec.MsgspecError, UnicodeDecodeError, RecursionError
-        The file is damaged.
+    The provenance is under a key of its own, or among the other keys. Raises one of `JSON_FAILURES` on a damaged file.
     """
     record = record_of(content, dict[str, object])
     written = msgspec.convert(record.get("provenance") or record, Provenance[dict[str, object]])

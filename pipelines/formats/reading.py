@@ -33,13 +33,7 @@ _OVERHEAD_BYTES = 1_000_000
 
 
 def is_file(path: Path) -> bool:
-    """Return whether there is a regular file; False for names that no file can have.
-
-    Raises
-    ------
-    MissingFile
-        The system does not tell: a right or a disk is lacking.
-    """
+    """Return whether there is a regular file; False for names that no file can have, MissingFile if it is not known."""
     return _is_there(path, Path.is_file)
 
 
@@ -61,13 +55,7 @@ def _is_there(path: Path, test: Callable[[Path], bool]) -> bool:
 
 @contextmanager
 def opened(path: Path) -> Iterator[BufferedReader]:
-    """Open a regular file for reading.
-
-    Raises
-    ------
-    MissingFile
-        It cannot be opened, or is not a regular file.
-    """
+    """Open a regular file for reading; raise MissingFile if it cannot be opened, or is not a regular file."""
     try:
         file = open_regular(path)
     except (OSError, ValueError) as failure:
@@ -77,13 +65,7 @@ def opened(path: Path) -> Iterator[BufferedReader]:
 
 
 def read_content(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> bytes:
-    """Return the content of a file.
-
-    Raises
-    ------
-    MissingFile
-        It cannot be read, is not a regular file, or is larger than `max_bytes`.
-    """
+    """Return the content of a regular file; raise MissingFile if it cannot be read, or is larger than `max_bytes`."""
     try:
         return read_regular(path, max_bytes)
     except (OSError, ValueError) as failure:
@@ -91,34 +73,15 @@ def read_content(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> bytes:
 
 
 def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
-    """Return the text of a file, in which undecodable bytes become replacement characters.
-
-    Raises
-    ------
-    MissingFile
-        As in `read_content`.
-    """
+    """Return the text of a file, in which undecodable bytes become replacement characters; raise as `read_content`."""
     return read_content(path, max_bytes).decode(errors="replace")
 
 
 def read_json[T](path: Path, kind: type[T], *, what: str, remedy: str) -> T:
-    """Return the content of a JSON file as an instance of `kind`.
+    """Return the content of a JSON file as a type that msgspec decodes; `what` and `remedy` are for the message.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    kind : type
-        A msgspec Struct, or another type that msgspec decodes.
-    what, remedy : str
-        What the file should be, and what to do if it is not, for the message.
-
-    Raises
-    ------
-    MissingFile
-        The file cannot be read.
-    BadValue
-        It is not JSON, not of this type, or does not agree with the digest that it carries.
+    Raises MissingFile if it cannot be read, and BadValue if it is not JSON, not of this type, or disagrees with its
+    own digest.
     """
     content = read_content(path)
     try:
@@ -134,30 +97,10 @@ def read_json[T](path: Path, kind: type[T], *, what: str, remedy: str) -> T:
 def read_arrays(
     path: Path, names: Collection[str], *, max_bytes: int, remedy: str, shape: tuple[int, ...] | None = None
 ) -> dict[str, NDArray[Any]]:
-    """Return those of the named arrays that a .npz file has.
+    """Return those of the named arrays of numbers that a .npz file has; they cannot be written to.
 
-    The declared size of an array is checked before it is decompressed, and its checksum after. The arrays cannot be
-    written to.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    names : collection of str
-        Names of arrays of numbers.
-    max_bytes : int
-        Largest size of all of them together.
-    remedy : str
-        What to do if the file is damaged, for the message.
-    shape : tuple of int, optional
-        Shape that every array must have.
-
-    Raises
-    ------
-    MissingFile
-        The file cannot be read.
-    BadValue
-        It is damaged, or an array has another shape, is not of numbers, or exceeds `max_bytes`.
+    The declared size of an array is checked before it is decompressed, and its checksum after. Raises BadValue if the
+    file is damaged, an array has another shape or is not of numbers, or all together exceed `max_bytes`.
     """
     arrays: dict[str, NDArray[Any]] = {}
     with opened(path) as file:
@@ -176,7 +119,6 @@ def read_arrays(
 
 
 def _member(archive: zipfile.ZipFile, name: str, max_bytes: int, shape: tuple[int, ...] | None) -> NDArray[Any]:
-    """Return one array of a .npz file; raise ValueError if it is not what is expected."""
     entry = archive.getinfo(f"{name}.npy")
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise ValueError(f"{name} is compressed by method {entry.compress_type}, which numpy does not use")
@@ -205,6 +147,5 @@ def _array_header(member: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[An
 
 
 def _unreadable(path: Path, failure: OSError | ValueError) -> MissingFile:
-    """Return the failure of a file that cannot be opened or read; a ValueError is a name with a NUL."""
     reason = failure.strerror if isinstance(failure, OSError) else str(failure)
     return MissingFile(f"{path}: cannot be read ({reason}); name a file of the kind that is read here")

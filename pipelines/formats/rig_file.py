@@ -16,15 +16,7 @@ def read_rig(path: Path) -> RigSettings:
 
 
 def read_rig_tables[T](path: Path, kind: type[T]) -> T:
-    """Read a rig.toml, or those of its tables that `kind` has.
-
-    Raises
-    ------
-    MissingFile, BadValue, UnknownKey
-        The file cannot be used; the message names the file and the key.
-    UnknownPlugin
-        It names a driver that is neither built in nor installed.
-    """
+    """Read a rig.toml, or those of its tables that `kind` has; raise as `read_toml` does, or UnknownPlugin."""
     try:
         return read_toml(path, kind, fold_plugins)
     except UnknownPlugin as failure:
@@ -42,13 +34,7 @@ def stage_settings_path(rig: Path) -> Path:
 
 
 def read_stage_settings(rig: Path) -> dict[str, str] | None:
-    """Read the stored settings of the stage of a rig.toml, None if there are none.
-
-    Raises
-    ------
-    MissingFile, BadValue
-        The file cannot be read, or is not as `faintfield check --remember` writes it.
-    """
+    """Read the stored settings of the stage of a rig.toml, None if there are none."""
     path = stage_settings_path(rig)
     if not is_file(path):
         return None

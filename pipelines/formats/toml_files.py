@@ -26,24 +26,8 @@ _LONG_KEY = re.compile(rb"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*
 def read_toml[T](path: Path, kind: type[T], prepare: Callable[[Any], Any] = lambda content: content) -> T:
     """Read a TOML file into `kind`, a msgspec Struct that forbids unknown fields.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    kind : type
-        The Struct.
-    prepare : callable
-        Gives the file's tables the form that `kind` has.
-
-    Raises
-    ------
-    MissingFile
-        There is no such file.
-    UnknownKey
-        A key is not read; the message names its place, and the nearest key or the table where it belongs.
-    BadValue
-        The file is not TOML, a key is missing, a value has the wrong type or is not one of its choices, or a number
-        is not finite.
+    `prepare` gives the file's tables the form that `kind` has. Raises MissingFile, UnknownKey with the nearest key or
+    the table where it belongs, or BadValue with the place of a value of a wrong type or out of its limits.
     """
     if not is_file(path):
         raise MissingFile(f"{path}: no such file; name a folder or file of the kind that this command reads")
@@ -57,7 +41,6 @@ def read_toml[T](path: Path, kind: type[T], prepare: Callable[[Any], Any] = lamb
 
 
 def _decoded(path: Path) -> Any:
-    """Return the content of a TOML file."""
     content = read_content(path, _MAX_TOML_BYTES)
     if (key := _LONG_KEY.search(content)) is not None:
         line = content.count(b"\n", 0, key.start()) + 1
@@ -76,13 +59,7 @@ def write_toml(path: Path, settings: msgspec.Struct) -> None:
 
 
 def inside(folder: Path, name: str, key: str) -> Path:
-    """Return the path of a file named in a settings file, which must lie in the same folder.
-
-    Raises
-    ------
-    BadValue
-        The name is absolute, climbs out of the folder, or is none that a file can have.
-    """
+    """Return the path of a file named in a settings file; BadValue if it is not in the same folder."""
     path = folder / name
     try:
         lies_inside = path.resolve().is_relative_to(folder.resolve())
@@ -116,7 +93,6 @@ def _shown(number: float) -> str:
 
 
 def _failure_of(path: Path, complaint: str, kind: type) -> InputError:
-    """Return the failure that says what msgspec found, in words for people."""
     reason, _, place = complaint.partition(" - at ")
     place = place.strip("`").removeprefix("$").removeprefix(".")
     if unknown := re.search(r"unknown field `(.+?)`", reason):
@@ -129,7 +105,6 @@ def _failure_of(path: Path, complaint: str, kind: type) -> InputError:
 
 
 def _better_key(kind: type, place: str, key: str) -> str:
-    """Return the remedy for a key that the table at `place` does not have."""
     tables = _tables(kind)
     known = {name for table in tables.values() for name in table}
     if key not in known:
@@ -143,7 +118,6 @@ def _better_key(kind: type, place: str, key: str) -> str:
 
 
 def _better_value(kind: type, place: str, value: str) -> str:
-    """Return the choices at `place`, and the one most like `value`."""
     choices = [
         repr(choice) for table in _tables(kind).values() for choice in table.get(_name(place), {}).get("enum", [])
     ]
@@ -158,12 +132,10 @@ def _tables(kind: type) -> dict[str, dict[str, Any]]:
 
 
 def _name(place: str) -> str:
-    """Return the last key of a place: "kind" of `step[2].kind`."""
     return re.sub(r"\[.*?\]", "", place).rpartition(".")[2]
 
 
 def _without_none(value: Any) -> Any:
-    """Return a value without the keys whose value is None, at any depth."""
     if isinstance(value, dict):
         return {key: _without_none(part) for key, part in value.items() if part is not None}
     return [_without_none(part) for part in value] if isinstance(value, list | tuple) else value

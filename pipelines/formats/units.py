@@ -135,13 +135,7 @@ def named_by(content: Any, units: StatedUnits) -> Any:
 
 
 def record_of[Record](content: bytes, kind: type[Record]) -> Record:
-    """Return a record from its JSON; its keys may be named by the units that it states.
-
-    Raises
-    ------
-    msgspec.MsgspecError, UnicodeDecodeError, RecursionError
-        It is not JSON, or not of this kind.
-    """
+    """Return a record from JSON, whose keys may be named by the units that it states; raise one of `JSON_FAILURES`."""
     if b'"units"' in content:
         whole = msgspec.json.decode(content)
         stated = whole.get("units") if isinstance(whole, dict) else None
@@ -168,7 +162,6 @@ def _names(units: StatedUnits) -> tuple[dict[str, str], dict[str, str]]:
 
 
 def _renamed(value: Any, depths: Mapping[str, str], lights: Mapping[str, str]) -> Any:
-    """Return JSON values with their keys renamed."""
     if isinstance(value, dict):
         return {
             depths.get(key) or lights.get(key) or key: (

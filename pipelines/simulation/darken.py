@@ -42,15 +42,7 @@ class Darkened(msgspec.Struct, frozen=True):
 
 
 def darken_set(bright: ElementalSet, out: Path, options: DarkeningOptions, *, overwrite: bool = False) -> Darkened:
-    """Expose every view of a bright set anew with few photons, and write the dark set.
-
-    Raises
-    ------
-    OutputExists
-        `out` holds something other than an earlier set, or `overwrite` is False.
-    BadValue
-        The reference view is black, or the SNR cannot be reached.
-    """
+    """Expose each view of a bright set anew with few photons, and write the dark set; BadValue if none has the SNR."""
     layouts = channel_layouts(bright)
     light = _light(bright, bright.image_paths[bright.reference_view], layouts)
     region, scale_e = _region_and_scale(bright.folder, light, options)
@@ -77,7 +69,6 @@ def darken_set(bright: ElementalSet, out: Path, options: DarkeningOptions, *, ov
 def _region_and_scale(
     folder: Path, light: NDArray[np.floating], options: DarkeningOptions
 ) -> tuple[NDArray[np.bool_], float]:
-    """Return the object region (row, column) of the reference view, and the factor that makes its light dark."""
     region = _object_region(light)
     if not region.any():
         raise BadValue(f"{folder}: cannot be darkened: its reference view is black; is it the bright set?")
@@ -97,7 +88,6 @@ def _object_region(light: NDArray[np.floating]) -> NDArray[np.bool_]:
 
 
 def _light(bright: ElementalSet, path: Path, layouts: list[ChannelLayout]) -> NDArray[np.float32]:
-    """Return the light of a bright view: its electrons above the dark level, never negative."""
     frame = checked_frame(bright, path, layouts[0])
     light = np.zeros(frame.pixels_dn.shape, np.float32)
     for layout in layouts:

@@ -47,15 +47,7 @@ _NOISE_FREE_PEAK_DN = 60000.0
 
 
 def write_synthetic_set(out: Path, options: SyntheticOptions, *, overwrite: bool = False) -> Truth:
-    """Write the dark set of an experiment, the same set without noise, and its ground truth; return that.
-
-    Raises
-    ------
-    OutputExists
-        `out` holds something other than an earlier set, or `overwrite` is False.
-    BadValue
-        The detector is too small to show the objects.
-    """
+    """Write the dark set of an experiment, the same set without noise, and its ground truth; return that."""
     generator = np.random.default_rng(options.seed)
     experiment = _experiment(options)
     sensor = experiment.sensor
@@ -77,7 +69,6 @@ def write_synthetic_set(out: Path, options: SyntheticOptions, *, overwrite: bool
 
 
 def _experiment(options: SyntheticOptions) -> SimulatedExperiment:
-    """Return the experiment that the options ask for."""
     made = surface_experiment if options.objects == "surfaces" else paper_experiment
     return replace(
         made(*options.size_px),
@@ -108,13 +99,7 @@ def write_exposures(
     exposure_s: float,
     generator: np.random.Generator,
 ) -> None:
-    """Expose every view and write it under its name; an exposure without light is the noise reference.
-
-    Parameters
-    ----------
-    signal_e : iterable of array (row, column)
-        Expected photoelectrons of each view.
-    """
+    """Write each view (row, column) of expected photoelectrons under its name, exposed; one without light is added."""
     for name, view_e in zip(names, signal_e, strict=True):
         write_frame(folder / name, sensor.expose(view_e / sensor.quantum_efficiency, exposure_s, generator))
     write_frame(folder / NOISE_REFERENCE, sensor.expose(np.zeros_like(view_e), exposure_s, generator))
@@ -124,18 +109,8 @@ def write_exposures(
 class RenderedScene:
     """A simulated scene as light alone makes it, before the sensor.
 
-    Attributes
-    ----------
-    experiment : SimulatedExperiment
-        The camera, its grid, and the objects before it.
-    mosaic : tuple of str, optional
-        Colour filters of the sensor.
-    poses_rt_cam_ref : array (view, 6)
-        Where the camera really is, in raster order.
-    views : float32 array (view, row, column)
-        Relative to the light of a white object on the axis.
-    object_region : bool array (row, column)
-        Where the reference view shows an object.
+    `poses_rt_cam_ref` (view, 6) are where the camera really is, in raster order. `views` (view, row, column) are
+    relative to the light of a white object on the axis; `object_region` is where the reference view shows an object.
     """
 
     experiment: SimulatedExperiment
@@ -183,19 +158,7 @@ def render_scene(
     mosaic: tuple[str, ...] | None,
     samples_per_px: int = 2,
 ) -> RenderedScene:
-    """Cast the rays of all views; through a mosaic, each pixel keeps the colour of its filter.
-
-    Parameters
-    ----------
-    experiment : SimulatedExperiment
-        The camera, and what stands before it.
-    poses_rt_cam_ref : array (view, 6)
-        Where the camera really is, in raster order.
-    mosaic : tuple of str, optional
-        Colour filters.
-    samples_per_px : int
-        Rays along each side of a pixel.
-    """
+    """Cast rays of all views, `samples_per_px` along each side; through a mosaic, a pixel keeps its filter's colour."""
     views = np.empty((len(poses_rt_cam_ref), *experiment.optics.size_px[::-1]), np.float32)
     object_region = np.zeros(views.shape[1:], bool)
     coloured = experiment if mosaic else experiment.grey()
@@ -210,18 +173,7 @@ def render_scene(
 def write_ground_truth(folder: Path, scene: RenderedScene, white_e: float, snr: float, poses: Poses = "true") -> Truth:
     """Write the noise-free views, as a set of their own, and everything else that no capture shows.
 
-    Parameters
-    ----------
-    folder : Path
-        Folder to write into, which exists.
-    scene : RenderedScene
-        The scene as it was captured.
-    white_e : float
-        Expected electrons of a white object on the axis.
-    snr : float
-        The SNR that was asked for.
-    poses : Poses
-        The kind of poses that the captured set states: "true" or "nominal".
+    `white_e` are the expected electrons of a white object on the axis; `poses` are those that the captured set states.
     """
     _write_noise_free_set(folder / NOISE_FREE, scene, white_e)
     write_png(folder / OBJECT_REGION, mask_picture(scene.object_region))
@@ -255,7 +207,6 @@ def _write_noise_free_set(folder: Path, scene: RenderedScene, white_e: float) ->
 
 
 def _write_textures(folder: Path, scene: RenderedScene, white_e: float) -> list[TruePlane]:
-    """Write each object's texture in electrons, and where the ideal reference view shows it."""
     planes, optics = scene.experiment.planes, scene.experiment.optics
     seen_by_ideal = partial(render, optics=optics.ideal(), poses_rt_cam_ref=np.zeros((1, 6)))
     all_visible = next(seen_by_ideal([plane.grey() for plane in planes])).visible
@@ -271,7 +222,6 @@ def _write_textures(folder: Path, scene: RenderedScene, white_e: float) -> list[
 
 
 def _write_surface(folder: Path, scene: RenderedScene, white_e: float) -> TrueSurface:
-    """Write the true depths, and the picture in electrons, of the ideal reference view."""
     coloured = scene.experiment if scene.mosaic else scene.experiment.grey()
     ideal = replace(coloured, optics=coloured.optics.ideal())
     surface = TrueSurface("truth/true_depth_mm.tiff", "truth/true_picture.tiff")

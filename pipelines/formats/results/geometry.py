@@ -78,7 +78,7 @@ class CameraPoses(Struct, frozen=True, kw_only=True):
     homings: list[HomingRecord] | UnsetType = UNSET
 
     def camera_lens(self) -> Lens:
-        """Return the lens."""
+        """Return the lens; ValueError if it is impossible."""
         lens = self.lens
         return Lens(self.size_px, lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, lens.distortion)
 
@@ -188,13 +188,7 @@ class GeometryRecord(CameraPoses, frozen=True, kw_only=True):
 
 
 def read_geometry[Kind: CameraPoses](path: Path, kind: type[Kind]) -> Kind:
-    """Read geometry.json, or that of a folder, whole or only the camera's poses.
-
-    Raises
-    ------
-    MissingFile, BadValue
-        There is none, or it is not a result of `faintfield geometry`.
-    """
+    """Read geometry.json, or that of a folder, whole or only the camera's poses."""
     path = path / GEOMETRY_FILE if is_folder(path) else path
     if not is_file(path):
         raise MissingFile(f"{path}: no such file; run `faintfield geometry` on the board set first")

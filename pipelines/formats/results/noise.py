@@ -134,29 +134,16 @@ class NoiseRecord(_StandardQuantities, frozen=True, kw_only=True):
 
 
 def read_noise(path: Path) -> NoiseRecord:
-    """Read noise.json.
-
-    Raises
-    ------
-    MissingFile, BadValue
-        The file cannot be read, or is not a result of `faintfield noise`.
-    """
+    """Read noise.json."""
     return read_json(path, NoiseRecord, what="the result of `faintfield noise`", remedy="run that again")
 
 
 def write_noise(
     out: Path, record: NoiseRecord, maps: Iterable[tuple[str, NDArray[Any]]], pages: Mapping[str, bytes]
 ) -> NoiseRecord:
-    """Write noise.json, its maps and its pages of plots, and return the record with the hash of the maps.
+    """Write noise.json, its maps (row, column) one by one and its pages by file name; return it with the maps' hash.
 
     noise.json is written last: where it stands, everything that it names stands too.
-
-    Parameters
-    ----------
-    maps : iterable of (str, array (row, column))
-        Each with its name in noise_maps.npz; they are written one by one.
-    pages : mapping of str to bytes
-        Pages of plots, PNG or HTML, by file name.
     """
     with exclusive(out):
         remove(out / NOISE_FILE)
@@ -175,18 +162,10 @@ def write_noise(
 
 @dataclass(frozen=True)
 class FittedNoise:
-    """Noise model of a sensor from a calibration.
+    """Noise model of a sensor from a calibration, with a map (row, column) of each quantity that has one.
 
-    Attributes
-    ----------
-    model : NoiseModel
-        With a map (row, column) of each quantity that has one.
-    unusable : bool array (row, column)
-        Hot, noisy and dead pixels.
-    response : float array (row, column), optional
-        Relative photo response, vignetting included; None when there were no flats.
-    mosaic : tuple of str, optional
-        Colour filters of the frames that were measured.
+    `unusable` are hot, noisy and dead pixels. `response` is the relative photo response, vignetting included; None when
+    there were no flats. `mosaic` has the colour filters of the frames that were measured.
     """
 
     model: NoiseModel
@@ -198,11 +177,8 @@ class FittedNoise:
 def read_fitted_noise(path: Path, size_px: tuple[int, int]) -> FittedNoise:
     """Read `noise.json`, and `noise_maps.npz` when it lies beside it.
 
-    Raises
-    ------
-    MissingFile, BadValue
-        A file cannot be read, is no noise result, is another camera's or not the one that is named, or a number that a
-        reconstruction needs is not known or out of its range.
+    Raises BadValue if one is another camera's or not the one that is named, or if a number that a reconstruction needs
+    is not known or out of its range.
     """
     record = read_noise(path)
     values = _numbers(path, record)
@@ -278,13 +254,7 @@ def _numbers(path: Path, record: NoiseRecord) -> dict[str, float]:
 def read_maps(
     path: Path, record: NoiseRecord, shape: tuple[int, int], names: Collection[str] = _MAPS_TAKEN
 ) -> dict[str, Any]:
-    """Return the maps (row, column) that the file has, of those named; none without a file.
-
-    Raises
-    ------
-    BadValue
-        The file is damaged, of another size, or not the one that the record names.
-    """
+    """Return the maps (row, column) that the file has, of those named; none without a file."""
     if not is_file(path):
         return {}
     maps = read_arrays(

@@ -11,18 +11,8 @@ OVERVIEW_FILE = "overview.json"
 class Brightness(Struct, frozen=True):
     """The SNR and photon figures of a set's reference view; light is in the units of the overview.
 
-    Attributes
-    ----------
-    region, noise_from : str
-        What was measured, and what it was compared with.
-    snr : float, optional
-        Eq. (4), a ratio of powers; None if the noise model states no read noise to compare with.
-    electrons_linear, electrons_from_moments : float, optional
-        Electrons per pixel by eq. (7), and of a uniform object with this SNR; None if the SNR is not positive.
-    mean_signal_e : float
-        Mean electrons per pixel above the dark level.
-    photons_linear, photons_from_moments : float, optional
-        The same in photons; None if the quantum efficiency is not known.
+    `snr` is that of eq. (4), a ratio of powers; `electrons_linear` and `electrons_from_moments` are electrons per pixel
+    by eq. (7), and of a uniform object with this SNR. None stands for what is not known, or has no meaning.
     """
 
     region: str

@@ -64,20 +64,8 @@ class _Part(Provenance[ReconstructionOptions], frozen=True):
 class PlaneFiles:
     """Paths of the files of one plane by one method, and their inputs.
 
-    Attributes
-    ----------
-    folder : Path
-        Folder of the method's planes.
-    method : Method
-        By which the plane is reconstructed.
-    place : Place
-        The plane's depth in mm, or its pose.
-    channels : tuple of str
-        Its colours, in their order.
-    origin : Provenance
-        Its provenance, if it were made now: files with another are made again.
-    stem : str
-        File name of the plane without suffix; by default that of a depth in mm.
+    `channels` are its colours in their order, `origin` its provenance, if it were made now: files with another are made
+    again. `stem` is the file name of the plane without suffix, by default that of a depth in mm.
     """
 
     folder: Path
@@ -109,17 +97,7 @@ class PlaneFiles:
     def save_part(
         self, channel: str, arrays: Mapping[str, NDArray[np.floating]], record: PlaneRecord, focus: FocusPoint | None
     ) -> None:
-        """Keep one colour until the others are there.
-
-        Parameters
-        ----------
-        channel : str
-            The colour.
-        arrays : mapping of str to float array (row, column)
-            The `plane`, and what else is known of its samples: `sigma`, `opacity`.
-        record, focus : PlaneRecord, FocusPoint
-            What this colour adds to the plane's record.
-        """
+        """Keep one colour until the others are there: `plane` (row, column), and what else is known of its samples."""
         path = self._part(channel)
         with writing(path) as file:
             for array in arrays.values():
@@ -131,13 +109,7 @@ class PlaneFiles:
         )
 
     def finish(self) -> PlaneFileRecord:
-        """Write the plane and its preview from its colours, then the record that vouches for them, and return that.
-
-        Raises
-        ------
-        BadValue
-            The file of a colour does not hold the arrays that its record names.
-        """
+        """Write the plane and its preview from its colours, then the record that vouches for them, and return that."""
         paths = [self._part(channel) for channel in self.channels]
         entries = [read_json(path.with_suffix(".json"), _Part, what=_A_COLOUR, remedy=_ANEW) for path in paths]
         parts = [_arrays(path, entry, entries[0].record.shape) for path, entry in zip(paths, entries, strict=True)]
@@ -178,7 +150,6 @@ class PlaneFiles:
         return self.folder / PARTS / f"{self.name}_{channel}{_SUFFIX_OF_PARTS}"
 
     def _has(self, channel: str) -> bool:
-        """Return whether a colour is there, whole and current."""
         path = self._part(channel)
         part = read_current(path.with_suffix(".json"), _Part, self.origin)
         return part is not None and list(part.sha256) == [path.name] and part.record.channel == channel
@@ -219,7 +190,6 @@ def read_current[Record: (PlaneFileRecord, DepthMapFileRecord, SurfaceFileRecord
 
 
 def _arrays(path: Path, part: _Part, shape: tuple[int, int]) -> dict[str, NDArray[np.float32]]:
-    """Return the arrays of one colour by name, all of one shape (row, column)."""
     found, needed = path.stat().st_size, len(part.arrays) * math.prod(shape) * _STORED.itemsize
     if found != needed or not needed or part.record.shape != shape or "plane" not in part.arrays:
         raise BadValue(
@@ -230,12 +200,10 @@ def _arrays(path: Path, part: _Part, shape: tuple[int, int]) -> dict[str, NDArra
 
 
 def _spacing(part: _Part) -> Spacing:
-    """Return the spacing of the samples of a plane, whose values are light."""
     units = units_of(part)
     return Spacing(part.record.pitch_mm, in_mm=units.depth == "mm")
 
 
 def _joined(parts: list[dict[str, NDArray[Any]]], name: str) -> NDArray[Any]:
-    """Return one array of all colours, (row, column[, colour])."""
     colours = [part[name] for part in parts]
     return colours[0] if len(colours) == 1 else np.dstack(colours)

@@ -20,24 +20,12 @@ def files_below(directory: Path, name: str) -> list[Path]:
 
 
 def read_result[Record](path: Path, kind: type[Record]) -> Record:
-    """Read a JSON file as one of the types of `formats.results.records`.
-
-    Raises
-    ------
-    MissingFile, BadValue
-        The file cannot be read, is not of this type, or does not agree with its digest.
-    """
+    """Read a JSON file as one of the types of `formats.results.records`."""
     return read_json(path, kind, what="a result that can be shown", remedy="reconstruct again")
 
 
 def file_within(folder: Path, name: str) -> Path:
-    """Return the path of a file that a record in `folder` names; it may be missing.
-
-    Raises
-    ------
-    BadValue
-        It leads out of the folder, or is a pipe, a device or a folder.
-    """
+    """Return the path of a file that a record in `folder` names; it may be missing, but not be elsewhere (BadValue)."""
     path = folder / name
     if not _is_within(path, folder):
         raise BadValue(f"{path}: leads out of the folder, or is no regular file; reconstruct again")
@@ -45,17 +33,7 @@ def file_within(folder: Path, name: str) -> Path:
 
 
 def problem_of_file(path: Path, folder: Path, known: str, hashed: Callable[[Path], str] = sha256) -> str | None:
-    """Return in words how a file that a record names differs from the one that it vouches for, None if it does not.
-
-    Parameters
-    ----------
-    path, folder : Path
-        The file, and the folder that it must lie in.
-    known : str
-        Its SHA-256 as recorded.
-    hashed : callable
-        Returns the SHA-256 of a file.
-    """
+    """Return in words how a file, which must lie in `folder`, differs from its recorded hash, None if it does not."""
     if not _is_within(path, folder):
         return "leads out of its folder, or is no regular file"
     try:
@@ -67,7 +45,6 @@ def problem_of_file(path: Path, folder: Path, known: str, hashed: Callable[[Path
 
 
 def _is_within(path: Path, folder: Path) -> bool:
-    """Return whether a path is that of a regular file in a folder, or of none."""
     try:
         return path.resolve().is_relative_to(folder.resolve()) and (path.is_file() or not path.exists())
     except (OSError, ValueError):  # a name that no file can have
@@ -75,13 +52,7 @@ def _is_within(path: Path, folder: Path) -> bool:
 
 
 def results_below(directory: Path, *, required: bool = True) -> dict[Path, ReconstructionRecord]:
-    """Return each reconstruction.json in a folder and below it, by its folder.
-
-    Raises
-    ------
-    MissingFile, BadValue
-        There is none, unless none is `required`; or one that cannot be read, or that names a file outside its folder.
-    """
+    """Return each reconstruction.json in a folder and below it, by its folder; MissingFile if one is `required`."""
     if not directory.is_dir():
         raise MissingFile(f"{directory}: no such folder; name one that `faintfield reconstruct` wrote")
     paths = files_below(directory, RECONSTRUCTION_FILE)

@@ -23,20 +23,12 @@ _EQUAL_STEPS = 1e-3
 
 @dataclass(frozen=True)
 class Scale:
-    """The spacing of the samples of a stack, across and in depth.
+    """The spacing of the samples of a stack, across in `unit` and in depth; x, y of the first sample are the `origin`.
 
-    Attributes
-    ----------
-    across : float
-        Distance of neighbouring samples, in `unit`.
-    unit : str
-        That of the records ("mm", "px", or none if it has no name) if all planes have the same pitch. By default the
-        pitch of a plane grows with its depth, and its samples are a constant angle apart: then "mrad", thousandths of
-        x/z, which is the same at every depth.
-    origin : (float, float)
-        x, y of the first sample, in `unit`.
-    step_mm : float, optional
-        From one depth or disparity to the next; None if the steps differ.
+    The unit is that of the records ("mm", "px", or none if it has no name) if all planes have the same pitch. By
+    default the pitch of a plane grows with its depth, and its samples are a constant angle apart: then it is "mrad",
+    thousandths of x/z, which is the same at every depth. `step_mm` leads to the next depth or disparity; None if the
+    steps differ.
     """
 
     across: float
@@ -72,19 +64,10 @@ def planes_in_order(records: Sequence[PlaneRecord]) -> list[PlaneRecord]:
 
 
 def write_stack(folder: Path, records: Sequence[PlaneRecord], units: StatedUnits) -> Path | None:
-    """Write the planes of a folder as one ImageJ hyperstack, and return its path.
+    """Write the planes of one method in a folder as one ImageJ hyperstack there, and return its path.
 
     Axes are depth, colour (if any), row, column; the calibration makes ImageJ show x, y and depth in their units, and
     each slice is labelled with its depth and pitch. Planes of different shapes do not fit into a stack: None.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the planes; the stack is written there, too.
-    records : sequence of PlaneRecord
-        The `planes` of reconstruction.json, of one method.
-    units : StatedUnits
-        Their units.
     """
     planes = planes_in_order(records)
     if len({record.shape for record in planes}) > 1:
@@ -133,5 +116,4 @@ def _imagej_metadata(planes: Sequence[PlaneRecord], scale: Scale, colours: int, 
 
 
 def _pitch_text(record: PlaneRecord, units: StatedUnits) -> str:
-    """Return the pitch of a plane for its label; nothing if it is that of the detector whatever the depth."""
     return f", {record.pitch_mm:.4g} mm/px" if units.depth == "mm" else ""

@@ -49,20 +49,11 @@ class SurfaceOptions(Struct, frozen=True, kw_only=True):
 
 
 class HeldOutRecord(Struct, frozen=True, kw_only=True):
-    """Prediction of views that were left out from the other views.
+    """Prediction of views that were left out from the other views, compared in a number of `pixels`.
 
-    Attributes
-    ----------
-    views : list of int
-        The views that were left out.
-    pixels : int
-        Number of their pixels that were compared.
-    surface, planes, neighbours : float
-        Mean deviance per pixel of their prediction by the surface; by the same depths on a few planes; and by the mean
-        of each view's neighbours, blurred. None if it was not computed. Smaller is better; a perfect prediction has
-        about 1.
-    standard_error : float
-        Of the difference between `planes` and `surface`.
+    `surface`, `planes` and `neighbours` are the mean deviances per pixel of the prediction by the surface; by the same
+    depths on a few planes; and by the mean of each view's neighbours, blurred. Smaller is better; a perfect prediction
+    has about 1. `standard_error` is that of the difference between `planes` and `surface`.
     """
 
     views: list[Count]
@@ -90,28 +81,9 @@ class SurfaceChannel(Struct, frozen=True, kw_only=True):
 class SurfaceFacts(Struct, frozen=True, kw_only=True):
     """Record of the estimation of a surface, without its maps.
 
-    Attributes
-    ----------
-    unit : str
-        Of all depths: "mm"; "relative", that of the poses; or "px" of disparity from one node to the next.
-    searched : (float, float)
-        Nearest and farthest depth that were considered.
-    range_found : bool
-        This range was found in the views, not given.
-    depths : int
-        Number of depths that were compared.
-    bins_px : int
-        Width in detector pixels of the bins in which depths were first compared.
-    rounds : int
-        How often depth and picture were estimated in turn.
-    sure_above : float
-        Probability from which on a depth counts as sure.
-    held_out : HeldOutRecord, optional
-        How well the surface predicts views that were left out.
-    channels : list of SurfaceChannel
-        The picture, colour by colour.
-    wall_time_s : float
-        How long it took.
+    `searched` are the nearest and farthest depth that were considered, in `unit`; `range_found` says that they were
+    found in the views. `depths` were compared, first in bins of `bins_px` detector pixels. Depth and picture were
+    estimated in turn in `rounds`. `sure_above` is the probability from which on a depth counts as sure.
     """
 
     unit: Literal["mm", "px", "relative"]
@@ -129,28 +101,11 @@ class SurfaceFacts(Struct, frozen=True, kw_only=True):
 class SurfaceRecord(SurfaceFacts, frozen=True, kw_only=True):
     """A surface: what the estimation says, the names of its files, and how much of it is known.
 
-    Attributes
-    ----------
-    picture, picture_sigma : str
-        The light of each sample and its standard deviation.
-    picture_proposal, picture_moved : str, optional
-        What the prior proposed, and how far the data moved the picture from it.
-    depth, depth_sigma : str
-        The depth of each sample and its standard deviation, in `unit`; NaN where the depth is not known.
-    depth_confidence : str
-        Probability, 0 to 1, that the depth is right within 2 %.
-    visibility : str
-        Number of views that see each sample.
-    points : str, optional
-        The samples whose depth is known as a point cloud, in `unit`; None if that is px.
-    film : str, optional
-        The picture from viewpoints between the nodes; None if these do not differ, or it could not be encoded.
-    shape : (int, int)
-        Rows and columns.
-    known_share, sure_share : float
-        Shares of the samples whose depth is known, and whose depth is right with a probability of `sure_above`.
-    median : float, optional
-        Median of the known depths; None if there are none.
+    Files of light, of depth in `unit` (NaN where it is not known), and of their standard deviations; `picture_proposal`
+    is what the prior proposed, `picture_moved` how far the data moved the picture from it. `depth_confidence` is the
+    probability that the depth is right within 2 %, `visibility` the number of views that see a sample, `points` the
+    samples of known depth as a point cloud, None in px, and `film` the picture from viewpoints between the nodes.
+    `known_share` and `sure_share` are shares of the samples, `median` is that of the known depths.
     """
 
     picture: FileName
@@ -203,13 +158,7 @@ class SurfaceFileRecord(Provenance[SurfaceOptions], frozen=True):
 
 
 def planes_below(directory: Path) -> dict[Path, ReconstructionRecord]:
-    """Return each reconstruction.json in a folder and below it, by its folder: for what shows planes alone.
-
-    Raises
-    ------
-    MissingFile, BadValue
-        There is none, perhaps because a surface was reconstructed; or one that cannot be read.
-    """
+    """Return each reconstruction.json in a folder and below it, by its folder: for what shows planes alone."""
     if not results_below(directory, required=False) and surfaces_below(directory):
         raise MissingFile(
             f"{directory}: holds a surface and no planes; open its TIFFs or surface.ply by other programs, or "
@@ -219,13 +168,7 @@ def planes_below(directory: Path) -> dict[Path, ReconstructionRecord]:
 
 
 def surfaces_below(directory: Path) -> dict[Path, SurfaceFileRecord]:
-    """Return each surface.json in a folder and below it, by its folder.
-
-    Raises
-    ------
-    MissingFile, BadValue
-        The folder does not exist, a record cannot be read, or one names a file outside its folder.
-    """
+    """Return each surface.json in a folder and below it, by its folder; BadValue if it names a file outside."""
     if not directory.is_dir():
         raise MissingFile(f"{directory}: no such folder; name one that `faintfield reconstruct` wrote")
     paths = files_below(directory, SURFACE_FILE)

@@ -50,17 +50,7 @@ _LEVELS_ABOVE = 2
 
 
 class ResultVerdict(Struct, frozen=True):
-    """Verdict on results.
-
-    Attributes
-    ----------
-    records, files, inputs : int
-        Number of records that were read, of the files beside them and of the inputs that were compared with them.
-    problems : tuple of str
-        All problems, one line each; empty if there is none.
-    unchecked : tuple of str
-        What could not be checked, one line each.
-    """
+    """Counts of records, of files beside them and of inputs that were compared; problems, and what was not checked."""
 
     records: int
     files: int
@@ -95,13 +85,7 @@ def records_below(folder: Path) -> list[Path]:
 
 
 def records_of(path: Path) -> list[Path]:
-    """Return the records that belong to a result: all below a folder, and those that a reconstruction.json repeats.
-
-    Raises
-    ------
-    MissingFile
-        It does not exist, or is no result.
-    """
+    """Return the records that belong to a result: all below a folder, and those that a reconstruction.json repeats."""
     if path.is_dir():
         found = records_below(path)
         if not found:
@@ -128,18 +112,9 @@ def verify_results(
     progress: Callable[[Sequence[Path]], Iterable[Path]] = iter,
     hashed: Callable[[Path], str] = sha256,
 ) -> ResultVerdict:
-    """Verify records.
+    """Verify records, and with `find_inputs` their inputs, too.
 
-    Parameters
-    ----------
-    records : sequence of Path
-        The records.
-    find_inputs : callable, optional
-        Finds the inputs of a record; without it, they are not compared.
-    progress : callable
-        Wraps the iteration over the files that are hashed, to draw a progress bar.
-    hashed : callable
-        Returns the SHA-256 of a file.
+    `progress` wraps the iteration over the files that are hashed; `hashed` returns the SHA-256 of a file.
     """
     work = _Verification()
     for path in records:
@@ -200,7 +175,6 @@ class _Verification:
                     self._compare_part(path, path.with_name(name), part)
 
     def _compare_part(self, path: Path, own: Path, part: object) -> None:
-        """Compare a part of a reconstruction.json with the record that holds it, too."""
         if own in self.content and msgspec.json.encode(_own_part(self.content[own])) != msgspec.json.encode(part):
             self.problems.append(f"{path}: does not say what {own.name} says")
         elif path in self._vouching and own not in self._vouching:
@@ -274,7 +248,6 @@ def inputs_around(record: Path, inputs: Mapping[str, str]) -> Path | None:
 
 
 def _decoded(text: bytes, kinds: Sequence[type[Struct]]) -> Struct:
-    """Return a record of the first type that it fits."""
     for kind in kinds[:-1]:
         with suppress(msgspec.ValidationError):
             return record_of(text, kind)
@@ -282,12 +255,10 @@ def _decoded(text: bytes, kinds: Sequence[type[Struct]]) -> Struct:
 
 
 def _kinds_of(path: Path) -> tuple[type[Struct], ...]:
-    """Return the types of a record by its name; none if it is not that of a record."""
     return next((kinds for pattern, kinds in _KINDS.items() if fnmatchcase(path.name, pattern)), ())
 
 
 def _hashes_beside(record: Struct) -> Mapping[str, str]:
-    """Return the SHA-256 of each file beside a record for which it vouches, by name."""
     match record:
         case PlaneFileRecord() | DepthMapFileRecord() | SurfaceFileRecord():
             return record.sha256
@@ -313,7 +284,6 @@ def _named_by(record: Struct) -> list[str]:
 
 
 def _inputs_of(record: Struct) -> Mapping[str, str]:
-    """Return the SHA-256 of a record's inputs by name."""
     made = record.provenance if isinstance(record, NoiseRecord) else record
     inputs: Mapping[str, str] = getattr(made, "inputs", {})
     return inputs
@@ -328,12 +298,10 @@ def _repeated(record: ReconstructionRecord) -> dict[str, object]:
 
 
 def _own_part(record: Struct) -> object:
-    """Return the part of a record that reconstruction.json repeats."""
     return record.planes if isinstance(record, PlaneFileRecord) else getattr(record, "depth_map", None)
 
 
 def _exists(path: Path) -> bool:
-    """Return whether there is a file of any kind; False for names that no file can have."""
     try:
         return path.exists()
     except (OSError, ValueError):

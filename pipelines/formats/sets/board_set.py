@@ -39,7 +39,7 @@ class BoardEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     first_marker_id: int = 0
 
     def board(self) -> Board:
-        """Return the board; ValueError where it is impossible."""
+        """Return the board; ValueError if it is impossible."""
         return Board(**msgspec.structs.asdict(self))
 
 
@@ -75,13 +75,7 @@ class BoardView:
     homing: int = 0
 
     def image(self, expected_px: tuple[int, int] | None = None) -> NDArray[np.float32]:
-        """Return the mean of the frames (row, column), the colours of RGB frames averaged.
-
-        Raises
-        ------
-        WrongSize
-            The frames are not of one size, or not of the one that is expected.
-        """
+        """Return the mean of the frames (row, column), the colours of RGB frames averaged."""
         total: NDArray[Any] | None = None
         for path in self.paths:
             frame = read_frame(path, expected_px, of="the first image")
@@ -95,24 +89,11 @@ class BoardView:
 
 @dataclass(frozen=True)
 class BoardSet:
-    """A board set that has been checked, without its pixels.
+    """All boards, and their views in the order in which they were taken.
 
-    Attributes
-    ----------
-    source : Path
-        The file that describes it.
-    boards : dict of name to Board
-        All boards.
-    views : list of BoardView
-        In the order in which they were taken.
-    reference : (int, int)
-        The node whose camera is the reference: the centre of the grid.
-    pitch_mm : float, optional
-        Commanded distance of neighbouring nodes.
-    one_sided : bool
-        Whether the stage approached every node from the same side, in whatever order.
-    switches_repeat : bool
-        Whether homings are known to lead to the same place.
+    `reference` is the node whose camera is the reference, the centre of the grid. `pitch_mm` is the commanded distance
+    of neighbouring nodes. With `one_sided` the stage approached every node from the same side, in whatever order;
+    `switches_repeat` if homings are known to lead to the same place.
     """
 
     source: Path
@@ -131,13 +112,7 @@ class BoardSet:
 
 
 def load_board_set(folder: Path) -> BoardSet:
-    """Read and check `charuco.toml`, or the charuco frames of a session, and that the files named exist.
-
-    Raises
-    ------
-    InputError
-        A file is missing, a key unknown, or a value impossible; the message names it.
-    """
+    """Read and check `charuco.toml`, or the charuco frames of a session, and that the files named exist."""
     if has_session(folder) and not is_file(folder / FILE_NAME):
         return _of_session(folder)
     path = folder if is_file(folder) else folder / FILE_NAME
@@ -162,7 +137,6 @@ def load_board_set(folder: Path) -> BoardSet:
 
 
 def _of_session(folder: Path) -> BoardSet:
-    """Return the charuco frames of a session; each charuco step is a sweep, with the boards at rest."""
     frozen = read_plan(folder)
     files: dict[tuple[Node, int, int], list[Path]] = {}
     homings = read_homing_groups(folder)

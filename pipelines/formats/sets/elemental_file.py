@@ -124,13 +124,7 @@ class ElementalSetFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 
 
 def read_set_file(path: Path) -> ElementalSetFile:
-    """Read and check `elemental.toml`, and that the files it names are there.
-
-    Raises
-    ------
-    InputError
-        A file is missing, a key is unknown, or a value is impossible; the message names it.
-    """
+    """Read and check `elemental.toml`, and that the files it names are there."""
     settings = read_toml(path, ElementalSetFile)
     _check_numbers(path, settings)
     _check_views(path, settings)
@@ -153,7 +147,6 @@ def named_files(settings: ElementalSetFile) -> list[str]:
 
 
 def _check_numbers(path: Path, settings: ElementalSetFile) -> None:
-    """Refuse an impossible exposure or mosaic."""
     if settings.exposure_s is not None and not 0 < settings.exposure_s <= MAX_EXPOSURE_S:
         raise BadValue(
             f"{path}: exposure_s = {settings.exposure_s}; it must be positive and at most {MAX_EXPOSURE_S:g}: give the "
@@ -173,7 +166,6 @@ def _check_numbers(path: Path, settings: ElementalSetFile) -> None:
 
 
 def _check_views(path: Path, settings: ElementalSetFile) -> None:
-    """Refuse a set without views, without its reference, or with a repeated view."""
     count = len(settings.view)
     for index, view in enumerate(settings.view):
         if not (sound_pose(view.rt_cam_ref) and (view.node is None or sound_node(view.node))):
@@ -199,7 +191,6 @@ def _check_views(path: Path, settings: ElementalSetFile) -> None:
 
 
 def _refuse_repeated(path: Path, key: str, names: list[Any]) -> None:
-    """Refuse a name that several views share."""
     seen = set()
     for name in names:
         if name in seen:

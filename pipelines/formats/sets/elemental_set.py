@@ -39,34 +39,22 @@ _MAX_RESPONSE = 1e6
 
 @dataclass(frozen=True)
 class ElementalSet:
-    """An elemental set that has been checked: everything but the pixels.
+    """An elemental set that has been checked when it was loaded: everything but the pixels.
 
     Attributes
     ----------
-    folder : Path
-        Its folder; paths in the set are relative to it.
-    settings : ElementalSetFile
-        What `elemental.toml` says.
-    lens : Lens
-        Lens of the camera.
-    noise : NoiseModel
-        Noise model of the camera; its offset is zero if each raw file brings its own (`offset_from_files`).
-    offset_from_files : bool
-        The offset of each raw file is the black level of its masked pixels.
+    folder, settings : Path, ElementalSetFile
+        Its folder, to which paths in the set are relative, and what `elemental.toml` says.
+    lens, noise : Lens, NoiseModel
+        Of the camera; with `offset_from_files`, each raw file's masked pixels give its offset, and the model's is zero.
     flat : float array (row, column), optional
         Relative response.
     unusable : bool array (row, column)
         Pixels that are left out (hot, dead).
-    measured_in : Path, optional
-        The geometry.json of the lens; None if the lens is the set's own.
-    poses : str
-        Where the poses come from: "stated" in the set, "measured", "nominal" or "true".
-    described_in : str
-        The file that says what the images are.
-    noise_reference : tuple of Path
-        Exposures without light, if there are any.
-    bright_view : (Path, float), optional
-        The reference view in plenty of light and its exposure in s, if there is one.
+    measured_in, described_in : Path, str
+        The geometry.json of the lens, None if the lens is the set's own; the file that says what the images are.
+    noise_reference, bright_view : tuple of Path, (Path, float)
+        Exposures without light, and the reference view in plenty of light with its exposure in s, if there are any.
     read_frame : callable
         Reads a frame, given its path and its size in px; see `reconstruction.channels.keeping_frames`.
     """
@@ -139,12 +127,7 @@ class ElementalSet:
 
         If the camera moves by B along its rows, the image of a point at depth z moves by −fx B / z, plus the shift of
         the principal point by rectification. With known nodes and poses this is an equation for 1/z, solved by least
-        squares over all views.
-
-        Raises
-        ------
-        BadValue
-            The views have no nodes, do not move, or no plane in front of the cameras has this disparity.
+        squares over all views. BadValue if no plane in front of the cameras has this disparity.
         """
         at_zero, slope = self.inverse_depth_of_disparity()
         if slope == 0:
@@ -182,13 +165,7 @@ class ElementalSet:
         return self.units.depths_text([self.stated_depth(depth) for depth in depths_mm], join)
 
     def inverse_depth_of_disparity(self) -> tuple[float, float]:
-        """Return 1/depth in 1/mm of the disparity zero, and by how much it grows with each px of disparity.
-
-        Raises
-        ------
-        BadValue
-            The views have no nodes.
-        """
+        """Return 1/depth in 1/mm of the disparity zero, and by how much it grows with each px of disparity."""
         steps, shift_px = self._steps_and_shifts()
         camera = self.settings.camera
         moved_px = self.poses_rt_cam_ref[:, 3:5] * [camera.fx_px, camera.fy_px]
@@ -251,7 +228,6 @@ def load_set(folder: Path) -> ElementalSet:
 
 @contextmanager
 def _naming(path: Path, table: str) -> Iterator[None]:
-    """Name the file and the table of a value that is refused."""
     try:
         yield
     except ValueError as failure:
@@ -271,7 +247,6 @@ def _noise(folder: Path, settings: ElementalSetFile) -> FittedNoise:
 
 
 def _read_flat(path: Path, size_px: tuple[int, int]) -> NDArray[np.float32]:
-    """Return the relative response (row, column) from a float TIFF."""
     flat = read_frame(path, size_px).pixels_dn
     if flat.ndim != 2 or not np.isfinite(flat).all() or (flat < 0).any() or (flat > _MAX_RESPONSE).any():
         raise BadValue(
@@ -282,13 +257,7 @@ def _read_flat(path: Path, size_px: tuple[int, int]) -> NDArray[np.float32]:
 
 
 def with_measured_geometry(elemental_set: ElementalSet, path: Path) -> ElementalSet:
-    """Return a set with the lens of a geometry.json and each view at its node's measured pose.
-
-    Raises
-    ------
-    BadValue
-        A view has no node, a node was not measured, the reference is another, or the image has another size.
-    """
+    """Return a set with the lens of a geometry.json, each view at its node's measured pose; BadValue if one lacks."""
     path = path / GEOMETRY_FILE if is_folder(path) else path
     geometry, settings = read_geometry(path, CameraPoses), elemental_set.settings
     poses = {entry.node: entry.rt_cam_ref for entry in geometry.nodes}
@@ -309,7 +278,6 @@ def with_measured_geometry(elemental_set: ElementalSet, path: Path) -> Elemental
 
 
 def _homing_shifts_mm(path: Path, geometry: CameraPoses, elemental_set: ElementalSet) -> dict[int, NDArray[np.float64]]:
-    """Return by how much the cameras of each homing are shifted from those of the reference view's."""
     views = elemental_set.settings.view
     of_reference = views[elemental_set.settings.reference_view].homing
     shifts = {homing: geometry.homing_shift_mm(of_reference, homing) for homing in {view.homing for view in views}}
@@ -333,7 +301,6 @@ def _shifted(rt_cam_ref: Pose, shift_mm: NDArray[np.float64]) -> Pose:
 
 
 def _check_match(path: Path, geometry: CameraPoses, elemental_set: ElementalSet) -> None:
-    """Refuse a geometry of images of another size, of other nodes, or with another reference than the set."""
     settings, nodes = elemental_set.settings, {entry.node for entry in geometry.nodes}
     if geometry.size_px != settings.camera.size_px:
         raise BadValue(

@@ -35,12 +35,8 @@ class TruePlane(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class TrueSurface(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Light that the reference camera would see without distortion and vignetting, on the samples of its own pixels.
 
-    Attributes
-    ----------
-    depth_mm : str
-        File of the depths along its axis, at the centres of the pixels, NaN at nothing.
-    picture : str
-        File of the expected electrons, the mean over each pixel.
+    Files of the depths along its axis, at the centres of the pixels, NaN at nothing; and of the expected electrons, the
+    mean over each pixel.
     """
 
     depth_mm: str
@@ -62,16 +58,9 @@ class Truth(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
 
 
 class TrueDepth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """`true_depth.json`: the depth of each pixel of the reference view.
+    """`true_depth.json`: the file of the depth of each pixel of the reference view, and the hash of its source.
 
-    Attributes
-    ----------
-    format : int
-        Version of the file.
-    depth_mm : str
-        File of the depths along the camera's axis, at the centres of the pixels, NaN where there is none.
-    source, sha256 : str
-        The file that it was made from, and its hash.
+    Depths are those along the camera's axis, at the centres of the pixels, NaN where there is none.
     """
 
     format: Literal[1]
@@ -81,13 +70,7 @@ class TrueDepth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def read_true_depth_mm(folder: Path) -> NDArray[np.float64] | None:
-    """Return the true depth (row, column) of the pixels of the reference view; None for a set without it.
-
-    Raises
-    ------
-    MissingFile, BadValue, UnreadableImage
-        A file is missing or damaged.
-    """
+    """Return the true depth (row, column) of the pixels of the reference view; None for a set without it."""
     path = folder / TRUE_DEPTH_FILE
     if not is_file(path):
         return None
@@ -119,15 +102,7 @@ def true_plane(truth: Truth | None, depth_mm: float) -> TruePlane | None:
 
 
 def texture_and_region(folder: Path, plane: TruePlane) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-    """Return the object's texture (row, column[, colour]) and the region (row, column) where it is visible.
-
-    Raises
-    ------
-    MissingFile, UnreadableImage
-        A file cannot be read.
-    WrongSize
-        The two are of different sizes.
-    """
+    """Return the object's texture (row, column[, colour]) and the region (row, column) where it is visible."""
     texture, visible = (read_frame(folder / name).pixels_dn for name in (plane.texture, plane.visible))
     if visible.shape != texture.shape[:2]:
         raise WrongSize(

@@ -28,21 +28,8 @@ _NAMES: dict[SceneKind, str] = {"dark_scene": "dark-scene", "bright": "bright"}
 def load_session(folder: Path, kind: SceneKind = "dark_scene", geometry: Path | None = None) -> ElementalSet:
     """Return a session's views of the scene, with the noise of its noise.json and the poses of its geometry.json.
 
-    All frames of a node are added up to one view, whatever their exposures.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the session.
-    kind : str
-        The dark scene, or the bright one.
-    geometry : Path, optional
-        Another geometry.json than the session's own, or its folder.
-
-    Raises
-    ------
-    RigError, InputError
-        Frames are missing, or the noise or the geometry has not been measured; the message says what to run.
+    All frames of a node are added up to one view, whatever their exposures. `geometry` is another geometry.json than
+    the session's own, or its folder.
     """
     return with_measured_geometry(nominal_session(folder, kind, geometry), geometry or folder)
 
@@ -115,7 +102,6 @@ def _frames_of_views(folder: Path, plan: CapturePlan, kind: SceneKind) -> tuple[
 
 
 def _at_centre(folder: Path, kind: StepKind) -> list[tuple[Path, float]]:
-    """Return the frames of a kind at the centre node, each with its exposure in s."""
     centre = read_plan(folder).plan.centre
     taken = [(frame, path) for frame, _, path in taken_frames(folder) if frame.kind == kind and frame.stop == centre]
     return [(path, frame.exposure_s) for frame, path in taken if is_file(path)]

@@ -27,13 +27,7 @@ _UNITS = frozenset({"unit", "depth_map"})
 
 
 def light_per_e(elemental_set: ElementalSet) -> float:
-    """Return how much light one electron is, in the unit of the set: by this, light is multiplied where it is written.
-
-    Raises
-    ------
-    BadValue
-        Light is relative to white, and the set does not say what white is.
-    """
+    """Return how much light one electron is, in the unit of the set; BadValue if that is white, which is not known."""
     light, noise = elemental_set.units.light, elemental_set.noise
     if light == "electrons":
         return 1.0
@@ -98,8 +92,6 @@ def in_units[Record: Struct](elemental_set: ElementalSet, record: Record) -> Rec
 
 
 class _Converter:
-    """Converts the numbers of records by the names of their fields."""
-
     def __init__(self, elemental_set: ElementalSet) -> None:
         self._loaded = elemental_set
         self._light = light_per_e(elemental_set)
