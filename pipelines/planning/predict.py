@@ -144,7 +144,6 @@ class Predictor:
         return _with(of_view, self.light.e_per_s, self.sensor.read_noise_e, self.sensor.dark_current_e_per_s)
 
     def _snr(self, view: View) -> Measured:
-        pass
         return _finite(self._from_light(view, _snr_by_powers))
 
     def _depth(self, depth_mm: float | None) -> DepthPrediction:
