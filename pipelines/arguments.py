@@ -1,5 +1,7 @@
 """Types of command-line arguments, apart from the code that acts on them: numbers within limits, and words."""
 
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
@@ -34,3 +36,26 @@ type SceneKind = Literal["dark_scene", "bright"]
 type FigureNumber = Literal[2, 3, 4]
 type LensName = Literal["opencv5", "opencv8", "opencv4", "pinhole"]
 type PaperName = Literal["A4", "A3", "A2", "letter"]
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class StageConnection:
+    """The stage to use: a port, or the stage of a rig.toml.
+
+    Parameters
+    ----------
+    port
+        Serial device, pyserial URL, or simulated:grbl, simulated:grblhal, simulated:marlin.
+    protocol
+        Firmware of the controller at the port; grbl by default.
+    baud
+        Bits per second; 115200 by default.
+    rig
+        Use the [stage] table of this rig.toml instead, with its limits and keep-out boxes.
+    """
+
+    port: str | None = None
+    protocol: Literal["grbl", "marlin"] | None = None
+    baud: int | None = None
+    rig: Path | None = None

@@ -3,20 +3,20 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import msgspec
 from cyclopts import Parameter
 
 from faintfield.pipelines.arguments import Count, FigureNumber, LensName, Positive, SceneKind, Seed, SizePx
 from faintfield.pipelines.console import inform, working
-from faintfield.pipelines.paper.figure_records import Figure2, Figure3, Figure4
 from faintfield.pipelines.reconstruction.options import DEFAULTS, Options
 
 if TYPE_CHECKING:
+    from faintfield.pipelines.paper.figures import FiguresMade
     from faintfield.pipelines.reconstruction.run import Outcome
     from faintfield.pipelines.workflows.session import RunOutcome
 
 type Run = RunOutcome
 type Reconstruction = Outcome
+type Figures = FiguresMade
 
 
 def run(
@@ -117,14 +117,6 @@ def view(directory: Path, /) -> dict[str, list[str]]:
     return {"layers": show_planes(directory)}
 
 
-class FiguresMade(msgspec.Struct, frozen=True):
-    """The result of `faintfield figures`."""
-
-    out: str
-    report: str
-    figures: dict[str, Figure2 | Figure3 | Figure4]
-
-
 def figures(
     out: Path,
     /,
@@ -134,7 +126,7 @@ def figures(
     seed: Seed = 1,
     seeds: Count = 5,
     size_px: SizePx = (640, 480),
-) -> FiguresMade:
+) -> Figures:
     """Make figures 2, 3 and 4 of the paper from simulated light, and a page that compares them with the paper's.
 
     Figure 2: the bright integral image and its back-projections. Figure 3: one dark view, the noise reference, and the
@@ -156,8 +148,7 @@ def figures(
     size_px
         Width and height of the detector.
     """
-    from faintfield.pipelines.paper.figures import PAGE_FILE, FigureOptions, make_figures
+    from faintfield.pipelines.paper.figures import FigureOptions, make_figures
 
     options = FigureOptions(only=sorted(set(only or (2, 3, 4))), snr=snr, seed=seed, seeds=seeds, size_px=size_px)
-    made = make_figures(out, options)
-    return FiguresMade(str(out), str(out / PAGE_FILE), made)
+    return make_figures(out, options)

@@ -1,17 +1,25 @@
-"""Figure 4 of the paper: the error of the reconstruction against the SNR, for four objects."""
+"""Figure 4 of the paper: the error of the reconstruction against the SNR, by several methods, for four objects.
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+To compare one more method, add an entry to `METHODS`.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from importlib.util import find_spec
 from itertools import pairwise
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
+from skimage.restoration import denoise_tv_chambolle
 
 from faintfield.calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.console import progress
-from faintfield.pipelines.paper.figure_methods import METHODS, FigureMethod
-from faintfield.pipelines.paper.figure_records import CurvePoint, ErrorPoint
+from faintfield.pipelines.formats.results.records import Method
+from faintfield.pipelines.reconstruction.planes.solutions import PriorName, Settings
+from faintfield.pipelines.reconstruction.planes.solve import solve
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.metrics import mean_square_error, signal_scale_for_snr
 from faintfield.recon.operator.grid import PlaneGrid
@@ -20,6 +28,78 @@ from faintfield.recon.solver.initialization import back_projection
 from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
 from faintfield.rig.simulation.objects import sailing_boat, shaded_ball, toy_airplane, toy_truck
 from faintfield.rig.simulation.scene import TexturedPlane, render
+
+
+@dataclass(frozen=True)
+class FigureMethod:
+    """A method that makes a plane from dark views.
+
+    `plane` takes the operator, the images and one of the `weights`, if there are any; it returns the plane (row,
+    column) in electrons. The best weight only the true object tells. `draws` limits the draws of the noise, for
+    methods that are slow and far from the best.
+    """
+
+    name: str
+    title: str
+    plane: Callable[..., Image]
+    weights: tuple[float, ...] = ()
+    draws: int | None = None
+
+
+def _solved(
+    method: Method,
+    operator: PlaneOperator,
+    images: ElementalImages,
+    weight: float | None = None,
+    prior: PriorName = "tv",
+) -> Image:
+    return solve(operator, images, method, Settings(penalty_weight=weight, prior=prior)).plane
+
+
+def _clipped(operator: PlaneOperator, images: ElementalImages) -> Image:
+    """Return the plane by a naive reading of eq. (2): negative pixels clipped at zero, read noise not modelled."""
+    floor = np.maximum(images.electrons, 0)
+    return _solved("pmlem-osl", operator, replace(images, electrons=floor, read_variance_e2=0.0))
+
+
+def _tv_denoised(operator: PlaneOperator, images: ElementalImages, weight: float) -> Image:
+    """Return the back-projection, denoised by total variation (Chambolle 2004)."""
+    plane = back_projection(operator, images)
+    # At the default tolerance it stops too early to compare weights
+    return np.asarray(denoise_tv_chambolle(plane, weight=weight, eps=1e-5, max_num_iter=200), np.float32)
+
+
+def _bm3d_denoised(operator: PlaneOperator, images: ElementalImages, weight: float) -> Image:
+    """Return the back-projection, denoised by BM3D with a standard deviation of `weight` electrons."""
+    import bm3d  # an extra
+
+    return np.asarray(bm3d.bm3d(back_projection(operator, images), sigma_psd=weight), np.float32)
+
+
+# The method that stands for the paper's, and the same with the best weight, which only the truth can tell.
+OURS: Method = "pmlem"
+BEST = "pmlem-best"
+
+# Weights to try: β for PMLEM, electrons for the denoisers.
+_PMLEM_WEIGHTS = tuple(np.geomspace(1.0, 3.2, 6).tolist())
+_TV_WEIGHTS_E = tuple(np.geomspace(0.1, 1.6, 12).tolist())
+_BM3D_WEIGHTS_E = tuple(np.geomspace(0.4, 1.2, 5).tolist())
+
+# The first is the reference for the others.
+METHODS = (
+    FigureMethod("backprojection", "back-projection", back_projection),
+    FigureMethod("tv", "back-projection + TV denoising, best weight", _tv_denoised, _TV_WEIGHTS_E),
+    *(
+        [FigureMethod("bm3d", "back-projection + BM3D, best weight", _bm3d_denoised, _BM3D_WEIGHTS_E, draws=2)]
+        if find_spec("bm3d")
+        else []
+    ),
+    FigureMethod("pmlem-clipped", "PMLEM, one-step-late, negative data clipped", _clipped, draws=2),
+    FigureMethod("pmlem-osl", "PMLEM, one-step-late, weight from the noise", partial(_solved, "pmlem-osl"), draws=2),
+    FigureMethod(OURS, "PMLEM, convergent, weight from held-out views", partial(_solved, OURS)),
+    FigureMethod("pmlem-patches", "PMLEM, prior of patches", partial(_solved, OURS, prior="patches")),
+    FigureMethod(BEST, "PMLEM, convergent, best weight", partial(_solved, OURS), _PMLEM_WEIGHTS),
+)
 
 OBJECTS = (toy_truck, toy_airplane, sailing_boat, shaded_ball)
 SNRS = tuple(round(0.16 + 0.01 * step, 2) for step in range(8))
@@ -33,6 +113,34 @@ _MARGIN_DIVISOR = 16
 _POSITION_SD_MM, _ROTATION_SD_RAD = 0.3, 3.5e-3
 
 
+class ErrorPoint(msgspec.Struct, frozen=True):
+    """The error of one object by one method, of one draw of the noise.
+
+    `mse` is against the back-projection of the views without noise, over the object, scaled to 0…1; `mse_texture` is
+    against the object itself. `weight` is the best one, where the method was given that.
+    """
+
+    object: str
+    snr: float
+    method: str
+    mse: float
+    seed: int
+    mse_texture: float
+    weight: float | None
+
+
+class CurvePoint(msgspec.Struct, frozen=True):
+    """The mean over the draws of the noise, and its standard error (None for a single draw)."""
+
+    object: str
+    method: str
+    snr: float
+    draws: int
+    mse: float
+    standard_error: float | None
+    mse_texture: float
+
+
 @dataclass(frozen=True)
 class StagedObject:
     """One object alone before the camera, and the planes that reconstructions are compared with.
@@ -42,9 +150,7 @@ class StagedObject:
     light : float32 array (view, row, column)
         Light of the views, relative to that of a white object.
     region : bool array (row, column)
-        Mask of the object in the reference view.
-    window : (slice, slice)
-        Rows and columns of the reference view that the plane's samples overlay: the object and a margin.
+        Mask of the object in the reference view, whose `window` the plane's samples overlay.
     bright, texture : float array (row, column)
         The back-projection of `light`, and the object itself, at the plane's samples.
     """
@@ -61,8 +167,7 @@ class StagedObject:
     def exposures(self, seed: int) -> Iterator[tuple[float, ElementalImages, float]]:
         """Yield SNR, images, and the electrons of a white object, from the darkest exposure to the brightest.
 
-        Each exposure is the previous one with more photons and the same read noise. By itself each has the statistics
-        of an independent exposure; from one to the next only the light differs.
+        Each is the previous one with more photons and the same read noise.
         """
         sensor, exposure_s = self.experiment.sensor, self.experiment.exposure_s
         dark_e = sensor.dark_current_e_per_s * exposure_s
@@ -91,15 +196,7 @@ type _Case = tuple[StagedObject, _Weights, int, tuple[float, ElementalImages, fl
 
 
 def measure_errors(size_px: tuple[int, int], seeds: int) -> list[ErrorPoint]:
-    """Return the errors of all objects, SNRs, methods and draws of the noise.
-
-    Parameters
-    ----------
-    size_px : (int, int)
-        Width and height of the detector, of the paper's field of view.
-    seeds : int
-        Draws of the noise per object and SNR.
-    """
+    """Return the errors of all objects, SNRs and methods, for `seeds` draws of the noise each."""
     errors = []
     cases = progress(_exposures(size_px, seeds), "figure 4: exposures", len(OBJECTS) * seeds * len(SNRS))
     for stage, weights, seed, (snr, images, scale_e) in cases:

@@ -11,9 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from faintfield.pipelines.formats.results.records import PlaneRecord
-from faintfield.pipelines.paper.figure4 import PAPERS_AXIS, SNRS
-from faintfield.pipelines.paper.figure_methods import METHODS, OURS
-from faintfield.pipelines.paper.figure_records import CurvePoint
+from faintfield.pipelines.paper.figure4 import METHODS, OURS, PAPERS_AXIS, SNRS, CurvePoint
 
 # The colours of Okabe and Ito, which colour-blind readers can tell apart; marks and dashes tell curves without colour.
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#7f7f7f")

@@ -1,5 +1,7 @@
 """Figures 2, 3 and 4 of the paper from simulated light, with their numbers: the work of `faintfield figures`."""
 
+import csv
+import io
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -15,25 +17,24 @@ from faintfield.pipelines.formats.files import check_free, exclusive, remove, wr
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.provenance import Provenance, provenance
 from faintfield.pipelines.formats.results.geometry import DEFAULT_DEPTHS_MM
-from faintfield.pipelines.formats.results.records import Method, PlaneRecord
+from faintfield.pipelines.formats.results.records import Method, PhotonsRecord, PlaneRecord, SnrRecord
 from faintfield.pipelines.formats.sets.elemental_set import NOISE_REFERENCE, load_set
 from faintfield.pipelines.formats.sets.ground_truth import read_truth, texture_and_region
 from faintfield.pipelines.pages.page import data_uri, template
 from faintfield.pipelines.pages.report import write_report
-from faintfield.pipelines.paper.figure4 import PAPERS_AXIS, is_monotone, mean_curves, measure_errors, over_best
-from faintfield.pipelines.paper.figure_drawings import DrawnPlane, draw_figure2, draw_figure3, draw_figure4
-from faintfield.pipelines.paper.figure_methods import BEST, METHODS, OURS
-from faintfield.pipelines.paper.figure_records import (
-    DarkPlaneRow,
-    DetailRow,
+from faintfield.pipelines.paper.figure4 import (
+    BEST,
+    METHODS,
+    OURS,
+    PAPERS_AXIS,
+    CurvePoint,
     ErrorPoint,
-    Figure2,
-    Figure3,
-    Figure4,
-    Figure4Curves,
-    Row,
-    as_csv,
+    is_monotone,
+    mean_curves,
+    measure_errors,
+    over_best,
 )
+from faintfield.pipelines.paper.figure_drawings import DrawnPlane, draw_figure2, draw_figure3, draw_figure4
 from faintfield.pipelines.reconstruction.overview import INTEGRAL_IMAGE, grey_scale_dn
 from faintfield.pipelines.reconstruction.request import Request
 from faintfield.pipelines.reconstruction.run import Outcome, reconstruct_set
@@ -44,13 +45,70 @@ from faintfield.recon.likelihood.images import blurred
 PAGE_FILE = "figures.html"
 _CURVES_FILE = "figure4_curves.json"
 
-# By the number of a figure, the type of its JSON file.
-_KINDS = {2: Figure2, 3: Figure3, 4: list[ErrorPoint]}
-
 _SCENE, _BRIGHT, _DARK = "dark-scene", "bright", "dark"
 
 # Detail is what this blur removes; its standard deviation is 2 samples.
 _DETAIL_BLUR = (1, 1, 1, 1, 2)
+
+
+class DetailRow(msgspec.Struct, frozen=True):
+    """Figure 2: the share of an object's detail that a plane shows, 1 where it is sharp."""
+
+    plane_depth_mm: float
+    object: str
+    object_depth_mm: float
+    detail: float
+
+
+class Figure2(msgspec.Struct, frozen=True):
+    """`figure2.json`: the bright back-projections."""
+
+    planes: list[DetailRow]
+
+
+class DarkPlaneRow(msgspec.Struct, frozen=True):
+    """Figure 3: the errors of a plane that was reconstructed from dark views."""
+
+    depth_mm: float
+    object: str
+    method: str
+    mse_bright: float
+    mse_texture: float
+    psnr_db: float | None
+    penalty_weight: float | None
+    passes: int
+
+
+class Figure3(msgspec.Struct, frozen=True):
+    """`figure3.json`: how dark the views are, and how right the planes."""
+
+    snr: SnrRecord
+    photons_per_px: PhotonsRecord
+    planes: list[DarkPlaneRow]
+
+
+class Figure4(msgspec.Struct, frozen=True):
+    """The curves of figure 4.
+
+    `monotone` tells of each method if every object's error falls from each SNR to the next; `over_best` is the largest
+    ratio of our error to that with the best weight, of each object.
+    """
+
+    monotone: dict[str, bool]
+    over_best: dict[str, float]
+    curves: list[CurvePoint]
+
+
+class Figure4Curves(Figure4, frozen=True):
+    """`figure4_curves.json`: the curves, and the width and height of the detector."""
+
+    size_px: tuple[int, int]
+
+
+type Row = DetailRow | DarkPlaneRow | ErrorPoint
+
+# By the number of a figure, the type of its JSON file.
+_KINDS = {2: Figure2, 3: Figure3, 4: list[ErrorPoint]}
 
 
 class FigureOptions(msgspec.Struct, frozen=True, kw_only=True):
@@ -63,14 +121,22 @@ class FigureOptions(msgspec.Struct, frozen=True, kw_only=True):
     size_px: tuple[int, int]
 
 
+class FiguresMade(msgspec.Struct, frozen=True):
+    """The result of `faintfield figures`: the folder, its page, and the numbers by figure."""
+
+    out: str
+    report: str
+    figures: dict[str, Figure2 | Figure3 | Figure4]
+
+
 class _FigureProvenance(Provenance[dict[str, object]], frozen=True, kw_only=True):
     """Provenance of a figure, which is written last: with it, the figure is whole."""
 
     wall_time_s: float
 
 
-def make_figures(out: Path, options: FigureOptions) -> dict[str, Figure2 | Figure3 | Figure4]:
-    """Write the figures that are asked for, their numbers and the page, and return the numbers by figure.
+def make_figures(out: Path, options: FigureOptions) -> FiguresMade:
+    """Write the figures that are asked for, their numbers and the page.
 
     Raises
     ------
@@ -84,7 +150,7 @@ def make_figures(out: Path, options: FigureOptions) -> dict[str, Figure2 | Figur
         write_synthetic_set(out / _SCENE, scene, overwrite=True)
     makers: dict[int, Callable[[Path, FigureOptions], Figure2 | Figure3 | Figure4]]
     makers = {2: _figure2, 3: _figure3, 4: _figure4}
-    numbers = {}
+    numbers: dict[str, Figure2 | Figure3 | Figure4] = {}
     for number in options.only:
         start_s = time.monotonic()
         remove(_provenance_path(out, number))
@@ -94,7 +160,7 @@ def make_figures(out: Path, options: FigureOptions) -> dict[str, Figure2 | Figur
         write_json(_provenance_path(out, number), _FigureProvenance(**origin, wall_time_s=wall_time_s))
         inform(f"figure {number}: {wall_time_s:.1f} s")
     _write_page(out)
-    return numbers
+    return FiguresMade(str(out), str(out / PAGE_FILE), numbers)
 
 
 def _figure2(out: Path, _: FigureOptions) -> Figure2:
@@ -163,7 +229,6 @@ def _figure4(out: Path, options: FigureOptions) -> Figure4:
 
 
 def _reconstruct(set_path: Path, out: Path, method: Method) -> Outcome:
-    """Reconstruct both planes of a set, and write the report of them."""
     with exclusive(out):
         outcome = reconstruct_set(load_set(set_path), out, Request([*DEFAULT_DEPTHS_MM], [method]))
         write_report(out)
@@ -175,7 +240,11 @@ def _read_planes(folder: Path, records: Sequence[PlaneRecord]) -> list[DrawnPlan
 
 
 def _write(out: Path, number: int, picture: bytes, rows: Sequence[Row], numbers: Any) -> None:
-    write_whole(out / f"figure{number}.csv", as_csv(rows))
+    table = io.StringIO()
+    writer = csv.DictWriter(table, rows[0].__struct_fields__, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(msgspec.structs.asdict(row) for row in rows)
+    write_whole(out / f"figure{number}.csv", table.getvalue())
     write_whole(out / f"figure{number}.png", picture)
     write_json(out / f"figure{number}.json", numbers)
 

@@ -16,7 +16,6 @@ from faintfield.pipelines.cli import run
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import encoded
 from faintfield.pipelines.formats.results.records import JOINT_METHODS, Method
-from faintfield.pipelines.paper import demo as paper
 from faintfield.pipelines.workflows import demo as workflow
 
 METHODS = [method for method in get_args(Method.__value__) if method not in JOINT_METHODS]
@@ -63,7 +62,7 @@ def test_small_demo_from_capture_to_report(
 ) -> None:
     """Nine nodes, and two methods that are fast."""
     methods = ["backprojection", "pmlem-osl"]
-    monkeypatch.setattr(workflow, "QUICK", paper.DemoSize(3, 100.0, (288, 216), 3))
+    monkeypatch.setattr(workflow, "QUICK", workflow.DemoSize(3, 100.0, (288, 216), 3))
     monkeypatch.setattr(workflow, "_METHODS", methods)
     monkeypatch.setattr(workflow, "DEFAULT_METHOD", "pmlem-osl")
     monkeypatch.setattr(Figure, "savefig", _save_nothing)  # text takes most of the time of a page

@@ -8,11 +8,11 @@ from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.results.plane_files import plane_name
 from faintfield.pipelines.formats.results.records import Metrics
 from faintfield.pipelines.formats.sets.session_set import load_session
-from faintfield.pipelines.paper.demo import true_set, write_truth
 from faintfield.pipelines.reconstruction.options import Options
 from faintfield.pipelines.reconstruction.planes.accuracy import assess
 from faintfield.pipelines.reconstruction.request import DEFAULT_METHOD, Request, select_planes
 from faintfield.pipelines.reconstruction.run import reconstruct_set
+from faintfield.pipelines.workflows.demo import true_set, write_truth
 from faintfield.pipelines.workflows.session import run_steps, session_steps
 from tests.pipelines.sessions import captured, rig_toml
 

@@ -70,7 +70,7 @@ def test_failures_are_one_line_with_a_name(arguments: tuple[str, ...], named: st
 
 def test_unfit_stage_is_a_named_failure(faintfield: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     checks = [Check("homing", True, "2 s", "60 s"), Check("speed", False, "3 mm/s", "at least 50 mm/s")]
-    monkeypatch.setattr("faintfield.pipelines.commands.stage.check_conformance", lambda stage: iter(checks))
+    monkeypatch.setattr("faintfield.pipelines.workflows.stage.check_conformance", lambda stage: iter(checks))
     words = "speed: 3 mm/s, and at least 50 mm/s is asked for"
     assert_refused(faintfield("stage", "test", *GRBL), "StageUnfit", words)
 

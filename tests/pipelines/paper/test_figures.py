@@ -13,9 +13,17 @@ import numpy as np
 import pytest
 
 from faintfield.pipelines.paper import figure4, figure_drawings, figures
-from faintfield.pipelines.paper.figure4 import SNRS, StagedObject, is_monotone, mean_curves, over_best, stage_object
-from faintfield.pipelines.paper.figure_methods import METHODS
-from faintfield.pipelines.paper.figure_records import CurvePoint, ErrorPoint
+from faintfield.pipelines.paper.figure4 import (
+    METHODS,
+    SNRS,
+    CurvePoint,
+    ErrorPoint,
+    StagedObject,
+    is_monotone,
+    mean_curves,
+    over_best,
+    stage_object,
+)
 from faintfield.recon.metrics import expected_snr_from_powers
 from faintfield.rig.simulation.objects import shaded_ball, star_chart, toy_truck
 from tests.pipelines.conftest import Command, run_undrawn

@@ -1,0 +1,124 @@
+"""A stage brought up by hand, with the driver that captures use: `faintfield stage`."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+
+import msgspec
+from rich.table import Table
+from rich.text import Text
+
+from faintfield.pipelines.arguments import StageConnection
+from faintfield.pipelines.console import console, inform, visible
+from faintfield.pipelines.errors import BadValue, WrongUsage
+from faintfield.pipelines.formats.rig_file import read_rig_tables
+from faintfield.rig.devices import SIMULATED, SIMULATED_FIRMWARE, open_stage
+from faintfield.rig.errors import StageUnfit
+from faintfield.rig.simulation.controller.firmware import serving
+from faintfield.rig.stages.conformance import Check, check_conformance
+from faintfield.rig.stages.gantry import Gantry
+from faintfield.rig.stages.protocol import Identity, Point, Position, StageSettings
+
+
+class _RigFile(msgspec.Struct):
+    """The part of a rig.toml that describes the stage; other tables are ignored."""
+
+    stage: StageSettings
+
+
+def identify_stage(connection: StageConnection) -> Identity:
+    """Print firmware, travel and rates of a controller, and return its settings, too."""
+    with _connected(connection) as stage:
+        identity = stage.identify()
+        inform(f"{identity.firmware}, travel {stage.travel()}")
+        rates = " and ".join(f"{60.0 * rate:g}" for rate in identity.motion.rate_mm_per_s)
+        inform(f"rates {rates} mm/min; a position counts as reached within {max(identity.tolerance_mm):.4f} mm")
+        return identity
+
+
+def home_stage(connection: StageConnection) -> Position:
+    """Home a stage."""
+    with _connected(connection) as stage:
+        homing = stage.home()
+        inform(f"homed to {homing.position.point} in {homing.duration_s:.1f} s")
+        return homing.position
+
+
+def move_stage(connection: StageConnection, target: Point, home: bool) -> Position:
+    """Move to a position in machine coordinates, after homing if `home`; the path is checked before any motion."""
+    with _connected(connection) as stage:
+        stage.workspace().check_path([target])
+        if home:
+            stage.home()
+        position = stage.move_to(target.x_mm, target.y_mm)
+        inform(f"arrived at {position.point}")
+        return position
+
+
+def jog_stage(connection: StageConnection, dx_mm: float, dy_mm: float, unlock: bool) -> Position:
+    """Move by a short distance without homing."""
+    with _connected(connection) as stage:
+        position = stage.jog(dx_mm, dy_mm, unlock=unlock)
+        inform(f"reported at {position.point}; not homed, so the true position is unknown")
+        return position
+
+
+def check_stage(connection: StageConnection) -> list[Check]:
+    """Check what a capture relies on, and print a table; raise StageUnfit if a check failed."""
+    table, checks = Table("", "check", "measured", "limit"), []
+    with _connected(connection) as stage:
+        for check in check_conformance(stage):
+            inform(f"tried: {check.name}")
+            mark = "[green]passed[/]" if check.passed else "[bold red]FAILED[/]"
+            table.add_row(mark, *(Text(visible(text)) for text in (check.name, check.measured, check.limit)))
+            checks.append(check)
+    console.print(table)
+    failed = [check for check in checks if not check.passed]
+    if failed:
+        raise StageUnfit(
+            "; ".join(f"{check.name}: {check.measured}, and {check.limit} is asked for" for check in failed)
+            + "; mend that before a capture (docs/stage.md)"
+        )
+    return checks
+
+
+def serve_simulated_stage(protocol: str, speed: float) -> None:
+    """Serve a simulated controller on a port until Ctrl-C, with `speed` simulated seconds per real second."""
+    with serving(SIMULATED_FIRMWARE[protocol]) as server:
+        inform(f"a simulated {protocol} stage is at {server.port}; Ctrl-C ends it")
+        with suppress(KeyboardInterrupt):
+            server.run(speed)
+
+
+@contextmanager
+def _connected(connection: StageConnection) -> Iterator[Gantry]:
+    """Connect to a stage, print its warnings, and close the port at the end."""
+    try:
+        settings = _settings(connection)
+    except ValueError as failure:
+        raise BadValue(f"{failure}") from failure
+    stage = open_stage(settings)
+    stage.connect()
+    try:
+        for warning in stage.identify().warnings:
+            inform(f"warning: {warning}")
+        yield stage
+    finally:
+        stage.close()
+
+
+def _settings(connection: StageConnection) -> StageSettings:
+    port, protocol = connection.port, connection.protocol
+    stated = [name for name in ("port", "protocol", "baud") if getattr(connection, name) is not None]
+    if connection.rig is not None:
+        if stated:
+            raise WrongUsage(f"--rig describes the whole stage; leave out --{stated[0]}, or --rig")
+        return read_rig_tables(connection.rig, _RigFile).stage
+    if port is None:
+        raise WrongUsage("no stage is named; give --port, such as /dev/ttyUSB0 or simulated:grbl, or --rig rig.toml")
+    if not port.startswith(SIMULATED):
+        return StageSettings(protocol=protocol or "grbl", port=port, baud=connection.baud or 115200)
+    if protocol is not None:
+        raise WrongUsage(f"--port {port} names its protocol; leave out --protocol")
+    if port.removeprefix(SIMULATED) not in SIMULATED_FIRMWARE:
+        raise WrongUsage(f"--port {port}: no such stage is simulated; name one of {', '.join(SIMULATED_FIRMWARE)}")
+    return StageSettings(protocol="simulated", port=port)
