@@ -13,7 +13,7 @@ from faintfield.pipelines.errors import BadValue, WrongUsage
 from faintfield.pipelines.formats.rig_file import read_rig_tables
 from faintfield.rig.devices import SIMULATED, SIMULATED_FIRMWARE, open_stage
 from faintfield.rig.errors import StageUnfit
-from faintfield.rig.simulation.controller.firmware import serving
+from faintfield.rig.simulation.controller.bench import Server
 from faintfield.rig.stages.conformance import Check, check_conformance
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.protocol import Identity, Point, Position, StageSettings
@@ -83,10 +83,10 @@ def check_stage(connection: StageConnection) -> list[Check]:
 
 def serve_simulated_stage(protocol: str, speed: float) -> None:
     """Serve a simulated controller on a port until Ctrl-C, with `speed` simulated seconds per real second."""
-    with serving(SIMULATED_FIRMWARE[protocol]) as server:
-        inform(f"a simulated {protocol} stage is at {server.port}; Ctrl-C ends it")
-        with suppress(KeyboardInterrupt):
-            server.run(speed)
+    server = Server(SIMULATED_FIRMWARE[protocol])
+    inform(f"a simulated {protocol} stage is at {server.port}; Ctrl-C ends it")
+    with suppress(KeyboardInterrupt):
+        server.run(speed)
 
 
 @contextmanager

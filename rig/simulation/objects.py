@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.rig.simulation.scene import TexturedPlane
-from faintfield.rig.simulation.shapes import Cylinder, Rectangle, Shape, Sphere
-from faintfield.rig.simulation.surfaces import Surface
+from faintfield.rig.simulation.surfaces import Cylinder, Rectangle, Shape, Sphere, Surface
 
 # Objects are drawn this many times finer than the texture and averaged, so that edges are smooth.
 _OVERSAMPLING = 4

@@ -6,11 +6,10 @@ from operator import methodcaller
 from typing import Literal
 
 from faintfield.rig.simulation.controller.bench import Bench
-from faintfield.rig.simulation.controller.firmware import SimulatedFirmware
+from faintfield.rig.simulation.controller.firmware import ByteFilter, SimulatedFirmware
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.grblhal import SimulatedGrblHal
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
-from faintfield.rig.simulation.controller.wire import ByteFilter
 from tests.rig.stages.benches import firmware
 
 type Nature = Literal["wire", "controller", "mechanics"]

@@ -1,18 +1,26 @@
-"""A simulated controller with its mechanics, wire and clock, and a port for the driver."""
+"""A simulated controller with its mechanics, wire and clock, for the driver in this program or for other programs."""
 
 import os
+import select
 import tempfile
+import time
 import tty
 from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
 from faintfield.rig.errors import StageLost
-from faintfield.rig.simulation.controller.firmware import SimulatedFirmware
-from faintfield.rig.simulation.controller.wire import SimulatedClock, Wire
+from faintfield.rig.simulation.controller.firmware import SimulatedFirmware, Wire
+from faintfield.rig.simulation.controller.kinematics import SimulatedClock
 from faintfield.rig.stages.gantry import Gantry, serial_stage
 from faintfield.rig.stages.protocol import Point, StageSettings
 from faintfield.rig.stages.transport import Port, SerialPort, TrafficLog
+
+# Longest wait in s between two looks at a served port.
+_MAX_WAIT_S = 0.05
+
+type MakeFirmware = Callable[[SimulatedClock, Wire], SimulatedFirmware]
+"""Makes a controller: `SimulatedGrbl` or `SimulatedMarlin`, possibly with options."""
 
 
 class Link(Protocol):
@@ -39,7 +47,7 @@ class Link(Protocol):
 
 
 class DirectLink:
-    """A link within the program."""
+    """A link within the program, and the host's end of it."""
 
     url = "simulated:"
 
@@ -49,9 +57,8 @@ class DirectLink:
 
     def open(self) -> Port:
         """Return the host's end, emptied."""
-        self._require_plug()
+        self.read(0.0)
         self._written.clear()
-        self._readable.clear()
         return self
 
     def write(self, data: bytes) -> None:
@@ -150,10 +157,10 @@ class Bench:
 
     Parameters
     ----------
-    firmware : callable
-        Makes the controller from a clock and a wire: `SimulatedGrbl` or `SimulatedMarlin`, possibly with options.
-    link, resets_on_open : Link, bool
-        The cable, and whether opening the port restarts the controller, as it does on most boards.
+    firmware, link : callable, Link
+        Makes the controller; the cable.
+    resets_on_open : bool
+        Whether opening the port restarts the controller, as it does on most boards.
 
     Attributes
     ----------
@@ -161,13 +168,7 @@ class Bench:
         Until then the driver does not come to read what has arrived, as on a computer that is busy; faults raise it.
     """
 
-    def __init__(
-        self,
-        firmware: Callable[[SimulatedClock, Wire], SimulatedFirmware],
-        link: Link | None = None,
-        *,
-        resets_on_open: bool = True,
-    ) -> None:
+    def __init__(self, firmware: MakeFirmware, link: Link | None = None, *, resets_on_open: bool = True) -> None:
         self.clock = SimulatedClock()
         self.wire = Wire(self.clock)
         self.firmware = firmware(self.clock, self.wire)
@@ -242,3 +243,38 @@ class _SteppedPort:
 
     def close(self) -> None:
         self._port.close()
+
+
+class Server:
+    """A simulated controller behind a pseudo-terminal, whose device `port` other programs open."""
+
+    def __init__(self, make_firmware: MakeFirmware) -> None:
+        self._clock = SimulatedClock()
+        self._wire = Wire(self._clock)
+        self._firmware = make_firmware(self._clock, self._wire)
+        # The near end stays open, so that programs can connect again
+        self._far, self._near = os.openpty()
+        tty.setraw(self._near)
+        self.port = os.ttyname(self._near)
+
+    def run(self, speed: float = 1.0) -> None:
+        """Serve until interrupted, `speed` simulated seconds per real second."""
+        begun_s = time.monotonic()
+        while True:
+            self.turn(speed * (time.monotonic() - begun_s))
+            next_s = self._clock.next_event_s()
+            wait_s = _MAX_WAIT_S if next_s is None else (next_s - self._clock.now_s()) / speed
+            select.select([self._far], [], [], min(_MAX_WAIT_S, max(0.0, wait_s)))
+
+    def turn(self, now_s: float) -> None:
+        """Advance simulated time to `now_s`, and pass on the bytes in both directions."""
+        self._clock.sleep_s(max(0.0, now_s - self._clock.now_s()))
+        if self._wire.arrived():
+            os.write(self._far, self._wire.take())
+        if select.select([self._far], [], [], 0.0)[0]:
+            self._firmware.receive(self._wire.to_controller(os.read(self._far, 4096)))
+
+    def close(self) -> None:
+        """Remove the port."""
+        os.close(self._far)
+        os.close(self._near)

@@ -1,22 +1,92 @@
-"""Common parts of the simulated GRBL and Marlin: restarts, lines, homing, and a server that gives them a real port."""
+"""Common parts of the simulated GRBL and Marlin: the serial wire, restarts, lines and homing."""
 
-import os
+import math
 import re
-import select
-import time
-import tty
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
 from typing import ClassVar
 
-from faintfield.rig.simulation.controller.kinematics import Mechanics
-from faintfield.rig.simulation.controller.wire import ScheduledEvent, SimulatedClock, Wire
+from faintfield.rig.simulation.controller.kinematics import Mechanics, ScheduledEvent, SimulatedClock
 from faintfield.rig.stages.protocol import ProtocolName
 
+# At 115200 baud; a byte takes ten bits.
+_SECONDS_PER_BYTE = 10.0 / 115200.0
+
+# Time in s until the controller's first byte is on the wire.
+_LATENCY_S = 0.002
+
+# Motions that the planner holds.
+_PLANNER_BLOCKS = 16
+
 WORD = re.compile(r"([A-Z])(-?\d+(?:\.\d+)?)")
+
+type ByteFilter = Callable[[bytes], bytes]
+"""Returns the bytes that arrive for the bytes that were sent."""
+
+
+class Wire:
+    """Carries bytes in both directions at 115200 baud, through filters.
+
+    Attributes
+    ----------
+    filters_to_controller, filters_to_host : list
+        Filters of the bytes, in order; faults add filters.
+    connected : bool
+        Whether the cable is plugged in.
+    """
+
+    def __init__(self, clock: SimulatedClock) -> None:
+        self.filters_to_controller: list[ByteFilter] = []
+        self.filters_to_host: list[ByteFilter] = []
+        self.connected = True
+        self._clock = clock
+        self._free_at_s = 0.0
+        self._arrived = bytearray()
+        self._under_way: list[ScheduledEvent] = []
+
+    def to_controller(self, data: bytes) -> bytes:
+        """Return the bytes that arrive at the controller when the host sends `data`."""
+        return _apply_filters(data, self.filters_to_controller)
+
+    def to_host(self, data: bytes) -> None:
+        """Send `data` to the host, after what is already on the wire."""
+        now_s = self._clock.now_s()
+        self._free_at_s = max(self._free_at_s, now_s + _LATENCY_S) + len(data) * _SECONDS_PER_BYTE
+        self._under_way.append(self._clock.after(self._free_at_s - now_s, lambda: self._arrive(data)))
+
+    def hold_up(self, duration_s: float) -> None:
+        """Delay all further bytes to the host by `duration_s`."""
+        self._free_at_s = self._clock.now_s() + duration_s
+
+    def arrived(self) -> bool:
+        """Return whether bytes have arrived at the host."""
+        return bool(self._arrived)
+
+    def take(self) -> bytes:
+        """Return and remove the bytes that have arrived at the host."""
+        data = bytes(self._arrived)
+        self._arrived.clear()
+        return data
+
+    def clear(self) -> None:
+        """Discard the bytes that are under way or not yet read."""
+        for event in self._under_way:
+            event.cancel()
+        self._under_way.clear()
+        self._arrived.clear()
+        self._free_at_s = 0.0
+
+    def _arrive(self, data: bytes) -> None:
+        del self._under_way[0]
+        if self.connected:
+            self._arrived += _apply_filters(data, self.filters_to_host)
+
+
+def _apply_filters(data: bytes, filters: list[ByteFilter]) -> bytes:
+    for apply in tuple(filters):
+        data = apply(data)
+    return data
 
 
 def parse_parameters(text: str) -> dict[str, float]:
@@ -25,14 +95,7 @@ def parse_parameters(text: str) -> dict[str, float]:
 
 
 class SimulatedFirmware(ABC):
-    """A simulated controller.
-
-    Parameters
-    ----------
-    clock, wire, mechanics : SimulatedClock, Wire, Mechanics
-        The simulated time, the serial line to the host, and the motors.
-    boot_s : float
-        Time from a restart to the first line that it sends.
+    """A simulated controller; `boot_s` is the time from a restart to the first line that it sends.
 
     Attributes
     ----------
@@ -49,7 +112,6 @@ class SimulatedFirmware(ABC):
         self.mechanics = mechanics
         self.boot_s = boot_s
         self.homing_slowdown = 1.0
-        self._line, self._waiting = bytearray(), deque[str]()
         self._boot: ScheduledEvent | None = None
         self._homing: ScheduledEvent | None = None
         mechanics.on_idle = self._motion_ended
@@ -93,10 +155,43 @@ class SimulatedFirmware(ABC):
     def _motion_ended(self) -> None:
         """React to the end of the last motion."""
 
-    def _start_homing(self, duration_s: float, finish: Callable[[], None]) -> None:
+    @abstractmethod
+    def _ready(self) -> bool:
+        """Return whether the next line can be run."""
+
+    @abstractmethod
+    def _run_line(self, line: str) -> None:
+        """Run a line, and answer it."""
+
+    @abstractmethod
+    def _homed(self, axes: Iterable[int]) -> None:
+        """Note that axes were homed."""
+
+    def _run_lines(self) -> None:
+        while self._waiting and self._ready() and self.mechanics.queued() < _PLANNER_BLOCKS:
+            self._run_line(self._waiting.popleft())
+
+    def _distances_to_switches(self, axes: Iterable[int], reach_mm: float) -> list[float]:
+        """Return the distance of each carriage from its switch, infinity where it is not found within `reach_mm`."""
+        distances_mm = map(abs, self.mechanics.true_mm())
+        ways = list(zip(self.mechanics.axes, distances_mm, strict=True))
+        return [math.inf if ways[i][0].stuck or ways[i][1] > reach_mm else ways[i][1] for i in axes]
+
+    def _start_homing(
+        self, axes: Iterable[int], position_mm: float, duration_s: float, fail: Callable[[], None] | None
+    ) -> None:
+        """Let axes be at `position_mm` after some time, or `fail`."""
+
         def end() -> None:
             self._homing = None
-            finish()
+            if fail is not None:
+                fail()
+                return
+            for axis in axes:
+                self.mechanics.set_homed(axis, position_mm)
+            self._homed(axes)
+            self.say("ok")
+            self._run_lines()
 
         self._homing = self.clock.after(self.homing_slowdown * duration_s, end)
 
@@ -104,50 +199,3 @@ class SimulatedFirmware(ABC):
         if self._homing is not None:
             self._homing.cancel()
             self._homing = None
-
-
-# Longest wait in s between two looks at the port.
-_MAX_WAIT_S = 0.05
-
-
-@dataclass
-class Server:
-    """A simulated controller, and the device `port` that other programs open."""
-
-    port: str
-    _clock: SimulatedClock
-    _wire: Wire
-    _firmware: SimulatedFirmware
-    _far: int
-
-    def run(self, speed: float = 1.0) -> None:
-        """Serve until interrupted, `speed` simulated seconds per real second."""
-        begun_s = time.monotonic()
-        while True:
-            self.turn(speed * (time.monotonic() - begun_s))
-            next_s = self._clock.next_event_s()
-            wait_s = _MAX_WAIT_S if next_s is None else (next_s - self._clock.now_s()) / speed
-            select.select([self._far], [], [], min(_MAX_WAIT_S, max(0.0, wait_s)))
-
-    def turn(self, now_s: float) -> None:
-        """Advance simulated time to `now_s`, and pass on the bytes in both directions."""
-        self._clock.sleep_s(max(0.0, now_s - self._clock.now_s()))
-        if self._wire.arrived():
-            os.write(self._far, self._wire.take())
-        if select.select([self._far], [], [], 0.0)[0]:
-            self._firmware.receive(self._wire.to_controller(os.read(self._far, 4096)))
-
-
-@contextmanager
-def serving(firmware: Callable[[SimulatedClock, Wire], SimulatedFirmware]) -> Iterator[Server]:
-    """Open a pseudo-terminal with the controller behind it that `firmware` makes, and close it at the end."""
-    clock = SimulatedClock()
-    wire = Wire(clock)
-    far, near = os.openpty()
-    tty.setraw(near)
-    try:
-        # The near end stays open, so that programs can connect again.
-        yield Server(os.ttyname(near), clock, wire, firmware(clock, wire), far)
-    finally:
-        os.close(far)
-        os.close(near)

@@ -5,25 +5,60 @@ during motion loses the position (ALARM:3); after ALARM:1 and 2 everything but a
 before GRBL has asked for it; a failed homing still answers `ok`; and only some reports carry the work offset.
 """
 
+import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from operator import sub
 from typing import ClassVar
 
-from faintfield.rig.simulation.controller.firmware import SimulatedFirmware, parse_parameters
-from faintfield.rig.simulation.controller.grbl_settings import StoredSettings, jog_error
-from faintfield.rig.simulation.controller.kinematics import Axis, Mechanics, Vector
-from faintfield.rig.simulation.controller.wire import SimulatedClock, Wire
+from faintfield.rig.simulation.controller.firmware import WORD, SimulatedFirmware, Wire, parse_parameters
+from faintfield.rig.simulation.controller.kinematics import Axis, Mechanics, SimulatedClock, Vector, along
 
-# Sizes of GRBL's line (bytes), receive buffer (bytes) and planner (motions).
-_LINE_BYTES, _BUFFER_BYTES, _PLANNER_BLOCKS = 80, 128, 15
+# Sizes in bytes of GRBL's line and receive buffer.
+_LINE_BYTES, _BUFFER_BYTES = 80, 128
 
 # The work offset is in every 30th report while moving, and in every 10th at rest.
 _OFFSET_EVERY_BUSY, _OFFSET_EVERY_IDLE = 30, 10
 
 _ALARM_DELAY_S = 0.05  # from a critical alarm until a reset is accepted
 
-_RESUMED_MM_PER_MIN = 6000.0  # rate of motion that was held and goes on
+_RAPID_MM_PER_MIN = 6000.0  # of motion without a rate, and of motion that was held and goes on
+
+DEFAULTS = {
+    0: "10", 1: "255", 2: "0", 3: "0", 4: "0", 5: "0", 6: "0", 10: "1", 11: "0.010", 12: "0.002", 13: "0",
+    20: "1", 21: "1", 22: "1", 23: "0", 24: "100.000", 25: "1500.000", 26: "250", 27: "1.000", 30: "1000",
+    31: "0", 32: "0", 100: "80.000", 101: "80.000", 102: "80.000", 110: "6000.000", 111: "6000.000",
+    112: "500.000", 120: "500.000", 121: "500.000", 122: "10.000", 130: "400.000", 131: "400.000", 132: "100.000",
+}  # fmt: skip
+
+
+class StoredSettings(dict[int, str]):
+    """Values by `$` number, as text."""
+
+    def number(self, setting: int) -> float:
+        """Return a setting as a number."""
+        return float(self[setting])
+
+    def travel_mm(self) -> tuple[float, float]:
+        """Return the lengths of both axes."""
+        return self.number(130), self.number(131)
+
+    def allows(self, target: Sequence[float], margin_mm: float) -> bool:
+        """Return whether the soft limits, which keep a margin from the ends if they are enabled, allow a position."""
+        ways = zip(self.travel_mm(), target, strict=True)
+        return all(margin_mm - length <= value <= -margin_mm for length, value in ways) or not self.number(20)
+
+    def speed_and_acceleration(
+        self, start: Sequence[float], target: Sequence[float], feed_mm_per_min: float
+    ) -> tuple[float, float]:
+        """Return the requested speed, limited by the axes' rates, and their highest acceleration (mm, s)."""
+        speed = min(feed_mm_per_min, along((self.number(110), self.number(111)), start, target)) / 60.0
+        return speed, along((self.number(120), self.number(121)), start, target)
+
+    def homing_s(self, distance_mm: float) -> float:
+        """Return the time to seek a switch `distance_mm` away, back off, and find it again slowly."""
+        seek, locate, pull_off = self.number(25) / 60.0, self.number(24) / 60.0, self.number(27)
+        return distance_mm / seek + 2.0 * pull_off / seek + pull_off / locate + 4.0 * self.number(26) / 1000.0
 
 
 class SimulatedGrbl(SimulatedFirmware):
@@ -31,8 +66,6 @@ class SimulatedGrbl(SimulatedFirmware):
 
     Parameters
     ----------
-    clock, wire : SimulatedClock, Wire
-        The simulated time, and the serial line to the host.
     settings : dict
         Values that differ from the defaults, by `$` number; settings survive restarts.
     boot_s, play_mm : float
@@ -45,11 +78,10 @@ class SimulatedGrbl(SimulatedFirmware):
     """
 
     door_is_open = False
-
     protocol = "grbl"
     _line_end = b"\r\n"
     _critical_alarms: ClassVar[tuple[int, ...]] = (1, 2)
-    _settings_type: ClassVar[type[StoredSettings]] = StoredSettings
+    _defaults: ClassVar[dict[int, str]] = DEFAULTS
 
     def __init__(
         self,
@@ -60,7 +92,7 @@ class SimulatedGrbl(SimulatedFirmware):
         boot_s: float = 1.0,
         play_mm: float = 0.0,
     ) -> None:
-        self.settings = self._settings_type(settings or {})
+        self.settings = StoredSettings(self._defaults | (settings or {}))
         self._realtime: dict[int, Callable[[], None]] = {
             ord("?"): self._report,
             ord("!"): self._hold,
@@ -70,8 +102,7 @@ class SimulatedGrbl(SimulatedFirmware):
             0x85: self._cancel_jog,
         }
         x, y = (Axis(-length - 5.0, 2.0, -0.5 * length, play_mm) for length in self.settings.travel_mm())
-        mechanics = Mechanics(clock, (x, y), 1.0 / self.settings.number(100), (0.0, 0.0), switch_at_high_end=True)
-        mechanics.on_switch = self._switch_hit
+        mechanics = Mechanics(clock, (x, y), 1.0 / self.settings.number(100), 1.0, on_switch=self._switch_hit)
         super().__init__(clock, wire, mechanics, boot_s)
 
     def _reset_state(self) -> None:
@@ -93,6 +124,9 @@ class SimulatedGrbl(SimulatedFirmware):
     def _deaf(self) -> bool:
         """Return whether GRBL hears nothing but a reset."""
         return self.critical
+
+    def _ready(self) -> bool:
+        return not self._deaf() and self._homing is None
 
     def alarm(self, code: int) -> None:
         """Stop with an alarm."""
@@ -199,12 +233,11 @@ class SimulatedGrbl(SimulatedFirmware):
         return "".join(axis for axis, closed in zip("XY", self.mechanics.switches(), strict=True) if closed)
 
     def _resume(self) -> None:
-        if self.state not in ("Hold:0", "Door:0"):
-            return
-        self.state = "Idle"
-        held, self._held = self._held, []
-        for target in held:
-            self._queue(target, _RESUMED_MM_PER_MIN, "Run")
+        if self.state in ("Hold:0", "Door:0"):
+            self.state = "Idle"
+            held, self._held = self._held, []
+            for target in held:
+                self._queue(target, _RAPID_MM_PER_MIN, "Run")
 
     def _take(self, byte: int) -> None:
         if byte in b"\r\n":
@@ -213,15 +246,10 @@ class SimulatedGrbl(SimulatedFirmware):
         elif len(self._line) + sum(map(len, self._waiting)) < _BUFFER_BYTES:
             self._line.append(byte)
 
-    def _run_lines(self) -> None:
-        while self._waiting and not self._deaf() and self._homing is None:
-            if self.mechanics.queued() > _PLANNER_BLOCKS:
-                return
-            line = self._waiting.popleft()
-            if len(line) >= _LINE_BYTES:
-                self.say("error:11")
-            elif (error := self._run(line.replace(" ", "").upper())) is not None:
-                self.say(f"error:{error}" if error else "ok")
+    def _run_line(self, line: str) -> None:
+        error = 11 if len(line) >= _LINE_BYTES else self._run(line.replace(" ", "").upper())
+        if error is not None:
+            self.say(f"error:{error}" if error else "ok")
 
     def _run(self, line: str) -> int | None:
         """Run one line; return its error, 0 for ok, or None if the answer comes later."""
@@ -242,23 +270,41 @@ class SimulatedGrbl(SimulatedFirmware):
         if self.state not in ("Idle", "Alarm"):
             return 8
         if match := re.fullmatch(r"\$H([XY]?)", line):
-            if match[1] and not self.settings.homes_singly():
+            if match[1] and not self._homes_singly():
                 return 3
             return self._home(["XY".index(match[1])] if match[1] else [0, 1])
-        answer = self.settings.answer(line)
-        if answer is None:
+        if line == "$I":
+            self.say(*self._build_info())
+        elif line == "$$":
+            self.say(*(f"${number}={value}" for number, value in self.settings.items()))
+        elif match := re.fullmatch(r"\$(\d+)=(\d+(?:\.\d+)?)", line):
+            self.settings[int(match[1])] = match[2]
+        else:
             return 3
-        self.say(*answer)
         return 0
+
+    def _build_info(self) -> tuple[str, ...]:
+        return ("[VER:1.1h.20190830:]", "[OPT:V,15,128]")
+
+    def _homes_singly(self) -> bool:
+        return False
+
+    def _margin_mm(self) -> float:
+        """Return how far from the ends of the travel the soft limits lie."""
+        return 0.0
 
     def _jog(self, text: str) -> int:
         if self.state not in ("Idle", "Jog"):
             return 9
-        if error := jog_error(text):
-            return error
-        parsed = parse_parameters(text)
+        parsed, modes = parse_parameters(text), set(re.findall(r"G\d+", text))
+        if not parsed.keys() <= set("GXYZF") or not modes <= {"G20", "G21", "G90", "G91", "G53"} or WORD.sub("", text):
+            return 16
+        if "F" not in parsed:
+            return 22
+        if not parsed.keys() & {"X", "Y"}:
+            return 16
         target = self._target(parsed, relative="G91" in text, machine="G53" in text)
-        if not self.settings.allows(target):
+        if not self.settings.allows(target, self._margin_mm()):
             return 15
         self._queue(target, parsed["F"], "Jog")
         return 0
@@ -275,18 +321,17 @@ class SimulatedGrbl(SimulatedFirmware):
         if not parsed.keys() & {"X", "Y"}:
             return 26
         target = self._target(parsed, relative=False, machine="G53" in line)
-        if not self.settings.allows(target):
+        if not self.settings.allows(target, self._margin_mm()):
             self.alarm(2)
         else:
-            self._queue(target, parsed.get("F", 6000.0), "Run")
+            self._queue(target, parsed.get("F", _RAPID_MM_PER_MIN), "Run")
         return 0
 
     def _target(self, axis_words: dict[str, float], *, relative: bool, machine: bool) -> tuple[float, float]:
-        values = []
-        for axis, here, offset in zip("XY", self.mechanics.planned_mm(), self.work_offset, strict=False):
-            base = here if relative else 0.0 if machine else offset
-            values.append(base + axis_words[axis] if axis in axis_words else here)
-        return values[0], values[1]
+        here = self.mechanics.planned_mm()
+        base = here if relative else (0.0, 0.0) if machine else self.work_offset
+        x, y = (base[i] + axis_words[axis] if axis in axis_words else here[i] for i, axis in enumerate("XY"))
+        return x, y
 
     def _queue(self, target: Vector, feed_mm_per_min: float, state: str) -> None:
         start = self.mechanics.planned_mm()
@@ -297,21 +342,16 @@ class SimulatedGrbl(SimulatedFirmware):
         """Start homing: the axes seek at once, back off, and find the switch again slowly."""
         if not self.settings.number(22):
             return 5
-        distances_mm = self.mechanics.homing_distances_mm()
-        farthest_mm = max(distances_mm[axis] for axis in axes)
         reach_mm = 1.5 * max(self.settings.travel_mm())
-        lost = any(self.mechanics.axes[axis].stuck for axis in axes) or farthest_mm > reach_mm
+        farthest_mm = max(self._distances_to_switches(axes, reach_mm))
         self.state = "Home"
-        duration_s = self.settings.homing_s(reach_mm if lost else farthest_mm)
-        self._start_homing(duration_s, (lambda: self.alarm(9)) if lost else (lambda: self._homed(axes)))
+        fail = (lambda: self.alarm(9)) if farthest_mm == math.inf else None
+        position_mm = -self.settings.number(27)
+        self._start_homing(axes, position_mm, self.settings.homing_s(min(farthest_mm, reach_mm)), fail)
         return None
 
-    def _homed(self, axes: Sequence[int]) -> None:
-        for axis in axes:
-            self.mechanics.set_homed(axis, -self.settings.number(27), -self.settings.number(27))
+    def _homed(self, axes: Iterable[int]) -> None:
         self.state = "Idle"
-        self.say("ok")
-        self._run_lines()
 
 
 def _vector(values: Sequence[float]) -> str:

@@ -8,8 +8,7 @@ accepted while it is pressed. After power-up it raises ALARM:11 until it is home
 
 from typing import ClassVar
 
-from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
-from faintfield.rig.simulation.controller.grbl_settings import StoredSettings
+from faintfield.rig.simulation.controller.grbl import DEFAULTS, SimulatedGrbl
 
 _HOMING_REQUIRED = 11
 
@@ -17,30 +16,11 @@ _HOMING_REQUIRED = 11
 _HARMLESS = ("", "$I", "$$")
 
 
-class _HalSettings(StoredSettings):
-    """The `$` settings of grblHAL."""
-
-    def __init__(self, changes: dict[int, str]) -> None:
-        super().__init__({22: "7", 40: "0", **changes})
-
-    def margin_mm(self) -> float:
-        return self.number(27) if int(self.number(21)) & 1 else 0.0
-
-    def homes_singly(self) -> bool:
-        return bool(int(self.number(22)) & 2)
-
-    def answer(self, command: str) -> list[str] | None:
-        if command != "$I":
-            return super().answer(command)
-        single = "H" if self.homes_singly() else ""
-        return ["[VER:1.1f.20250225:]", f"[OPT:VNM{single}L,100,1024,3,0]", "[AXS:3:XYZ]", "[FIRMWARE:grblHAL]"]
-
-
 class SimulatedGrblHal(SimulatedGrbl):
     """Firmware, settings and mechanics of a grblHAL stage; the parameters are those of `SimulatedGrbl`."""
 
     _critical_alarms: ClassVar[tuple[int, ...]] = (1, 2, 10, 17)
-    _settings_type = _HalSettings
+    _defaults = DEFAULTS | {22: "7", 40: "0"}
 
     def _reset_state(self) -> None:
         super()._reset_state()
@@ -85,6 +65,19 @@ class SimulatedGrblHal(SimulatedGrbl):
     def _deaf(self) -> bool:
         return False
 
+    def _ready(self) -> bool:
+        return not self._frozen and super()._ready()
+
+    def _build_info(self) -> tuple[str, ...]:
+        single = "H" if self._homes_singly() else ""
+        return ("[VER:1.1f.20250225:]", f"[OPT:VNM{single}L,100,1024,3,0]", "[AXS:3:XYZ]", "[FIRMWARE:grblHAL]")
+
+    def _homes_singly(self) -> bool:
+        return bool(int(self.settings.number(22)) & 2)
+
+    def _margin_mm(self) -> float:
+        return self.settings.number(27) if int(self.settings.number(21)) & 1 else 0.0
+
     def _reported_state(self) -> str:
         return f"Alarm:{self._alarm}" if self.state == "Alarm" and self._alarm else self.state
 
@@ -111,10 +104,6 @@ class SimulatedGrblHal(SimulatedGrbl):
         if self._frozen:
             self._frozen, self.state = False, "Hold:0"
         super()._resume()
-
-    def _run_lines(self) -> None:
-        if not self._frozen:
-            super()._run_lines()
 
     def _run(self, line: str) -> int | None:
         if self.critical and line not in _HARMLESS:

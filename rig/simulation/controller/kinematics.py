@@ -1,24 +1,80 @@
-"""Simulates motors, carriages and switches: the commanded and the true position of the stage.
+"""Simulates time, motors, carriages and switches: the commanded and the true position of the stage.
 
 The controller counts the steps that it sends (the commanded position). The carriage follows, except for play in the
 drive, lost steps, an axis that is stuck, and the ends of the travel.
 """
 
+import heapq
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from faintfield.rig.simulation.controller.wire import ScheduledEvent, SimulatedClock
-
 type Vector = tuple[float, ...]
+
+
+@dataclass(order=True)
+class ScheduledEvent:
+    """An action at a future time, unless it is cancelled."""
+
+    at_s: float
+    order: int
+    action: Callable[[], None] = field(compare=False)
+    cancelled: bool = field(default=False, compare=False)
+
+    def cancel(self) -> None:
+        """Prevent the action."""
+        self.cancelled = True
+
+
+class SimulatedClock:
+    """A `Clock` that runs scheduled events.
+
+    Waiting runs the events that are due, in order and each at its own time. Time does not pass otherwise, so a
+    simulation gives the same result on any computer, however busy.
+    """
+
+    def __init__(self) -> None:
+        self._now_s = 0.0
+        self._events: list[ScheduledEvent] = []
+        self._order = itertools.count()
+
+    def now_s(self) -> float:
+        """Return the simulated time in seconds since the clock was made."""
+        return self._now_s
+
+    def sleep_s(self, duration_s: float) -> None:
+        """Advance by `duration_s` simulated seconds."""
+        deadline_s = self._now_s + duration_s
+        while self.step(deadline_s):
+            pass
+
+    def after(self, delay_s: float, action: Callable[[], None]) -> ScheduledEvent:
+        """Schedule `action` after `delay_s`."""
+        event = ScheduledEvent(self._now_s + max(0.0, delay_s), next(self._order), action)
+        heapq.heappush(self._events, event)
+        return event
+
+    def step(self, until_s: float) -> bool:
+        """Run the next event up to `until_s`; if there is none, advance to `until_s` and return False."""
+        next_s = self.next_event_s()
+        if next_s is None or next_s > until_s:
+            self._now_s = max(self._now_s, until_s)
+            return False
+        self._now_s = max(self._now_s, next_s)
+        heapq.heappop(self._events).action()
+        return True
+
+    def next_event_s(self) -> float | None:
+        """Return the time of the next event, None if there is none."""
+        while self._events and self._events[0].cancelled:
+            heapq.heappop(self._events)
+        return self._events[0].at_s if self._events else None
 
 
 @dataclass(frozen=True)
 class Profile:
-    """Speed along a straight line over time, in pieces of constant acceleration.
-
-    Each piece has a duration (s), an initial speed (mm/s) and an acceleration (mm/s²).
-    """
+    """Speed along a straight line over time: pieces of duration (s), initial speed (mm/s) and acceleration (mm/s²)."""
 
     pieces: tuple[tuple[float, float, float], ...]
 
@@ -62,8 +118,12 @@ class Motion:
         """Return the commanded position and the speed at `now_s`."""
         length = math.dist(self.start, self.end)
         covered, speed = self.profile.at(now_s - self.begun_s)
-        share = min(1.0, covered / length) if length else 1.0
-        return tuple(a + share * (b - a) for a, b in zip(self.start, self.end, strict=True)), speed
+        return interpolate(self.start, self.end, min(1.0, covered / length) if length else 1.0), speed
+
+
+def interpolate(start: Vector, end: Vector, share: float) -> Vector:
+    """Return the point at a share of the way from `start` to `end`."""
+    return tuple(a + share * (b - a) for a, b in zip(start, end, strict=True))
 
 
 @dataclass
@@ -109,9 +169,7 @@ class Axis:
 
 @dataclass
 class Mechanics:
-    """The mechanics of a stage with two axes.
-
-    Motions are queued and run one after the other, each from rest to rest.
+    """The mechanics of a stage with two axes, whose motions are queued and run one by one, each from rest to rest.
 
     Parameters
     ----------
@@ -119,8 +177,8 @@ class Mechanics:
         The simulated time; x and y.
     step_mm : float
         Distance of one motor step.
-    switch_mm, switch_at_high_end : (float, float), bool
-        Positions at which the homing switches close, and whether these are the upper ends of the travel.
+    switch_sign : float
+        1 if the homing switches, which close at 0 mm, are at the upper ends of the travel, −1 if at the lower ends.
     on_idle, on_switch : callable
         Called when the last motion ends, and when a motion closes a switch.
     endless : bool
@@ -130,8 +188,7 @@ class Mechanics:
     clock: SimulatedClock
     axes: tuple[Axis, Axis]
     step_mm: float
-    switch_mm: tuple[float, float]
-    switch_at_high_end: bool
+    switch_sign: float
     on_idle: Callable[[], None] = lambda: None
     on_switch: Callable[[], None] = lambda: None
     endless: bool = False
@@ -158,8 +215,7 @@ class Mechanics:
 
     def switches(self) -> tuple[bool, ...]:
         """Return whether each axis's homing switch is closed."""
-        sign = 1.0 if self.switch_at_high_end else -1.0
-        return tuple(sign * (t - s) >= -1e-9 for t, s in zip(self.true_mm(), self.switch_mm, strict=True))
+        return tuple(self.switch_sign * position >= -1e-9 for position in self.true_mm())
 
     def set_count(self, position: Sequence[float]) -> None:
         """Set the controller's count to `position` without moving."""
@@ -169,8 +225,7 @@ class Mechanics:
 
     def queue(self, target: Sequence[float], speed: float, acceleration: float) -> None:
         """Queue a motion to `target`, rounded to steps."""
-        rounded = tuple(round(value / self.step_mm) * self.step_mm for value in target)
-        self._queue.append((rounded, speed, acceleration))
+        self._queue.append((self._whole_steps(target), speed, acceleration))
         if self._motion is None:
             self._start_next()
 
@@ -196,10 +251,7 @@ class Mechanics:
         if speed == 0.0 or remaining == 0.0:
             return ahead
         stopping_s = speed / motion.acceleration
-        share = min(1.0, 0.5 * speed * stopping_s / remaining)
-        end = tuple(
-            round((a + share * (b - a)) / self.step_mm) * self.step_mm for a, b in zip(here, motion.end, strict=True)
-        )
+        end = self._whole_steps(interpolate(here, motion.end, min(1.0, 0.5 * speed * stopping_s / remaining)))
         profile = Profile(((stopping_s, speed, -motion.acceleration),))
         self._begin(Motion(here, end, profile, motion.acceleration, self.clock.now_s()))
         return ahead
@@ -210,17 +262,16 @@ class Mechanics:
         self._queue.clear()
         self._end_motion()
 
-    def homing_distances_mm(self) -> Vector:
-        """Return the distance of each carriage from its switch."""
-        return tuple(abs(s - t) for s, t in zip(self.switch_mm, self.true_mm(), strict=True))
-
-    def set_homed(self, axis: int, position_mm: float, carriage_mm: float) -> None:
-        """Put one carriage at `carriage_mm` with the count `position_mm`, as homing leaves it."""
-        self.axes[axis].carriage_mm = carriage_mm
-        self.axes[axis].slip_mm = carriage_mm - position_mm
+    def set_homed(self, axis: int, position_mm: float) -> None:
+        """Put one carriage at `position_mm`, which its count agrees with, as homing leaves it."""
+        self.axes[axis].carriage_mm = position_mm
+        self.axes[axis].slip_mm = 0.0
         values = list(self._commanded)
         values[axis] = position_mm
         self._commanded = tuple(values)
+
+    def _whole_steps(self, position: Sequence[float]) -> Vector:
+        return tuple(round(value / self.step_mm) * self.step_mm for value in position)
 
     def _start_next(self) -> None:
         target, speed, acceleration = self._queue.pop(0)
@@ -232,13 +283,11 @@ class Mechanics:
         self._end_motion()
         self._motion = motion
         self._events = [] if self.endless else [self.clock.after(motion.profile.duration_s, self._finish)]
-        if not any(self.switches()) and (hit_s := self._first_contact_s(motion)) is not None:
-            self._events.append(self.clock.after(hit_s, self.on_switch))
+        if not any(self.switches()) and self._contact_at(motion.end):
+            self._events.append(self.clock.after(self._first_contact_s(motion), self.on_switch))
 
-    def _first_contact_s(self, motion: Motion) -> float | None:
-        """Return the time from the start of `motion` until it closes a switch, or None."""
-        if not self._contact_at(motion.end):
-            return None
+    def _first_contact_s(self, motion: Motion) -> float:
+        """Return the time from the start of `motion`, at whose end a switch is closed, until it closes one."""
         low, high = 0.0, motion.profile.duration_s
         for _ in range(40):
             middle = 0.5 * (low + high)
@@ -247,10 +296,9 @@ class Mechanics:
         return high
 
     def _contact_at(self, commanded: Vector) -> bool:
-        sign = 1.0 if self.switch_at_high_end else -1.0
         return any(
-            not axis.stuck and sign * (value + axis.slip_mm - switch) >= -1e-9
-            for axis, value, switch in zip(self.axes, commanded, self.switch_mm, strict=True)
+            not axis.stuck and self.switch_sign * (value + axis.slip_mm) >= -1e-9
+            for axis, value in zip(self.axes, commanded, strict=True)
         )
 
     def _finish(self) -> None:

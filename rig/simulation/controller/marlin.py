@@ -6,17 +6,14 @@ motion without slowing down; the motors are released after two idle minutes unle
 controller is silent until it is restarted.
 """
 
+import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from functools import reduce
 from operator import xor
 
-from faintfield.rig.simulation.controller.firmware import SimulatedFirmware, parse_parameters
-from faintfield.rig.simulation.controller.kinematics import Axis, Mechanics, along
-from faintfield.rig.simulation.controller.wire import ScheduledEvent, SimulatedClock, Wire
-
-# Motions that the planner holds.
-_PLANNER_BLOCKS = 16
+from faintfield.rig.simulation.controller.firmware import SimulatedFirmware, Wire, parse_parameters
+from faintfield.rig.simulation.controller.kinematics import Axis, Mechanics, ScheduledEvent, SimulatedClock, along
 
 # Interval in s of the busy messages while a command is executed.
 _BUSY_EVERY_S = 2.0
@@ -33,8 +30,6 @@ class SimulatedMarlin(SimulatedFirmware):
 
     Parameters
     ----------
-    clock, wire : SimulatedClock, Wire
-        The simulated time, and the serial line to the host.
     travel_mm : (float, float)
         Lengths of the axes; coordinates run upwards from zero, where the switches are.
     boot_s, play_mm : float
@@ -61,7 +56,7 @@ class SimulatedMarlin(SimulatedFirmware):
         self._realtime_position = realtime_position
         self._motors_off: ScheduledEvent | None = None
         x, y = (Axis(-2.0, length + 5.0, 0.5 * length, play_mm) for length in travel_mm)
-        mechanics = Mechanics(clock, (x, y), 1.0 / self.settings["M92"], (0.0, 0.0), switch_at_high_end=False)
+        mechanics = Mechanics(clock, (x, y), 1.0 / self.settings["M92"], -1.0)
         super().__init__(clock, wire, mechanics, boot_s)
 
     def _reset_state(self) -> None:
@@ -108,21 +103,19 @@ class SimulatedMarlin(SimulatedFirmware):
         self.say("start", "echo:Marlin 2.1.2.4", "echo: Last Updated: 2024-06-01", "echo:EEPROM OK")
         self._watch_idle()
 
-    def _run_lines(self) -> None:
-        while self._waiting and self.alive and self._awaited is None:
-            if self.mechanics.queued() >= _PLANNER_BLOCKS:
-                return
-            line = self._waiting.popleft()
-            command = self._checked(line)
-            if command is not None:
-                self._run(command)
+    def _ready(self) -> bool:
+        return self.alive and self._awaited is None
+
+    def _run_line(self, line: str) -> None:
+        if (command := self._checked(line)) is not None:
+            self._run(command)
 
     def _checked(self, line: str) -> str | None:
         """Return the command in a line, or None after asking for the line again."""
         match = re.fullmatch(r"N(\d+) (.*)\*(\d+)", line)
+        if not line.startswith("N"):
+            return line
         if not match:
-            if not line.startswith("N"):
-                return line
             self._ask_again("No Checksum with line number")
             return None
         if reduce(xor, line.rpartition("*")[0].encode("ascii", errors="replace")) != int(match[3]):
@@ -178,35 +171,29 @@ class SimulatedMarlin(SimulatedFirmware):
         self.mechanics.queue(target, speed, acceleration)
         self._watch_idle()
 
-    def _home(self, axes: list[int]) -> None:
+    def _home(self, axes: Sequence[int]) -> None:
+        reach_mm = 1.5 * max(self.travel_mm)
+        distances_mm = self._distances_to_switches(axes, reach_mm)
         seconds = 0.0
-        distances = self.mechanics.homing_distances_mm()
-        lost = False
-        for axis in axes:
-            stuck = self.mechanics.axes[axis].stuck
-            lost = lost or stuck
-            distance = 1.5 * self.travel_mm[axis] if stuck else distances[axis]
-            seconds += (distance + _BUMP_MM) / _SEEK_MM_PER_S + 2.0 * _BUMP_MM / _SEEK_MM_PER_S
+        for distance_mm in distances_mm:
+            seconds += (min(distance_mm, reach_mm) + _BUMP_MM) / _SEEK_MM_PER_S + 2.0 * _BUMP_MM / _SEEK_MM_PER_S
         self._awaited = lambda: False
-        finish = (lambda: self.kill("Homing Failed")) if lost else (lambda: self._homed(axes))
-        self._start_homing(seconds, finish)
+        fail = (lambda: self.kill("Homing Failed")) if math.inf in distances_mm else None
+        self._start_homing(axes, 0.0, seconds, fail)
         self._say_busy()
 
-    def _homed(self, axes: list[int]) -> None:
+    def _homed(self, axes: Iterable[int]) -> None:
         for axis in axes:
-            self.mechanics.set_homed(axis, 0.0, 0.0)
             self.homed[axis] = True
         self._awaited = None
-        self.say("ok")
         self._watch_idle()
-        self._run_lines()
 
     def _await(self, done: Callable[[], bool]) -> None:
         if done():
             self.say("ok")
-            return
-        self._awaited = done
-        self._say_busy()
+        else:
+            self._awaited = done
+            self._say_busy()
 
     def _say_busy(self) -> None:
         def again() -> None:
@@ -227,9 +214,9 @@ class SimulatedMarlin(SimulatedFirmware):
         """Set the idle time until the motors are released: 0 means never, None at once."""
         if seconds is None:
             self.release_motors()
-            return
-        self._idle_limit_s = seconds
-        self._watch_idle()
+        else:
+            self._idle_limit_s = seconds
+            self._watch_idle()
 
     def _watch_idle(self) -> None:
         if self._motors_off is not None:

@@ -26,7 +26,7 @@ from faintfield.rig.cameras.settings import (
 )
 from faintfield.rig.errors import CameraError, CameraTimeout, MissingExtra
 from faintfield.rig.plugins import PluginCamera
-from faintfield.rig.simulation.controller.wire import SimulatedClock
+from faintfield.rig.simulation.controller.kinematics import SimulatedClock
 from faintfield.rig.simulation.lab import TRUE_POSE, SimulatedCamera, SimulatedLab
 from faintfield.rig.stages.protocol import Point
 from faintfield.testing import camera_contract

@@ -18,7 +18,7 @@ from faintfield.rig.cameras.folder import FolderCamera
 from faintfield.rig.cameras.protocol import Decode, Exposure
 from faintfield.rig.cameras.settings import FolderSettings
 from faintfield.rig.errors import CameraError, CameraTimeout
-from faintfield.rig.simulation.controller.wire import SimulatedClock
+from faintfield.rig.simulation.controller.kinematics import SimulatedClock
 from faintfield.testing import camera_contract
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.capture.settling import measure_settling
 from faintfield.rig.settings import SettleSettings
-from faintfield.rig.simulation.controller.wire import SimulatedClock
+from faintfield.rig.simulation.controller.kinematics import SimulatedClock
 from faintfield.rig.simulation.experiment import paper_experiment
 from faintfield.rig.simulation.scene import render
 

@@ -12,8 +12,15 @@ from scipy.spatial.transform import Rotation
 from faintfield.rig.simulation.experiment import surface_experiment
 from faintfield.rig.simulation.optics import SimulatedOptics
 from faintfield.rig.simulation.scene import RenderedView
-from faintfield.rig.simulation.shapes import Cylinder, Rectangle, Shape, Sphere
-from faintfield.rig.simulation.surfaces import Surface, render_surfaces, true_depth_mm
+from faintfield.rig.simulation.surfaces import (
+    Cylinder,
+    Rectangle,
+    Shape,
+    Sphere,
+    Surface,
+    render_surfaces,
+    true_depth_mm,
+)
 
 type Points = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from faintfield.rig.errors import NotHomed, PlanRefused, PositionLost, StageLost
 from faintfield.rig.micromanager import SharedCore
 from faintfield.rig.plan import Grid
 from faintfield.rig.settings import DriftSettings, RigSettings, StepSettings
-from faintfield.rig.simulation.controller.wire import SimulatedClock
+from faintfield.rig.simulation.controller.kinematics import SimulatedClock
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.micromanager import MicroManagerController, MicroManagerStage
 from faintfield.rig.stages.protocol import Box, Point, StageSettings

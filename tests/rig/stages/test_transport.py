@@ -9,7 +9,7 @@ from faintfield.rig.devices import open_stage
 from faintfield.rig.errors import StageLost, StageTimeout
 from faintfield.rig.simulation.controller.bench import Bench, DirectLink, PtyLink
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
-from faintfield.rig.simulation.controller.wire import SimulatedClock
+from faintfield.rig.simulation.controller.kinematics import SimulatedClock
 from faintfield.rig.stages.protocol import StageSettings
 from faintfield.rig.stages.transport import LineTransport, SerialPort
 from tests.rig.stages.benches import Traffic, homed

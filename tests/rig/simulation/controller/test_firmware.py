@@ -1,15 +1,17 @@
 """The simulated controllers answer as the real ones do."""
 
+from contextlib import closing
 from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from faintfield.rig.simulation.controller.firmware import serving
+from faintfield.rig.simulation.controller.bench import Server
+from faintfield.rig.simulation.controller.firmware import Wire
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
+from faintfield.rig.simulation.controller.kinematics import SimulatedClock
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
-from faintfield.rig.simulation.controller.wire import SimulatedClock, Wire
 from faintfield.rig.stages.transport import SerialPort
 from tests.rig.stages.benches import CONTROLLERS, Controller
 
@@ -98,7 +100,7 @@ def test_no_bytes_crash_a_controller(firmware: Controller, typed: list[bytes]) -
 
 @pytest.mark.parametrize("firmware", CONTROLLERS)
 def test_served_controller_answers_at_its_port(firmware: Controller) -> None:
-    with serving(firmware) as server:
+    with closing(Server(firmware)) as server:
         port = SerialPort(server.port, 115200)
         heard = b""
         for turn in range(10_000):

@@ -2,14 +2,13 @@
 
 import pytest
 
-from faintfield.rig.simulation.controller.kinematics import Axis, Mechanics
-from faintfield.rig.simulation.controller.wire import SimulatedClock
+from faintfield.rig.simulation.controller.kinematics import Axis, Mechanics, SimulatedClock
 
 
 def mechanics(play_mm: float = 0.0) -> tuple[SimulatedClock, Mechanics]:
     clock = SimulatedClock()
     axes = (Axis(-2.0, 405.0, 0.0, play_mm), Axis(-2.0, 405.0, 0.0, play_mm))
-    return clock, Mechanics(clock, axes, 0.0125, (0.0, 0.0), switch_at_high_end=False)
+    return clock, Mechanics(clock, axes, 0.0125, -1.0)
 
 
 def test_clock_jumps_from_event_to_event() -> None:
