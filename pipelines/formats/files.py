@@ -6,7 +6,7 @@ import os
 import secrets
 import shutil
 import time
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -14,8 +14,8 @@ from typing import Any, BinaryIO
 
 import msgspec
 
-from faintfield.pipelines.errors import CannotWrite, DiskFull, MissingFile, OutputBusy, OutputExists
-from faintfield.pipelines.formats.digests import with_digest
+from faintfield.pipelines.errors import BadValue, CannotWrite, DiskFull, MissingFile, OutputBusy, OutputExists
+from faintfield.pipelines.formats.provenance import with_digest
 from faintfield.pipelines.formats.units import json_of
 from faintfield.rig import files as rig_files
 
@@ -32,6 +32,9 @@ CACHE_FILE = ".hashes.json"
 
 # A cache of a hundred thousand files is smaller.
 _MAX_CACHE_BYTES = 64_000_000
+
+# Folders of results lie at most this far below the folder that is shown.
+_MAX_LEVELS_BELOW = 3
 
 # In nanoseconds: a file changed this shortly before its hashing could change again with the same time stamp.
 _AT_REST_NS = 2_000_000_000
@@ -292,3 +295,37 @@ class Hashes:
         if self._changed:
             with suppress(CannotWrite):
                 write_json(self._folder / CACHE_FILE, self._known)
+
+
+def files_below(directory: Path, name: str) -> list[Path]:
+    """Return the files of a name in a folder and down to three folders below it, in order; no link out of it counts."""
+    whole = directory.resolve()
+    found = {path for level in range(_MAX_LEVELS_BELOW + 1) for path in directory.glob("*/" * level + name)}
+    return sorted(path for path in found if path.resolve().is_relative_to(whole))
+
+
+def file_within(folder: Path, name: str) -> Path:
+    """Return the path of a file that a record in `folder` names; it may be missing, but not be elsewhere (BadValue)."""
+    path = folder / name
+    if not _is_within(path, folder):
+        raise BadValue(f"{path}: leads out of the folder, or is no regular file; reconstruct again")
+    return path
+
+
+def problem_of_file(path: Path, folder: Path, known: str, hashed: Callable[[Path], str] = sha256) -> str | None:
+    """Return in words how a file, which must lie in `folder`, differs from its recorded hash, None if it does not."""
+    if not _is_within(path, folder):
+        return "leads out of its folder, or is no regular file"
+    try:
+        if not path.exists():
+            return "is missing"
+        return None if hashed(path) == known else "was altered"
+    except MissingFile as failure:
+        return f"cannot be read ({failure.__cause__})"
+
+
+def _is_within(path: Path, folder: Path) -> bool:
+    try:
+        return path.resolve().is_relative_to(folder.resolve()) and (path.is_file() or not path.exists())
+    except (OSError, ValueError):  # a name that no file can have
+        return False

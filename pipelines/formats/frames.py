@@ -13,10 +13,19 @@ from numpy.typing import NDArray
 
 from faintfield.calib.lens import MAX_PIXELS, MAX_SIDE_PX
 from faintfield.pipelines.errors import InputError, MissingFile, UnknownFormat, UnreadableImage, WrongSize
-from faintfield.pipelines.formats.decoders import OVERHEAD_BYTES, Accept, count_pages, decode_photo, decode_tiff
-from faintfield.pipelines.formats.limits import MAX_EXPOSURE_S, MAX_FRAME_BYTES
-from faintfield.pipelines.formats.plain_decoders import NETPBM_SUFFIXES, decode_bmp, decode_exr, decode_netpbm
+from faintfield.pipelines.formats.decoders import (
+    NETPBM_SUFFIXES,
+    OVERHEAD_BYTES,
+    Accept,
+    count_pages,
+    decode_bmp,
+    decode_exr,
+    decode_netpbm,
+    decode_photo,
+    decode_tiff,
+)
 from faintfield.pipelines.formats.reading import is_file, opened
+from faintfield.pipelines.formats.units import MAX_EXPOSURE_S, MAX_FRAME_BYTES
 from faintfield.rig.files import require_size
 
 TIFF_SUFFIXES = {".tif", ".tiff"}

@@ -1,6 +1,13 @@
-"""Provenance of every result (command, options, inputs, versions), and whether it is still current."""
+"""Provenance of every result (command, options, inputs, versions), whether it is current, and the digest of its record.
 
+The digest, the last key of a JSON record, is the SHA-256 of its text without that key and without white space. It tells
+a record that was altered or damaged from one that was written so. It is no signature: who writes a record anew can
+write its digest, too.
+"""
+
+import hashlib
 import platform
+import re
 from collections.abc import Mapping
 from contextlib import suppress
 from functools import cache
@@ -13,6 +20,10 @@ from msgspec import UNSET, UnsetType
 from faintfield.pipelines.formats.units import StatedUnits, record_of
 
 _PACKAGES = ("faintfield", "numpy", "scipy", "numba", "opencv-contrib-python-headless", "mrcal", "casadi")
+
+DIGEST_KEY = "record_sha256"
+
+_LAST_KEY = re.compile(rf',"{DIGEST_KEY}":"([0-9a-f]{{64}})"\}}\Z'.encode())
 
 
 class Provenance[Options](msgspec.Struct, frozen=True, kw_only=True):
@@ -65,3 +76,28 @@ def first_difference[Options](content: bytes, now: Provenance[Options]) -> str |
             more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
             return f"{kind}: {changed[0]}{more}"
     return None
+
+
+def with_digest(content: bytes) -> bytes:
+    """Return a JSON object as the content of a file: indented, with its digest as the last key."""
+    text = msgspec.json.format(content, indent=-1)
+    return msgspec.json.format(text[:-1] + f',"{DIGEST_KEY}":"{_digest(text)}"}}'.encode()) + b"\n"
+
+
+def digest_holds(content: bytes) -> bool | None:
+    """Return whether a JSON object agrees with the digest that it carries, None if it carries none.
+
+    Raises
+    ------
+    msgspec.MsgspecError, RecursionError
+        It is not JSON.
+    """
+    if DIGEST_KEY.encode() not in content:
+        return None
+    text = msgspec.json.format(content, indent=-1)
+    last = _LAST_KEY.search(text)
+    return last is not None and _digest(text[: last.start()] + b"}") == last[1].decode()
+
+
+def _digest(text: bytes) -> str:
+    return hashlib.sha256(text).hexdigest()

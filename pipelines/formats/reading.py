@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.pipelines.errors import BadValue, MissingFile
-from faintfield.pipelines.formats.digests import DIGEST_KEY, digest_holds
+from faintfield.pipelines.formats.provenance import DIGEST_KEY, digest_holds
 from faintfield.pipelines.formats.units import record_of
 from faintfield.rig.files import open_regular, read_regular
 

@@ -1,30 +1,59 @@
-"""The units of a set and of what is made from it: nothing is stated in a unit that nobody measured.
+"""Units of a set and of what is made from it, limits of values: nothing is stated in a unit that nobody measured.
 
 Records are of one type whatever their units: `depth_mm`, `mean_e` and their like hold numbers in the units that the
 record states. Files name them by these units, `disparity_px`, `mean_dn`: `json_of` names them so, `record_of` back.
 """
 
+import re
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
-from msgspec import UNSET
+from msgspec import UNSET, Meta
+
+# Limits beyond which values in a file are refused: far above what any rig has, far below what overflows.
+# Largest picture that is read, decoded (a plane in three colours of the largest detector, as float32), and on a page.
+MAX_FRAME_BYTES, MAX_PREVIEW_BYTES = 3_000_000_000, 200_000_000
+
+# Longest exposure: eleven days.
+MAX_EXPOSURE_S = 1e6
+
+# Largest light of a pixel, a million times what a pixel holds; its square is far from the limit of float32.
+MAX_LIGHT_E = 1e12
+
+# Largest row or column of a node.
+MAX_NODE = 100_000
+
+# Largest rotation and translation in a pose; the unit of an imported model may be as small as a µm.
+MAX_ANGLE_RAD, MAX_LENGTH_MM = 10.0, 1e9
+
+# Largest period of a mosaic; the largest that is sold has 6.
+MAX_PERIOD_PX = 8
+
+type _Angle = Annotated[float, Meta(ge=-MAX_ANGLE_RAD, le=MAX_ANGLE_RAD)]
+type _Length = Annotated[float, Meta(ge=-MAX_LENGTH_MM, le=MAX_LENGTH_MM)]
+type _Index = Annotated[int, Meta(ge=-MAX_NODE, le=MAX_NODE)]
+
+# Rodrigues vector in rad and translation in mm; the row and column of a node; a shift in mm.
+type Pose = tuple[_Angle, _Angle, _Angle, _Length, _Length, _Length]
+type Node = tuple[_Index, _Index]
+type Shift = tuple[_Length, _Length, _Length]
 
 type DepthUnit = Literal["mm", "relative", "disparity_px"]
 type LightUnit = Literal["electrons", "dn", "relative"]
 type ExposureUnit = Literal["s", "unknown"]
 
-# Keys that state a depth or a length across the planes, and their endings by unit.
-_DEPTH_KEYS = ("depth_mm", "pitch_mm", "origin_mm", "sharp_mm", "searched_mm", "depth_range_mm")
-_DEPTH_ENDINGS: dict[DepthUnit, str] = {"mm": "_mm", "relative": "", "disparity_px": "_px"}
-
-# Keys that state light or its square, with the place of its unit, and what stands there by unit.
-_LIGHT_KEYS = (
-    *("mean{}", "flux{}", "smoothing{}", "epsilon{}2", "detail{}2", "sigma{}2"),
-    *("read_noise{}", "dark{}", "mean_signal{}"),
+# Keys that state a depth, a length across the planes, or light (squared if they end with 2).
+DEPTH_KEYS = ("depth_mm", "sharp_mm", "searched_mm", "depth_range_mm")
+LENGTH_KEYS = ("pitch_mm", "origin_mm")
+LIGHT_KEYS = (
+    *("mean_e", "flux_e", "smoothing_e", "epsilon_e2", "detail_e2", "sigma_e2"),
+    *("read_noise_e", "dark_e", "mean_signal_e", "electrons_linear", "electrons_from_moments"),
 )
+
+# Their endings by unit, and what stands in the place of "e".
+_DEPTH_ENDINGS: dict[DepthUnit, str] = {"mm": "_mm", "relative": "", "disparity_px": "_px"}
 _LIGHT_PLACES: dict[LightUnit, str] = {"electrons": "_e", "dn": "_dn", "relative": ""}
-_ELECTRONS_KEYS = ("electrons_linear", "electrons_from_moments")
 
 # Keys that photons need, and what marks those that are left out.
 _PHOTON_KEYS, _LEFT_OUT = ("photons_linear", "photons_from_moments", "quantum_efficiency"), "-"
@@ -34,6 +63,14 @@ _FOREIGN = frozenset({"units", "inputs", "versions", "sha256", "plane_pose"})
 
 # A surface states the unit of its depths by a key of its own.
 _SURFACE = "surface"
+
+
+def sound_mosaic(mosaic: Sequence[str], letters: str | None = None) -> bool:
+    """Return whether a mosaic has rows of equal length, is no larger than any camera's, and of these letters only."""
+    widths = {len(row) for row in mosaic}
+    if len(widths) != 1 or not 0 < min(widths) <= max(len(mosaic), *widths) <= MAX_PERIOD_PX:
+        return False
+    return letters is None or not set("".join(mosaic)) - set(letters)
 
 
 class Units(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -153,11 +190,11 @@ def _names(units: StatedUnits) -> tuple[dict[str, str], dict[str, str]]:
     lights: dict[str, str] = {}
     if units.depth != "mm":
         ending = _DEPTH_ENDINGS[units.depth]
-        depths = {key: key.replace("depth", units.quantity).removesuffix("_mm") + ending for key in _DEPTH_KEYS}
+        keys = (*DEPTH_KEYS, *LENGTH_KEYS)
+        depths = {key: key.replace("depth", units.quantity).removesuffix("_mm") + ending for key in keys}
     if units.light != "electrons":
         place = _LIGHT_PLACES[units.light]
-        lights = {key.format("_e"): key.format(place) for key in _LIGHT_KEYS}
-        lights |= {key: key.replace("electrons", "light") for key in _ELECTRONS_KEYS}
+        lights = {key: re.sub("_e(?=2?$)", place, key.replace("electrons", "light")) for key in LIGHT_KEYS}
     return depths, lights
 
 

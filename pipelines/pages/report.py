@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 from msgspec import UNSET
 
-from faintfield.pipelines.formats.files import write_whole
+from faintfield.pipelines.formats.files import files_below, write_whole
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE
 from faintfield.pipelines.formats.results.noise import NOISE_FILE
 from faintfield.pipelines.formats.results.overview import OVERVIEW_FILE
@@ -19,9 +19,8 @@ from faintfield.pipelines.formats.results.records import (
     GeometryErrors,
     ReconstructionRecord,
 )
-from faintfield.pipelines.formats.results.result_files import files_below, results_below
 from faintfield.pipelines.formats.results.stacks import at_depths
-from faintfield.pipelines.formats.results.surface import SURFACE_FILE, SurfaceFileRecord, surfaces_below
+from faintfield.pipelines.formats.results.surface import SURFACE_FILE, SurfaceFileRecord, results_below, surfaces_below
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS
 from faintfield.pipelines.formats.units import StatedUnits, named_by, units_of
 from faintfield.pipelines.pages.page import figure, format_depths, template

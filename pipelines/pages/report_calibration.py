@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import msgspec
 import numpy as np
 
-from faintfield.pipelines.formats.files import sha256
-from faintfield.pipelines.formats.limits import MAX_PREVIEW_BYTES
+from faintfield.pipelines.formats.files import file_within, sha256
 from faintfield.pipelines.formats.provenance import Provenance
 from faintfield.pipelines.formats.reading import read_content
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_PAGE, GeometryRecord, read_geometry
 from faintfield.pipelines.formats.results.noise import Measured, NoiseRecord, read_noise
-from faintfield.pipelines.formats.results.result_files import file_within
+from faintfield.pipelines.formats.units import MAX_PREVIEW_BYTES
 from faintfield.pipelines.pages.page import smaller_uri
 
 if TYPE_CHECKING:

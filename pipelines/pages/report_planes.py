@@ -9,6 +9,7 @@ from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 
 from faintfield.pipelines.errors import MissingFile
+from faintfield.pipelines.formats.files import files_below
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.results.records import (
     METRICS_FILE,
@@ -20,7 +21,7 @@ from faintfield.pipelines.formats.results.records import (
     Poses,
     ReconstructionRecord,
 )
-from faintfield.pipelines.formats.results.result_files import files_below, read_result
+from faintfield.pipelines.formats.results.surface import read_result
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS
 from faintfield.pipelines.formats.units import StatedUnits, units_of
 from faintfield.pipelines.pages.page import format_depths

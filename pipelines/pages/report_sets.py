@@ -8,13 +8,13 @@ from typing import NamedTuple
 
 from msgspec import UNSET
 
+from faintfield.pipelines.formats.files import file_within
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import encoded
-from faintfield.pipelines.formats.limits import MAX_PREVIEW_BYTES
 from faintfield.pipelines.formats.reading import read_content
 from faintfield.pipelines.formats.results.overview import Overview
-from faintfield.pipelines.formats.results.result_files import file_within, read_result
-from faintfield.pipelines.formats.units import units_of
+from faintfield.pipelines.formats.results.surface import read_result
+from faintfield.pipelines.formats.units import MAX_PREVIEW_BYTES, units_of
 from faintfield.pipelines.pages.page import LOSSLESS, smaller_uri
 from faintfield.pipelines.pages.report_planes import PREFERRED_POSES
 from faintfield.pipelines.reconstruction.overview import (

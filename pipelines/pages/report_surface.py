@@ -7,11 +7,10 @@ from typing import NamedTuple
 
 from msgspec import UNSET, UnsetType
 
-from faintfield.pipelines.formats.limits import MAX_PREVIEW_BYTES
 from faintfield.pipelines.formats.reading import read_content
 from faintfield.pipelines.formats.results.records import DepthMapRecord, ReconstructionRecord, preview_name
 from faintfield.pipelines.formats.results.surface import HeldOutRecord, SurfaceFileRecord, SurfaceRecord
-from faintfield.pipelines.formats.units import StatedUnits, units_of
+from faintfield.pipelines.formats.units import MAX_PREVIEW_BYTES, StatedUnits, units_of
 from faintfield.pipelines.pages.page import data_uri, figure
 
 # Kinds of films that browsers play.

@@ -16,8 +16,8 @@ import msgspec
 import pytest
 
 from faintfield.pipelines.cli import run
-from faintfield.pipelines.formats.digests import DIGEST_KEY
 from faintfield.pipelines.formats.files import CACHE_FILE, UNFINISHED
+from faintfield.pipelines.formats.provenance import DIGEST_KEY
 from faintfield.pipelines.formats.results.plane_files import PARTS
 from faintfield.pipelines.formats.toml_files import write_toml
 from faintfield.rig.cameras.settings import SimulatedSettings

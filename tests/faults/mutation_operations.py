@@ -18,7 +18,7 @@ import numpy as np
 import tifffile
 import tomli_w
 
-from faintfield.pipelines.formats.digests import DIGEST_KEY, with_digest
+from faintfield.pipelines.formats.provenance import DIGEST_KEY, with_digest
 from tests.faults.contained import FORGED, MAX_FILE_BYTES, SCRIPT
 
 # A file in the folder around all of a case's files; nothing may be written to it.

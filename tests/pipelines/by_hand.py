@@ -9,8 +9,8 @@ import numpy as np
 import tomli_w
 from numpy.typing import NDArray
 
-from faintfield.pipelines.formats.digests import DIGEST_KEY
 from faintfield.pipelines.formats.image_files import write_frame
+from faintfield.pipelines.formats.provenance import DIGEST_KEY
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
 from faintfield.recon.likelihood.images import ElementalImages

@@ -20,13 +20,13 @@ from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.files import sha256, write_json, write_whole, writing_folder
 from faintfield.pipelines.formats.frames import RAW_SUFFIXES, Frame, read_frame
 from faintfield.pipelines.formats.image_files import write_frame
-from faintfield.pipelines.formats.limits import MAX_EXPOSURE_S
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.reading import is_file, read_text
 from faintfield.pipelines.formats.results.noise import NoiseFrame
 from faintfield.pipelines.formats.sets.noise_set import FILE_NAME as NOISE_SET_FILE
 from faintfield.pipelines.formats.sets.noise_set import NoiseSet, load_noise_set, write_noise_set
 from faintfield.pipelines.formats.toml_files import inside
+from faintfield.pipelines.formats.units import MAX_EXPOSURE_S
 
 DESCRIPTOR = "descriptor.txt"
 

@@ -17,9 +17,9 @@ from faintfield.pipelines.formats.exchange.image_grid import ImageGrid
 from faintfield.pipelines.formats.files import sha256, write_json
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import ONE_PIXEL, write_plane
-from faintfield.pipelines.formats.limits import MAX_LENGTH_MM, MAX_NODE
 from faintfield.pipelines.formats.reading import is_file, read_text
 from faintfield.pipelines.formats.sets.ground_truth import TRUE_DEPTH_FILE, TrueDepth
+from faintfield.pipelines.formats.units import MAX_LENGTH_MM, MAX_NODE
 
 FILE_NAME = "parameters.cfg"
 

@@ -21,7 +21,6 @@ from faintfield.pipelines.formats.exchange.tone import Tone, asked_tone, tone_of
 from faintfield.pipelines.formats.files import sha256, write_json, writing_folder
 from faintfield.pipelines.formats.frames import RAW_SUFFIXES, Frame, exif_exposure_s, read_frame
 from faintfield.pipelines.formats.image_files import write_frame
-from faintfield.pipelines.formats.limits import MAX_ANGLE_RAD, MAX_LENGTH_MM, sound_pose
 from faintfield.pipelines.formats.provenance import Provenance, provenance
 from faintfield.pipelines.formats.reading import is_file
 from faintfield.pipelines.formats.sets.elemental_file import (
@@ -33,7 +32,7 @@ from faintfield.pipelines.formats.sets.elemental_file import (
     write_set,
 )
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
-from faintfield.pipelines.formats.units import Units
+from faintfield.pipelines.formats.units import MAX_ANGLE_RAD, MAX_LENGTH_MM, Units
 
 # Files whose compression changes values, and with them the noise.
 _LOSSY_SUFFIXES = {".jpg", ".jpeg"}
@@ -120,12 +119,13 @@ def import_posed(out: Path, model: PosedModel, options: ImportOptions, command: 
 
 def _check_images(images: Sequence[PosedImage], mm_per_unit: float) -> None:
     """Refuse images that are missing, and poses that are not finite or too large."""
+    limits = np.repeat([MAX_ANGLE_RAD, MAX_LENGTH_MM / mm_per_unit], 3)
     for image in images:
         if not is_file(image.path):
             raise MissingFile(
                 f"{image.path}: has a pose but is missing; put it there, or name its folder with --images"
             )
-        if not sound_pose(image.rt_cam_world * [1, 1, 1, mm_per_unit, mm_per_unit, mm_per_unit]):
+        if not (np.abs(image.rt_cam_world) <= limits).all():
             raise BadValue(
                 f"{image.path}: its pose {image.rt_cam_world.tolist()} is not finite, or beyond {MAX_ANGLE_RAD:g} rad "
                 f"or {MAX_LENGTH_MM:g} mm; calibrate again, or remove it"

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.files import exclusive, remove, remove_leftovers, sha256, write_record, write_whole
-from faintfield.pipelines.formats.limits import MAX_ANGLE_RAD, MAX_LENGTH_MM, MAX_NODE, sound_node, sound_pose
 from faintfield.pipelines.formats.reading import is_file, is_folder, read_json
+from faintfield.pipelines.formats.units import Node, Pose, Shift
 
 GEOMETRY_FILE = "geometry.json"
 COVARIANCE_FILE = "geometry_covariance.npz"
@@ -27,8 +27,6 @@ CAMERA_FILE = "cameras/node_r{}_c{}.cameramodel"
 
 # Depths at which a geometry is judged unless others are stated; the paper's.
 DEFAULT_DEPTHS_MM = (500.0, 700.0)
-
-type Pose = tuple[float, float, float, float, float, float]
 
 
 class LensRecord(Struct, frozen=True):
@@ -46,7 +44,7 @@ class LensRecord(Struct, frozen=True):
 class NodeRecord(Struct, frozen=True):
     """The camera's pose at a node; its sigmas are relative to the reference node."""
 
-    node: tuple[int, int]
+    node: Node
     rt_cam_ref: Pose
     sigma_mm: float
     sigma_rad: float
@@ -63,7 +61,7 @@ class HomingRecord(Struct, frozen=True):
 
     before: int
     after: int
-    shift_mm: tuple[float, float, float]
+    shift_mm: Shift
     sigma_mm: tuple[float, float, float]
 
 
@@ -73,7 +71,7 @@ class CameraPoses(Struct, frozen=True, kw_only=True):
     format: Literal[1] = 1
     lens: LensRecord
     size_px: tuple[int, int]
-    reference_node: tuple[int, int]
+    reference_node: Node
     nodes: Annotated[list[NodeRecord], Meta(min_length=1)]
     homings: list[HomingRecord] | UnsetType = UNSET
 
@@ -197,19 +195,6 @@ def read_geometry[Kind: CameraPoses](path: Path, kind: type[Kind]) -> Kind:
         geometry.camera_lens()
     except ValueError as failure:
         raise BadValue(f"{path}: lens: {failure}; run `faintfield geometry` again") from failure
-    for entry in geometry.nodes:
-        if not (sound_pose(entry.rt_cam_ref) and sound_node(entry.node)):
-            raise BadValue(
-                f"{path}: node {list(entry.node)} at {list(entry.rt_cam_ref)} is impossible; a node's numbers are at "
-                f"most {MAX_NODE}, its angles {MAX_ANGLE_RAD:g} rad, and its lengths {MAX_LENGTH_MM:g} mm in size: "
-                "run `faintfield geometry` again"
-            )
-    for shift in geometry.homings or ():
-        if not max(map(abs, shift.shift_mm)) <= MAX_LENGTH_MM:
-            raise BadValue(
-                f"{path}: the homing shift {list(shift.shift_mm)} mm is impossible, limit {MAX_LENGTH_MM:g} mm; "
-                "run `faintfield geometry` again"
-            )
     return geometry
 
 

@@ -20,11 +20,11 @@ from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import exclusive, remove, sha256, write_record, write_whole, writing
 from faintfield.pipelines.formats.frames import at_phase
-from faintfield.pipelines.formats.limits import sound_mosaic
 from faintfield.pipelines.formats.provenance import Provenance
 from faintfield.pipelines.formats.reading import is_file, read_arrays, read_json
 from faintfield.pipelines.formats.results.noise_fit import EmvaRecord, FitRecord
 from faintfield.pipelines.formats.results.noise_fit import Measured as Measured
+from faintfield.pipelines.formats.units import sound_mosaic
 
 NOISE_FILE, NOISE_MAPS = "noise.json", "noise_maps.npz"
 STANDARD = "EMVA 1288 release 4.0"

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue, MissingFile
-from faintfield.pipelines.formats.digests import digest_holds
-from faintfield.pipelines.formats.files import remove, sha256, write_record, writing
+from faintfield.pipelines.formats.files import problem_of_file, remove, sha256, write_record, writing
 from faintfield.pipelines.formats.image_files import Spacing, grey_levels, white_level, write_plane, write_png
 from faintfield.pipelines.formats.plane_poses import Place, TiltedPlane
-from faintfield.pipelines.formats.provenance import Provenance, first_difference
+from faintfield.pipelines.formats.provenance import Provenance, digest_holds, first_difference
 from faintfield.pipelines.formats.reading import JSON_FAILURES, read_content, read_json
 from faintfield.pipelines.formats.results.records import (
     DepthMapFileRecord,
@@ -28,7 +27,6 @@ from faintfield.pipelines.formats.results.records import (
     ReconstructionOptions,
     Sha256,
 )
-from faintfield.pipelines.formats.results.result_files import problem_of_file
 from faintfield.pipelines.formats.results.surface import SurfaceFileRecord, SurfaceOptions
 from faintfield.pipelines.formats.units import record_of, units_of
 

@@ -11,8 +11,11 @@ from typing import Annotated, Literal
 from msgspec import UNSET, Meta, Struct, UnsetType
 
 from faintfield.pipelines.errors import MissingFile
+from faintfield.pipelines.formats.files import file_within, files_below
 from faintfield.pipelines.formats.provenance import Provenance
+from faintfield.pipelines.formats.reading import read_json
 from faintfield.pipelines.formats.results.records import (
+    RECONSTRUCTION_FILE,
     Certificate,
     Count,
     FileName,
@@ -23,7 +26,6 @@ from faintfield.pipelines.formats.results.records import (
     WeightScore,
     preview_name,
 )
-from faintfield.pipelines.formats.results.result_files import file_within, files_below, read_result, results_below
 
 SURFACE_FILE = "surface.json"
 
@@ -177,3 +179,22 @@ def surfaces_below(directory: Path) -> dict[Path, SurfaceFileRecord]:
         for name in record.files:
             file_within(folder, name)
     return surfaces
+
+
+def results_below(directory: Path, *, required: bool = True) -> dict[Path, ReconstructionRecord]:
+    """Return each reconstruction.json in a folder and below it, by its folder; MissingFile if one is `required`."""
+    if not directory.is_dir():
+        raise MissingFile(f"{directory}: no such folder; name one that `faintfield reconstruct` wrote")
+    paths = files_below(directory, RECONSTRUCTION_FILE)
+    if not paths and required:
+        raise MissingFile(f"{directory}: holds no {RECONSTRUCTION_FILE}; run `faintfield reconstruct` first")
+    results = {path.parent: read_result(path, ReconstructionRecord) for path in paths}
+    for folder, result in results.items():
+        for name in result.files:
+            file_within(folder, name)
+    return results
+
+
+def read_result[Record](path: Path, kind: type[Record]) -> Record:
+    """Read a JSON file as one of the types of `formats.results.records`."""
+    return read_json(path, kind, what="a result that can be shown", remedy="reconstruct again")

@@ -13,8 +13,8 @@ import msgspec
 from msgspec import Struct
 
 from faintfield.pipelines.errors import InputError, MissingFile
-from faintfield.pipelines.formats.digests import digest_holds
-from faintfield.pipelines.formats.files import sha256
+from faintfield.pipelines.formats.files import files_below, problem_of_file, sha256
+from faintfield.pipelines.formats.provenance import digest_holds
 from faintfield.pipelines.formats.reading import JSON_FAILURES, read_content
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, CameraPoses, GeometryRecord
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, NoiseRecord
@@ -29,8 +29,7 @@ from faintfield.pipelines.formats.results.records import (
     ReconstructionRecord,
     record_name,
 )
-from faintfield.pipelines.formats.results.result_files import files_below, problem_of_file, read_result
-from faintfield.pipelines.formats.results.surface import SURFACE_FILE, SurfaceFileRecord
+from faintfield.pipelines.formats.results.surface import SURFACE_FILE, SurfaceFileRecord, read_result
 from faintfield.pipelines.formats.units import record_of
 
 # The type of each record, by a pattern of its name; of geometry.json, a person may write the poses alone.

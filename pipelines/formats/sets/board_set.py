@@ -3,10 +3,11 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from faintfield.calib.board import Board
@@ -14,9 +15,9 @@ from faintfield.calib.geometry import Node
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.files import sha256
 from faintfield.pipelines.formats.frames import at_phase, mosaic_period, read_frame
-from faintfield.pipelines.formats.limits import MAX_NODE, sound_node
 from faintfield.pipelines.formats.reading import is_file
 from faintfield.pipelines.formats.toml_files import inside, read_toml
+from faintfield.pipelines.formats.units import MAX_NODE
 from faintfield.rig.plan import centre_node
 from faintfield.rig.session.homings import read_homing_groups
 from faintfield.rig.session.session import PLAN, has_session, read_plan, taken_frames
@@ -25,6 +26,8 @@ FILE_NAME = "charuco.toml"
 
 # Pixels of a frame from which its black and white are taken; of larger ones, some in even distances.
 _QUANTILE_PX = 4_000_000
+
+type _Index = Annotated[int, Meta(ge=0, le=MAX_NODE)]
 
 
 class BoardEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -50,7 +53,7 @@ class ImageEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     file: str
-    node: tuple[int, int]
+    node: tuple[_Index, _Index]
     sweep: int = 0
     homing: int = 0
 
@@ -61,7 +64,7 @@ class BoardSetFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
     format: Literal[1]
     board: list[BoardEntry]
     image: list[ImageEntry]
-    pitch_mm: float | None = None
+    pitch_mm: Annotated[float, Meta(gt=0)] | None = None
 
 
 @dataclass(frozen=True)
@@ -125,13 +128,7 @@ def load_board_set(folder: Path) -> BoardSet:
         file = inside(path.parent, entry.file, f"{path}: image[{index}].file")
         if not is_file(file):
             raise MissingFile(f"{path}: {entry.file} is named but missing; put it there or remove its entry")
-        if min(entry.node) < 0 or not sound_node(entry.node):
-            raise BadValue(
-                f"{path}: image[{index}].node = {list(entry.node)}; rows and columns count from 0, to {MAX_NODE}"
-            )
         files.setdefault((entry.node, entry.sweep, entry.homing), []).append(file)
-    if settings.pitch_mm is not None and not settings.pitch_mm > 0:
-        raise BadValue(f"{path}: pitch_mm = {settings.pitch_mm}; it must be positive")
     rows, columns = (1 + max(node[axis] for node, *_ in files) for axis in (0, 1))
     return BoardSet(path, boards, _views(files), centre_node(rows, columns), settings.pitch_mm)
 

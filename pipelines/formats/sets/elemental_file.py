@@ -7,19 +7,9 @@ import msgspec
 import numpy as np
 
 from faintfield.pipelines.errors import BadValue, MissingFile
-from faintfield.pipelines.formats.limits import (
-    MAX_ANGLE_RAD,
-    MAX_EXPOSURE_S,
-    MAX_LENGTH_MM,
-    MAX_NODE,
-    MAX_PERIOD_PX,
-    sound_mosaic,
-    sound_node,
-    sound_pose,
-)
 from faintfield.pipelines.formats.reading import is_file
 from faintfield.pipelines.formats.toml_files import inside, read_toml, write_toml
-from faintfield.pipelines.formats.units import Units
+from faintfield.pipelines.formats.units import MAX_EXPOSURE_S, MAX_PERIOD_PX, Node, Pose, Units, sound_mosaic
 
 FILE_NAME = "elemental.toml"
 
@@ -62,8 +52,8 @@ class View(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
     """
 
     image: str
-    rt_cam_ref: tuple[float, float, float, float, float, float]
-    node: tuple[int, int] | None = None
+    rt_cam_ref: Pose
+    node: Node | None = None
     cx_px: float | None = None
     cy_px: float | None = None
     repeats: tuple[str, ...] = ()
@@ -167,12 +157,6 @@ def _check_numbers(path: Path, settings: ElementalSetFile) -> None:
 
 def _check_views(path: Path, settings: ElementalSetFile) -> None:
     count = len(settings.view)
-    for index, view in enumerate(settings.view):
-        if not (sound_pose(view.rt_cam_ref) and (view.node is None or sound_node(view.node))):
-            raise BadValue(
-                f"{path}: view[{index}] has the pose {list(view.rt_cam_ref)} and the node {view.node}; angles are at "
-                f"most {MAX_ANGLE_RAD:g} rad, lengths {MAX_LENGTH_MM:g} mm and nodes {MAX_NODE} in size: correct it"
-            )
     if not 0 <= settings.reference_view < count:
         raise BadValue(
             f"{path}: reference_view = {settings.reference_view}, but there are {count} views; give 0…{count - 1}"

@@ -17,7 +17,7 @@ from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import sha256
 from faintfield.pipelines.formats.frames import Frame, read_frame
 from faintfield.pipelines.formats.reading import is_file, is_folder
-from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, CameraPoses, Pose, read_geometry
+from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, CameraPoses, read_geometry
 from faintfield.pipelines.formats.results.noise import NOISE_MAPS, FittedNoise, read_fitted_noise
 from faintfield.pipelines.formats.results.records import Poses
 from faintfield.pipelines.formats.sets.elemental_file import (
@@ -27,7 +27,7 @@ from faintfield.pipelines.formats.sets.elemental_file import (
     named_files,
     read_set_file,
 )
-from faintfield.pipelines.formats.units import StatedUnits
+from faintfield.pipelines.formats.units import Pose, StatedUnits
 from faintfield.recon.threads import map_in_threads
 
 # Exposure without light, beside a set's images if there is one.

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.errors import UnreadableImage, WrongSize
 from faintfield.pipelines.formats.frames import read_frame
-from faintfield.pipelines.formats.limits import MAX_LIGHT_E
 from faintfield.pipelines.formats.reading import is_file, read_json
 from faintfield.pipelines.formats.results.records import Poses
 from faintfield.pipelines.formats.toml_files import inside
+from faintfield.pipelines.formats.units import MAX_LIGHT_E
 
 TRUTH_FILE = "truth.json"
 

@@ -12,10 +12,10 @@ from faintfield.calib.noise import Conditions
 from faintfield.calib.noise.fit.temperature import dark_factor
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.frames import RAW_SUFFIXES, exif_exposure_s
-from faintfield.pipelines.formats.limits import MAX_EXPOSURE_S, MAX_PERIOD_PX, sound_mosaic
 from faintfield.pipelines.formats.reading import is_file
 from faintfield.pipelines.formats.results.noise import NoiseFrame, TemperatureRange
 from faintfield.pipelines.formats.toml_files import inside, read_toml, write_toml
+from faintfield.pipelines.formats.units import MAX_EXPOSURE_S, MAX_PERIOD_PX, sound_mosaic
 from faintfield.rig.session.changes import present_settings
 from faintfield.rig.session.session import PLAN, has_session, taken_frames
 

@@ -10,17 +10,7 @@ from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.plane_poses import Place, TiltedPlane
 from faintfield.pipelines.formats.results.plane_files import plane_name
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
-from faintfield.pipelines.formats.units import StatedUnits
-
-# Fields of records by what they hold. Those of squared light end with "2".
-_DEPTHS = frozenset({"depth_mm", "sharp_mm", "searched_mm", "depth_range_mm"})
-_LENGTHS = frozenset({"pitch_mm", "origin_mm"})
-_LIGHT = frozenset(
-    {
-        *("mean_e", "flux_e", "smoothing_e", "epsilon_e2", "detail_e2", "sigma_e2"),
-        *("read_noise_e", "dark_e", "mean_signal_e", "electrons_linear", "electrons_from_moments"),
-    }
-)
+from faintfield.pipelines.formats.units import DEPTH_KEYS, LENGTH_KEYS, LIGHT_KEYS, StatedUnits
 
 # Options that name the unit of depths.
 _UNITS = frozenset({"unit", "depth_map"})
@@ -112,10 +102,10 @@ class _Converter:
             return unit_of_maps(self._loaded.units)
         if not isinstance(value, (int, float)) or isinstance(value, bool):
             return value
-        if name in _DEPTHS:
+        if name in DEPTH_KEYS:
             return self._loaded.stated_depth(value)
-        if name in _LENGTHS and self._loaded.units.depth == "disparity_px":
+        if name in LENGTH_KEYS and self._loaded.units.depth == "disparity_px":
             return value * self._loaded.settings.camera.fx_px / depth_mm
-        if name in _LIGHT:
+        if name in LIGHT_KEYS:
             return value * self._light ** (2 if name.endswith("2") else 1)
         return value

@@ -11,8 +11,8 @@ import pytest
 
 from faintfield.pipelines.commands.capture import verify
 from faintfield.pipelines.errors import BadValue, ResultDamaged
-from faintfield.pipelines.formats.digests import DIGEST_KEY, digest_holds, with_digest
-from faintfield.pipelines.formats.results.result_files import results_below
+from faintfield.pipelines.formats.provenance import DIGEST_KEY, digest_holds, with_digest
+from faintfield.pipelines.formats.results.surface import results_below
 from faintfield.pipelines.formats.results.verification import records_below, records_of, verify_results
 from tests.pipelines.by_hand import write_by_hand
 from tests.pipelines.conftest import Command, assert_refused, run_undrawn
