@@ -31,9 +31,8 @@ from faintfield.recon.solver.initialization import back_projection, smooth_start
 from faintfield.rig.plan import nominal_poses_rt_cam_ref
 from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
 from faintfield.rig.simulation.objects import toy_truck
-from faintfield.rig.simulation.optics import SimulatedOptics
+from faintfield.rig.simulation.optics import SimulatedOptics, SimulatedSensor
 from faintfield.rig.simulation.scene import TexturedPlane, render
-from faintfield.rig.simulation.sensor import SimulatedSensor
 
 _SNRS, _GRIDS, _READ_NOISES_E = (0.05, 0.16, 0.5, 1.6, 5.0), (3, 5, 7, 9, 11), (12**0.5, 0.7)
 _SIDES_PX, _SNRS_OF_FEATURES = (2.0, 5.0, 10.0), (0.16, 5.0)

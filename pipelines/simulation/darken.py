@@ -20,7 +20,7 @@ from faintfield.pipelines.reconstruction.overview import OBJECT_REGION, brightne
 from faintfield.pipelines.simulation.options import DarkeningOptions
 from faintfield.pipelines.simulation.synthetic_set import stated_noise, write_exposures
 from faintfield.recon.metrics import photons_from_linear_snr, photons_from_moments, signal_scale_for_snr
-from faintfield.rig.simulation.sensor import SimulatedSensor
+from faintfield.rig.simulation.optics import SimulatedSensor
 
 _FLAT = "flat.tiff"
 

@@ -29,7 +29,7 @@ class DarkeningOptions(msgspec.Struct, frozen=True, kw_only=True):
     snr: float = 0.16
     seed: int = 1
     exposure_s: float = 0.1
-    # As of the paper's camera, see `rig.simulation.sensor`
+    # As of the paper's camera, see `rig.simulation.optics`
     read_noise_e: float = 12.0**0.5
     dark_current_e_per_s: float = 0.2
     quantum_efficiency: float = 0.5

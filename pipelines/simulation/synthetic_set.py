@@ -34,8 +34,8 @@ from faintfield.recon.metrics import (
 )
 from faintfield.rig.plan import grid_nodes
 from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment, surface_experiment
+from faintfield.rig.simulation.optics import SimulatedSensor, through_mosaic
 from faintfield.rig.simulation.scene import render
-from faintfield.rig.simulation.sensor import SimulatedSensor, through_mosaic
 from faintfield.rig.simulation.surfaces import true_depth_mm
 
 NOISE_FREE = "noise_free"

@@ -28,10 +28,8 @@ class SimulatedBoard:
 
     Parameters
     ----------
-    corner_rows, corner_columns : int
-        Number of inner corners.
-    square_mm : float
-        Distance of neighbouring corners.
+    corner_rows, corner_columns, square_mm : int, int, float
+        Numbers of inner corners, and distance of neighbouring ones.
     rt_ref_board : array (6,)
         Rodrigues rad and mm, from the board, whose origin is its first corner, to the reference camera.
     """
@@ -76,18 +74,9 @@ def printed_board(
     board: SimulatedBoard,
     first_corner_mm: tuple[float, float],
 ) -> TexturedPlane:
-    """Return a printed board in the pose of `board`.
+    """Return a printed board, of reflectance `picture` (row, column), in the pose of `board`.
 
-    Parameters
-    ----------
-    name, picture : str, array (row, column)
-        Name of the plane, and its reflectance, 0…1.
-    pitch_mm : float
-        Distance of neighbouring samples of the picture.
-    board : SimulatedBoard
-        Pose of the board.
-    first_corner_mm : (float, float)
-        Position x, y of the first inner corner from the outer edges of the picture's first sample.
+    `first_corner_mm` is the position x, y of the first inner corner from the outer edges of the picture's first sample.
     """
     height, width = picture.shape
     centre_mm = np.array([width * pitch_mm / 2 - first_corner_mm[0], height * pitch_mm / 2 - first_corner_mm[1], 0.0])

@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 
 from faintfield.rig.plan import centre_node, nominal_poses_rt_cam_ref
 from faintfield.rig.simulation.objects import surface_scene, toy_airplane, toy_truck
-from faintfield.rig.simulation.optics import SimulatedOptics
+from faintfield.rig.simulation.optics import SimulatedOptics, SimulatedSensor
 from faintfield.rig.simulation.scene import RenderedView, TexturedPlane, render
-from faintfield.rig.simulation.sensor import SimulatedSensor
 from faintfield.rig.simulation.surfaces import Surface, render_surfaces
 
 

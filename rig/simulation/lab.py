@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,45 +16,40 @@ from faintfield.rig.plan import StepKind
 from faintfield.rig.settings import BoardSettings
 from faintfield.rig.simulation.boards import standing_board
 from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
+from faintfield.rig.simulation.optics import through_mosaic
 from faintfield.rig.simulation.scene import TexturedPlane, render
-from faintfield.rig.simulation.sensor import through_mosaic
 from faintfield.rig.stages.protocol import Point
 
 # Bent rails and eccentric pulleys: number of waves over the travel, and the range of their lengths in mm.
 _WAVES, _WAVE_LENGTHS_MM = 8, (80.0, 400.0)
 
 
-class _Carriage:
-    """Maps motor positions to camera poses, repeatably and without error at the centre."""
+@lru_cache(maxsize=1)
+def _rail_waves(seed: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return the wave vectors' x and y and the phases of the errors of the rails, each (6, wave)."""
+    generator = np.random.default_rng([seed, 1])
+    direction, phase = generator.uniform(0.0, 2.0 * np.pi, (2, 6, _WAVES))
+    per_mm = 2.0 * np.pi / generator.uniform(*_WAVE_LENGTHS_MM, (6, _WAVES))
+    return per_mm * np.cos(direction), per_mm * np.sin(direction), phase
 
-    def __init__(self, centre: Point, settings: SimulatedSettings) -> None:
-        self._centre = centre
-        self._settings = settings
 
-    def rt_cam_ref(self, x_mm: float, y_mm: float) -> NDArray[np.float64]:
-        """Return the camera pose (6,), Rodrigues rad and mm, at a motor position."""
-        right_mm, down_mm = x_mm - self._centre.x_mm, y_mm - self._centre.y_mm
-        settings = self._settings
-        sd = np.repeat([settings.rotation_error_mrad * 1e-3, settings.position_error_mm], 3)
-        pose: NDArray[np.float64] = sd * (self._waves(right_mm, down_mm) - self._waves(0.0, 0.0))
-        right_mm = right_mm * (1.0 + settings.scale_error) + down_mm * np.sin(settings.squareness_mrad * 1e-3)
-        down_mm *= np.cos(settings.squareness_mrad * 1e-3)
-        # A camera moved right and down by c maps reference points by −c
-        pose[3:5] -= right_mm, down_mm
-        return pose
+def _rail_errors(seed: int, x_mm: float, y_mm: float) -> NDArray[np.float64]:
+    """Return the errors (6,) of the rails; the difference of two distant positions has variance 1."""
+    x_per_mm, y_per_mm, phase = _rail_waves(seed)
+    return np.asarray(np.sin(x_per_mm * x_mm + y_per_mm * y_mm + phase).sum(axis=1) / np.sqrt(_WAVES))
 
-    def _waves(self, x_mm: float, y_mm: float) -> NDArray[np.float64]:
-        """Return the errors (6,) of the rails; the difference of two distant positions has variance 1."""
-        x_per_mm, y_per_mm, phase = self._shape
-        return np.asarray(np.sin(x_per_mm * x_mm + y_per_mm * y_mm + phase).sum(axis=1) / np.sqrt(_WAVES))
 
-    @cached_property
-    def _shape(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return the wave vectors' x and y and the phases, each (6, wave)."""
-        generator = np.random.default_rng([self._settings.seed, 1])
-        direction, phase = generator.uniform(0.0, 2.0 * np.pi, (2, 6, _WAVES))
-        per_mm = 2.0 * np.pi / generator.uniform(*_WAVE_LENGTHS_MM, (6, _WAVES))
-        return per_mm * np.cos(direction), per_mm * np.sin(direction), phase
+def _carriage_pose(settings: SimulatedSettings, right_mm: float, down_mm: float) -> NDArray[np.float64]:
+    """Return the camera pose (6,) at a motor position relative to the centre, where it is without error."""
+    sd = np.repeat([settings.rotation_error_mrad * 1e-3, settings.position_error_mm], 3)
+    pose: NDArray[np.float64] = sd * (
+        _rail_errors(settings.seed, right_mm, down_mm) - _rail_errors(settings.seed, 0.0, 0.0)
+    )
+    right_mm = right_mm * (1.0 + settings.scale_error) + down_mm * np.sin(settings.squareness_mrad * 1e-3)
+    down_mm *= np.cos(settings.squareness_mrad * 1e-3)
+    # A camera moved right and down by c maps reference points by −c
+    pose[3:5] -= right_mm, down_mm
+    return pose
 
 
 # Light of a flat relative to that of a white object.
@@ -71,10 +66,8 @@ class SimulatedLab:
     ----------
     centre, true_position, still_s : Point, callable, callable
         Stage position of the reference pose; the true position of the carriages, and the time since they stopped.
-    boards : tuple of BoardSettings
-        Boards of the charuco sweeps.
-    settings : SimulatedSettings
-        The camera, the light and the errors of the rails.
+    boards, settings : tuple of BoardSettings, SimulatedSettings
+        Boards of the charuco sweeps; the camera, the light and the errors of the rails.
     """
 
     def __init__(
@@ -89,7 +82,7 @@ class SimulatedLab:
         self._still_s = still_s
         self._boards = boards
         self._settings = settings
-        self._carriage = _Carriage(centre, settings)
+        self._centre = centre
         self._planes: tuple[TexturedPlane, ...] = ()
         self._photons_per_s = 0.0
         self._flat = False
@@ -133,7 +126,8 @@ class SimulatedLab:
         x_mm, y_mm = self._true_position()
         after_s = self._still_s() + 0.5 * exposure_s
         swing_mm = _SWING_MM * math.exp(-after_s / _SWING_DECAY_S) * math.cos(2.0 * math.pi * _SWING_HZ * after_s)
-        return self._carriage.rt_cam_ref(x_mm + swing_mm, y_mm + swing_mm)
+        right_mm, down_mm = x_mm + swing_mm - self._centre.x_mm, y_mm + swing_mm - self._centre.y_mm
+        return _carriage_pose(self._settings, right_mm, down_mm)
 
 
 def flat_photons_per_s(settings: SimulatedSettings) -> float:
@@ -151,8 +145,8 @@ def lab_experiment(settings: SimulatedSettings) -> SimulatedExperiment:
         gain_dn_per_e=settings.gain_dn_per_e,
         saturation_dn=settings.saturation_dn,
     )
-    coloured = replace(paper, sensor=sensor)
-    return coloured if settings.mosaic else coloured.grey()
+    experiment = replace(paper, sensor=sensor)
+    return experiment if settings.mosaic else experiment.grey()
 
 
 # Temperature of a sensor whose cooling is not simulated, and the set point of one whose is, unless it is stated.

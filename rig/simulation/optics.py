@@ -1,4 +1,4 @@
-"""The optics of the simulated camera: the ray of each detector sample, and the light that reaches it.
+"""The simulated camera's lens and sensor: the ray of each detector sample, the light that reaches it, and its noise.
 
 This module shares no code with `calib` or `recon`, so that both can be tested against it.
 """
@@ -14,14 +14,10 @@ type Points = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SimulatedOptics:
-    """A lens and its detector; the centre of the first pixel is (0, 0).
+    """A lens and its detector, of width and height `size_px`; the centre of the first pixel is (0, 0).
 
     Parameters
     ----------
-    size_px : (int, int)
-        Width and height.
-    fx_px, fy_px, cx_px, cy_px : float
-        Focal lengths and principal point.
     distortion : tuple of float
         Up to eight coefficients in OpenCV's order k1, k2, p1, p2, k3, k4, k5, k6.
     vignetting : bool
@@ -101,3 +97,52 @@ def _undistort(x_image: Points, y_image: Points, distortion: tuple[float, ...]) 
         x -= (yy * error_x - xy * error_y) / determinant
         y -= (xx * error_y - yx * error_x) / determinant
     raise ValueError(f"distortion {distortion} cannot be inverted over the whole detector; take smaller coefficients")
+
+
+@dataclass(frozen=True)
+class SimulatedSensor:
+    """Converts light to DN, with the noise of eq. (6) of the paper; the defaults are those of the paper's camera.
+
+    Parameters
+    ----------
+    offset_dn, gain_dn_per_e : float
+        DN without electrons, and DN per electron.
+    read_noise_e : float
+        Standard deviation; the paper's variance is 12 e⁻².
+    dark_current_e_per_s, quantum_efficiency : float
+        Electrons per pixel and second without light; electrons per photon.
+    saturation_dn : int
+        Highest value of the converter.
+    """
+
+    offset_dn: float = 100.0
+    gain_dn_per_e: float = 2.0
+    read_noise_e: float = 12.0**0.5
+    dark_current_e_per_s: float = 0.2
+    quantum_efficiency: float = 0.5
+    saturation_dn: int = 65535
+
+    def __post_init__(self) -> None:
+        if not 0 < self.saturation_dn <= 65535:
+            raise ValueError(f"saturation_dn must lie within 1…65535 for a 16-bit file, got {self.saturation_dn}")
+
+    def expose(
+        self, photons_per_px: NDArray[np.floating], exposure_s: float, generator: np.random.Generator
+    ) -> NDArray[np.uint16]:
+        """Return one frame (row, column) in DN, given the expected photons on each pixel during the exposure."""
+        expected_e = self.quantum_efficiency * photons_per_px + self.dark_current_e_per_s * exposure_s
+        electrons = generator.poisson(expected_e) + generator.normal(0.0, self.read_noise_e, expected_e.shape)
+        return self.digitise(electrons)
+
+    def digitise(self, electrons: NDArray[np.floating]) -> NDArray[np.uint16]:
+        """Return electrons as integer DN within the converter's range."""
+        dn = np.rint(electrons * self.gain_dn_per_e + self.offset_dn)
+        return np.clip(dn, 0, self.saturation_dn).astype(np.uint16)
+
+
+def through_mosaic(light: NDArray[np.floating], mosaic: tuple[str, ...]) -> NDArray[np.floating]:
+    """Return the light (row, column) behind the colour filters of a mosaic, from light (row, column, RGB)."""
+    rows, columns = np.indices(light.shape[:2])
+    colours = np.array([["RGB".index(letter) for letter in row] for row in mosaic])
+    chosen = colours[rows % colours.shape[0], columns % colours.shape[1]]
+    return np.take_along_axis(light, chosen[:, :, np.newaxis], axis=2)[:, :, 0]

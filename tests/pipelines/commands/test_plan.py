@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from faintfield.rig.simulation.sensor import SimulatedSensor
+from faintfield.rig.simulation.optics import SimulatedSensor
 from tests.pipelines.by_hand import FITTED, write_fitted_noise
 from tests.pipelines.conftest import Command, assert_refused
 

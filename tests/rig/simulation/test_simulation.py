@@ -7,8 +7,7 @@ import pytest
 from faintfield.rig.plan import centre_node, grid_nodes, nominal_poses_rt_cam_ref
 from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
 from faintfield.rig.simulation.lab import Cooling
-from faintfield.rig.simulation.optics import SimulatedOptics, distort
-from faintfield.rig.simulation.sensor import SimulatedSensor
+from faintfield.rig.simulation.optics import SimulatedOptics, SimulatedSensor, distort
 
 RATIONAL = (0.2, -0.1, -1e-3, 2e-3, 0.02, 0.3, -0.05, 0.01)
 
