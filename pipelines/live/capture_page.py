@@ -66,14 +66,7 @@ def serve_page(
 ) -> Iterator[str]:
     """Serve the page of a capture while the block runs; yield its address, which no log records.
 
-    Parameters
-    ----------
-    panel : CapturePanel
-        Prompts and state of the capture.
-    frames : SessionFrames, optional
-        Frames of its session, shown when a node is clicked.
-    planes : PlanesClient, optional
-        Its live planes.
+    It shows prompts and state of `panel`, the `frames` of the session when a node is clicked, and live planes.
     """
     token = secrets.token_urlsafe(24)
     conceal(token)
@@ -141,15 +134,10 @@ class _BoundedConnection(H11Protocol):
 
 
 class _TokenMiddleware:
-    """Passes a request on if it gives the token, and comes from this page; tells others nothing.
-
-    Attributes
-    ----------
-    strangers : dict
-        The connections that have not given the token, the oldest first, by the address of the other side.
-    """
+    """Passes a request on if it gives the token, and comes from this page; tells others nothing."""
 
     def __init__(self, pages: Router, token: str) -> None:
+        # The connections that have not given the token, the oldest first, by the address of the other side
         self.strangers: dict[object, asyncio.Transport] = {}
         self._pages = pages
         self._token = token.encode()
@@ -164,10 +152,10 @@ class _TokenMiddleware:
 
 
 def _is_own(headers: Headers) -> bool:
-    """Return whether a request comes from the page itself.
+    """Return whether a request comes from the page itself, whatever the port, as that of a tunnel may be any.
 
     A foreign page can make a name of its own point to this computer, which `Host` tells, or post to an address that it
-    knows, which `Origin` tells. Any port will do, because the page may be reached through a tunnel.
+    knows, which `Origin` tells.
     """
     host = headers.get("host", "")
     return host.partition(":")[0] == _HOST and headers.get("origin") in (None, f"http://{host}")
@@ -242,9 +230,8 @@ async def _body(request: Request) -> bytes:
 @lru_cache(maxsize=1)
 def _png(shown: ShownFrame) -> bytes:
     """Return the picture of a frame in red, as a PNG file."""
-    grey = display_levels(shown.pixels, _PICTURE_PX)
-    zero = np.zeros_like(grey)
-    return encoded(np.dstack([grey, zero, zero]), ".png")
+    red = display_levels(shown.pixels, _PICTURE_PX)
+    return encoded(np.dstack([red, np.zeros_like(red), np.zeros_like(red)]), ".png")
 
 
 @lru_cache(maxsize=1)

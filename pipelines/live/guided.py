@@ -14,8 +14,7 @@ from faintfield.pipelines.errors import InputError, UnknownFormat
 from faintfield.pipelines.formats.files import require_room
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.live.panel import CapturePanel, SessionFrames
-from faintfield.pipelines.live.planes_client import live_planes
-from faintfield.pipelines.live.planes_messages import LiveOrder
+from faintfield.pipelines.live.planes_client import LiveOrder, live_planes
 from faintfield.pipelines.live.terminal import TerminalView
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.capture.guide import format_duration

@@ -12,7 +12,7 @@ from typing import get_args
 
 from msgspec import Struct
 
-from faintfield.pipelines.live.planes_messages import LiveFrame
+from faintfield.pipelines.live.planes_client import LiveFrame
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.capture.guide import Answer, OperatorRequest, Prompt, Status
 from faintfield.rig.plan import PlannedFrame
@@ -40,10 +40,7 @@ class ShownFrame(Struct, frozen=True, eq=False):
 class CapturePanel:
     """The `OperatorInterface` of a capture; views show its state and press its buttons.
 
-    Parameters
-    ----------
-    unattended : bool
-        Give every prompt its unattended answer; requests are still accepted.
+    If it is `unattended`, it gives every prompt its unattended answer; requests are still accepted.
 
     Attributes
     ----------
@@ -124,7 +121,7 @@ class SessionFrames:
     def at(self, step: int, node: tuple[int, int]) -> list[FrameSummary]:
         """Return the frames of a step at a node, in the order of the plan."""
         return [
-            self._record(frame, planned)
+            self._summary(frame, planned)
             for frame, planned in self._valid()
             if planned.step == step and planned.stop.node == node
         ]
@@ -143,7 +140,7 @@ class SessionFrames:
         frames = sorted(self._session.valid().values(), key=lambda frame: frame.frame)
         return [(frame, self._session.frames[frame.frame]) for frame in frames]
 
-    def _record(self, frame: CommittedFrame, planned: PlannedFrame) -> FrameSummary:
+    def _summary(self, frame: CommittedFrame, planned: PlannedFrame) -> FrameSummary:
         x_mm, y_mm = frame.record.position_mm
         written_s = None
         with suppress(OSError):

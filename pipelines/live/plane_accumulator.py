@@ -2,14 +2,13 @@
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.pipelines.live.planes_messages import LiveFrame, PictureKind
+from faintfield.pipelines.live.planes_client import LiveFrame, PictureKind
 from faintfield.pipelines.live.planes_scene import LiveScene
 from faintfield.pipelines.reconstruction.channels import lattice_noise, view_electrons
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
@@ -48,7 +47,7 @@ class _Refined(NamedTuple):
 class CompleteViews:
     """Images of the nodes that have all of their frames, one after another in memory, which solvers read as they are.
 
-    Memory is taken as nodes are complete.
+    `np.empty` takes memory as nodes are complete.
     """
 
     def __init__(self, shape: tuple[int, int], nodes: int, frames_per_view: int) -> None:
@@ -86,11 +85,11 @@ class CompleteViews:
         return ElementalImages(self._electrons[:count], background_e, read_variance_e2, None if valid.all() else valid)
 
 
-@dataclass(frozen=True)
-class _Frame:
-    """A frame that was read: its view, its images in bins, and its exposure relative to that of a view."""
+class _Frame(NamedTuple):
+    """A frame that was read: its view, its pixels and bins in electrons, and its share of the exposure of a view."""
 
     view: int
+    pixels: NDArray[np.float32]
     images: ElementalImages
     share: float
 
@@ -131,7 +130,7 @@ class PlaneAccumulator:
         """Number of nodes that PMLEM can take."""
         return 0 if self._complete is None else len(self._complete.views)
 
-    def add(self, frame: LiveFrame, planes_in_order: Sequence[int]) -> NDArray[np.generic]:
+    def add(self, frame: LiveFrame) -> NDArray[np.float32]:
         """Add a frame to all planes; return its pixels (row, column), in electrons.
 
         Raises
@@ -139,27 +138,27 @@ class PlaneAccumulator:
         InputError
             The file cannot be read, or does not fit the others.
         """
-        read, pixels = self._read(frame)
-        for index in planes_in_order:
+        read = self._read(frame)
+        for index, running in enumerate(self._running):
             self._latest[index] = view = self._project(index, read)
             if view is not None:
-                self._running[index].add(view, _half(frame))
+                running.add(view, _half(frame))
         if self._complete is not None:
             self._complete.add(read.view, read.images)
         self.frames[frame.intent] = frame
-        return pixels
+        return read.pixels
 
     def remove(self, frame: LiveFrame) -> None:
         """Take a frame away that is not valid any more; raises as `add` does."""
         del self.frames[frame.intent]
-        read, _ = self._read(frame)
+        read = self._read(frame)
         for index, running in enumerate(self._running):
             if (view := self._project(index, read)) is not None:
                 running.remove(view, _half(frame))
         if self._complete is not None:
             self._complete.drop(read.view)
             for same_node in [kept for kept in self.frames.values() if kept.node == frame.node]:
-                self._complete.add(read.view, self._read(same_node)[0].images)
+                self._complete.add(read.view, self._read(same_node).images)
 
     def picture(self, index: int, kind: PictureKind) -> tuple[Image, NDArray[np.bool_], int] | None:
         """Return a plane (row, column) in electrons per pixel, where it is covered, and from how many nodes."""
@@ -216,26 +215,21 @@ class PlaneAccumulator:
 
     def _project(self, index: int, read: _Frame) -> SeenByView | None:
         """Back-project a frame to a plane; None if its view does not see the plane."""
+        depth_mm, grid = self._depths_mm[index], self._grids[index]
         try:
-            operator = self._factory.of_views(
-                self._depths_mm[index], self._grids[index], [read.view], read.images.valid
-            )
+            operator = self._factory.of_views(depth_mm, grid, [read.view], read.images.valid)
         except GeometryMismatch:
             return None
         return seen_by_view(operator, read.images, read.share)
 
-    def _read(self, frame: LiveFrame) -> tuple[_Frame, NDArray[np.float32]]:
-        """Return a frame in electrons, in bins and in pixels."""
+    def _read(self, frame: LiveFrame) -> _Frame:
         elemental_set = self.scene.elemental_set
         [(electrons, over)] = view_electrons(elemental_set, self.scene.layout, [self._folder / frame.file])
-        images = ElementalImages(
-            electrons[np.newaxis],
-            self._noise.background_e(frame.exposure_s),
-            valid=~over[np.newaxis] if over.any() else None,
-        )
+        background_e = self._noise.background_e(frame.exposure_s)
+        images = ElementalImages(electrons[np.newaxis], background_e, valid=~over[np.newaxis] if over.any() else None)
         total_s = elemental_set.settings.exposure_s or frame.exposure_s
         view = self.scene.view_of[frame.node]
-        return _Frame(view, images.binned(self.scene.bins), frame.exposure_s / total_s), electrons
+        return _Frame(view, electrons, images.binned(self.scene.bins), frame.exposure_s / total_s)
 
 
 def _binned_sum(value: float | NDArray[np.floating], bins: int) -> float | Image:

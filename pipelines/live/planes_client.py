@@ -1,7 +1,7 @@
-"""The capture's side of live planes: a process that computes them, its messages, and the frames that it is told.
+"""The capture's side of live planes: the messages to and from the process that computes them, and its pictures.
 
 Nothing here waits for the process, and nothing that happens to it reaches the capture: one thread sends, another
-receives, and the session is not touched.
+receives, and the session is not touched. The process sends states and pictures, which are pairs of a name and a PNG.
 """
 
 import os
@@ -14,9 +14,17 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Literal
+
+from msgspec import Struct
 
 from faintfield.pipelines.console import inform
-from faintfield.pipelines.live.planes_messages import LiveFrame, LiveNews, LiveOrder, LiveStatus
+
+type PictureKind = Literal["view", "mean", "pmlem"]
+
+# Most planes: each takes about 40 MB.
+MAX_DEPTHS = 32
 
 # One thread for everything, and no modules from the current folder, which may be a stranger's.
 _ENVIRONMENT = {
@@ -31,20 +39,94 @@ _NICENESS = 19
 _MAX_FAREWELL_S = 5.0
 
 
-class PlanesClient:
-    """Live planes, as the capture and its page see them.
+class LiveOrder(Struct, frozen=True):
+    """Request for live planes: the first message to their process.
 
     Parameters
     ----------
-    order : LiveOrder
-        The request.
-    frames : callable
-        Returns all valid frames of the dark scene; called in another thread.
+    session, rig : Path
+        Folder of the session, and its rig.toml.
+    depths_mm : tuple of float
+        Depths of the planes.
+    noise, geometry : Path, optional
+        Results of `faintfield noise` and `faintfield geometry`; by default those in the session or beside rig.toml.
+    fx_px : float, optional
+        Focal length in pixels, where no geometry.json is found.
+    """
+
+    session: Path
+    rig: Path
+    depths_mm: tuple[float, ...]
+    noise: Path | None = None
+    geometry: Path | None = None
+    fx_px: float | None = None
+
+
+class LiveFrame(Struct, frozen=True):
+    """A valid frame of the dark scene; `intent` is the number of its exposure, which no other frame has."""
+
+    intent: int
+    file: str
+    node: tuple[int, int]
+    exposure_s: float
+
+
+class LiveNews(Struct, frozen=True):
+    """All valid frames of the dark scene now, and the index of the depth that the page shows: every further message."""
+
+    frames: tuple[LiveFrame, ...]
+    depth: int
+
+
+class PictureStatus(Struct, frozen=True):
+    """A picture that is there: from how many nodes, and the electrons per pixel that are black and white in it."""
+
+    version: int
+    nodes: int
+    black: float
+    white: float
+
+
+class PlaneStatus(Struct, frozen=True):
+    """One depth: its pictures, and the power of the detail that two halves of the views agree on, with its σ."""
+
+    depth_mm: float
+    pictures: dict[str, PictureStatus] = {}
+    focus: float = 0.0
+    focus_sigma: float = 0.0
+
+
+class LiveStatus(Struct, frozen=True):
+    """State of the live planes, as the page shows it.
+
+    `frames` and `nodes` are those added up so far, `poses` and `noise` name kinds and sources, `pmlem` is the progress
+    of PMLEM or why it is left out, `bins` are so many pixels wide, and the nodes `with_picture` have one of their
+    latest frame. `planes` are in the order of `LiveOrder`.
+    """
+
+    doing: str
+    frames: int = 0
+    nodes: int = 0
+    planned_nodes: int = 0
+    poses: str = ""
+    noise: str = ""
+    pmlem: str = ""
+    unit: str = "e⁻/px"
+    bins: int = 1
+    planes: tuple[PlaneStatus, ...] = ()
+    with_picture: tuple[tuple[int, int], ...] = ()
+    problems: tuple[str, ...] = ()
+
+
+class PlanesClient:
+    """Live planes, as the capture and its page see them; `frames`, called in another thread, returns the valid ones.
 
     Attributes
     ----------
     status : LiveStatus, optional
         Latest state of the process; None before the first.
+    pid : int
+        Number of the process.
 
     Raises
     ------
@@ -71,15 +153,11 @@ class PlanesClient:
                 pass_fds=[end.fileno()],
                 process_group=0,  # Ctrl-C is for the capture, which ends this process
             )
+        self.pid = self._process.pid
         with suppress(OSError):  # at once: loading its modules is work, too
-            os.setpriority(os.PRIO_PROCESS, self._process.pid, _NICENESS)
+            os.setpriority(os.PRIO_PROCESS, self.pid, _NICENESS)
         threading.Thread(target=self._send, args=(line, order), daemon=True, name="frames to live planes").start()
         threading.Thread(target=self._receive, args=(line,), daemon=True, name="live planes").start()
-
-    @property
-    def pid(self) -> int:
-        """Number of the process."""
-        return self._process.pid
 
     def note_change(self) -> None:
         """Note that frames may have come or gone; costs nothing, as a thread does the rest."""

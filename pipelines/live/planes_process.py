@@ -5,8 +5,8 @@ frames that wait are taken newest first; PMLEM runs when none does.
 """
 
 import sys
-import time
 from multiprocessing.connection import Connection
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -17,8 +17,7 @@ from faintfield.pipelines.errors import InputError
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import encoded, grey_levels
 from faintfield.pipelines.live.plane_accumulator import MAX_STACK_BYTES, PlaneAccumulator
-from faintfield.pipelines.live.planes_messages import (
-    PICTURE_KINDS,
+from faintfield.pipelines.live.planes_client import (
     LiveFrame,
     LiveNews,
     LiveOrder,
@@ -33,6 +32,10 @@ from faintfield.recon.errors import ReconstructionError
 from faintfield.recon.names import on_compiling
 from faintfield.rig.errors import RigError
 from faintfield.rig.session.session import FRAMES, read_plan
+
+# Work on a plane, the most urgent first.
+type _Task = Literal["view", "mean", "focus", "pmlem"]
+_TASKS: tuple[_Task, ...] = ("view", "mean", "focus", "pmlem")
 
 # Black and white of a picture are these quantiles of its covered samples, from about so many of them.
 _QUANTILES = (0.005, 0.998)
@@ -55,18 +58,15 @@ class LivePlanes:
         self._wanted: dict[int, LiveFrame] = {}
         self._unusable: set[int] = set()
         self._shown = 0
-        self._stale: set[tuple[int, PictureKind]] = set()
-        self._stale_focus: set[int] = set()
-        self._with_picture: dict[tuple[int, int], None] = {}
+        self._tasks: set[tuple[int, _Task]] = set()
         self._status = LiveStatus(
             "waiting for frames of the dark scene", planes=tuple(PlaneStatus(depth) for depth in order.depths_mm)
         )
-        self._adding_s, self._added = 0.0, 0
 
     def run(self) -> None:
         """Do one thing at a time until the capture ends, which raises EOFError or ConnectionError."""
-        on_compiling.append(lambda: self._report("compiling; once, for some ten seconds"))
-        self._report(self._status.doing)
+        on_compiling.append(lambda: self._report(doing="compiling; once, for some ten seconds"))
+        self._report()
         busy = False
         while True:
             news: LiveNews | None = None if busy else self._line.recv()
@@ -77,7 +77,7 @@ class LivePlanes:
                 self._shown = min(news.depth, self._indices[-1])
             busy = self._begin() if self._planes is None else self._advance(self._planes)
             if not busy and self._wanted and self._planes is not None:
-                self._report("up to date")
+                self._report(doing="up to date")
 
     def _begin(self) -> bool:
         """Find out what is known of the scene, once its first frame is there; return whether planes can begin."""
@@ -88,13 +88,13 @@ class LivePlanes:
         try:
             frozen = read_plan(self._order.session)
             scene = live_scene(self._order, frozen, read_frame(folder / first.file))
-            self._report("computing where each pixel looks")
+            self._report(doing="computing where each pixel looks")
             self._planes = PlaneAccumulator(scene, folder, self._order.depths_mm)
         except _FAILURES as failure:
-            self._report("waiting", problems=(str(failure),))
+            self._report(doing="waiting", problems=(str(failure),))
             return False
         self._report(
-            "reading frames",
+            doing="reading frames",
             poses=scene.poses,
             noise=scene.noise,
             unit="e⁻/px" if scene.knows_noise else "DN/px",
@@ -113,58 +113,56 @@ class LivePlanes:
             self._remove(planes, void[0])
         elif new:
             self._add(planes, self._wanted[max(new)])
-        elif self._stale:
-            index, kind = min(self._stale, key=lambda key: (self._distance(key[0]), PICTURE_KINDS.index(key[1])))
-            self._draw(planes, index, kind)
-        elif self._stale_focus:
-            self._measure_focus(planes, min(self._stale_focus, key=self._distance))
-        elif unrefined := [index for index in self._indices if not planes.is_refined(index)]:
-            self._refine(planes, min(unrefined, key=self._distance))
+        elif self._tasks:
+            index, task = min(self._tasks, key=self._rank)
+            self._work(planes, index, task)
         else:
             return False
         return True
 
+    def _rank(self, task: tuple[int, _Task]) -> tuple[bool, int, int, int]:
+        """Return the place in the queue: PMLEM comes last, and planes near to the one that is shown first."""
+        index, kind = task
+        return kind == "pmlem", abs(index - self._shown), index, _TASKS.index(kind)
+
     def _add(self, planes: PlaneAccumulator, frame: LiveFrame) -> None:
         """Add a frame, and show it on the plane that is looked at."""
-        order = sorted(self._indices, key=self._distance)
-        start_s = time.perf_counter()
         try:
-            electrons = planes.add(frame, order)
+            electrons = planes.add(frame)
         except _FAILURES as failure:
             self._unusable.add(frame.intent)
             self._report_problem(failure)
             return
-        self._adding_s += time.perf_counter() - start_s
-        self._added += len(order)
         row, column = frame.node
         self._send_picture(f"node_r{row}_c{column}.png", display_levels(electrons, _FRAME_WIDTH_PX))
-        self._with_picture[frame.node] = None
-        self._mark_stale(planes, "view", "mean")
-        self._draw(planes, self._shown, "view")
-        self._draw(planes, self._shown, "mean")
+        self._note_change(planes, with_picture=tuple(dict.fromkeys((*self._status.with_picture, frame.node))))
+        self._work(planes, self._shown, "view")
+        self._work(planes, self._shown, "mean")
 
     def _remove(self, planes: PlaneAccumulator, frame: LiveFrame) -> None:
         try:
             planes.remove(frame)
         except _FAILURES as failure:
             self._report_problem(failure)
-        self._mark_stale(planes, "mean")
+        self._note_change(planes)
 
-    def _mark_stale(self, planes: PlaneAccumulator, *kinds: PictureKind) -> None:
-        """Note which pictures have to be drawn again."""
-        self._stale |= {(index, kind) for index in self._indices for kind in kinds}
-        self._stale_focus |= set(self._indices)
-        self._report(
-            "adding frames",
-            frames=len(planes.frames),
-            nodes=len(planes.nodes),
-            with_picture=tuple(self._with_picture),
-            seconds_per_plane=self._adding_s / max(self._added, 1),
-        )
+    def _note_change(self, planes: PlaneAccumulator, **changes: object) -> None:
+        """Note that the frames are others, so that all is to be done again."""
+        self._tasks = {(index, task) for index in self._indices for task in _TASKS}
+        self._report(doing="adding frames", frames=len(planes.frames), nodes=len(planes.nodes), **changes)
+
+    def _work(self, planes: PlaneAccumulator, index: int, task: _Task) -> None:
+        self._tasks.discard((index, task))
+        if task == "focus":
+            measure = planes.focus(index)
+            self._report_plane(index, focus=measure.detail_e2, focus_sigma=measure.sigma_e2)
+        elif task != "pmlem":
+            self._draw(planes, index, task)
+        elif not planes.is_refined(index):
+            self._refine(planes, index)
 
     def _draw(self, planes: PlaneAccumulator, index: int, kind: PictureKind) -> None:
         """Send a picture, and its scale with the state."""
-        self._stale.discard((index, kind))
         picture = planes.picture(index, kind)
         if picture is None:
             return
@@ -176,35 +174,28 @@ class LivePlanes:
         version = pictures[kind].version + 1 if kind in pictures else 1
         self._report_plane(index, pictures=pictures | {kind: PictureStatus(version, nodes, black, white)})
 
-    def _measure_focus(self, planes: PlaneAccumulator, index: int) -> None:
-        self._stale_focus.discard(index)
-        measure = planes.focus(index)
-        self._report_plane(index, focus=measure.detail_e2, focus_sigma=measure.sigma_e2)
-
     def _refine(self, planes: PlaneAccumulator, index: int) -> None:
-        """Run PMLEM on a plane until it is done, or there are news."""
+        """Run PMLEM on a plane until it is done, or there are news; then the rest is to be done later."""
         depths_mm, count = self._order.depths_mm, planes.complete
-        self._report(f"PMLEM of the plane at {depths_mm[index]:g} mm")
+        self._report(doing=f"PMLEM of the plane at {depths_mm[index]:g} mm")
         planes.refine(index, self._line.poll)
+        if not planes.is_refined(index):
+            self._tasks.add((index, "pmlem"))
         self._draw(planes, index, "pmlem")
         done = sum(map(planes.is_refined, self._indices))
-        self._report(self._status.doing, pmlem=f"PMLEM of {count} nodes: {done} of {len(depths_mm)} planes done")
-
-    def _distance(self, index: int) -> tuple[int, int]:
-        """Return the rank of a plane by its distance from that which is looked at."""
-        return abs(index - self._shown), index
+        self._report(pmlem=f"PMLEM of {count} nodes: {done} of {len(depths_mm)} planes done")
 
     def _report_problem(self, failure: Exception) -> None:
-        self._report(self._status.doing, problems=(*self._status.problems[-2:], str(failure)))
+        self._report(problems=(*self._status.problems[-2:], str(failure)))
 
     def _report_plane(self, index: int, **changes: object) -> None:
         planes = list(self._status.planes)
         planes[index] = replace(planes[index], **changes)
-        self._report(self._status.doing, planes=tuple(planes))
+        self._report(planes=tuple(planes))
 
-    def _report(self, doing: str, **changes: object) -> None:
+    def _report(self, **changes: object) -> None:
         """Change the state, and send it."""
-        self._status = replace(self._status, doing=doing, **changes)
+        self._status = replace(self._status, **changes)
         self._line.send(self._status)
 
     def _send_picture(self, name: str, levels: NDArray[np.uint8]) -> None:

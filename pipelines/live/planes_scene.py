@@ -14,7 +14,7 @@ from faintfield.pipelines.formats.results.noise import NOISE_FILE, FittedNoise, 
 from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSetFile
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, with_measured_geometry
 from faintfield.pipelines.formats.sets.session_set import nominal_view, relative_to_axis
-from faintfield.pipelines.live.planes_messages import LiveOrder
+from faintfield.pipelines.live.planes_client import LiveOrder
 from faintfield.pipelines.planning.known import KnownLens, Sensor, calibration_file, known_lens, known_sensor
 from faintfield.pipelines.reconstruction.channels import ChannelLayout
 from faintfield.rig.plan import CapturePlan, PlannedFrame, planned_frames
@@ -31,18 +31,9 @@ type Node = tuple[int, int]
 class LiveScene:
     """The views of a dark scene that are planned, as an elemental set without images.
 
-    Attributes
-    ----------
-    elemental_set : ElementalSet
-        A view per node; the names of its images mean nothing.
-    layout, bins : ChannelLayout, int
-        The pixels that count, of RGB the green ones, and the width in pixels of the bins that are added up.
-    view_of : dict of (int, int) to int
-        Index of each node's view.
-    poses, noise : str
-        Their sources, in words.
-    knows_noise : bool
-        True if there is a noise model, without which light is in DN and PMLEM has no likelihood.
+    The set has a view per node; the names of its images mean nothing. `layout` has the pixels that count, of RGB the
+    green ones; `bins` are so many pixels wide; `view_of` has the index of each node's view. `poses` and `noise` are
+    their sources, in words. Unless it `knows_noise`, light is in DN and PMLEM has no likelihood.
     """
 
     elemental_set: ElementalSet

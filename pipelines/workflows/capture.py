@@ -9,7 +9,7 @@ from faintfield.pipelines.console import console
 from faintfield.pipelines.errors import WrongUsage
 from faintfield.pipelines.formats.rig_file import read_rig
 from faintfield.pipelines.live.guided import capture_session
-from faintfield.pipelines.live.planes_messages import MAX_DEPTHS, LiveOrder
+from faintfield.pipelines.live.planes_client import MAX_DEPTHS, LiveOrder
 from faintfield.pipelines.reconstruction.options import sweep_values
 
 

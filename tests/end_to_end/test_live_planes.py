@@ -24,8 +24,7 @@ from faintfield.pipelines.formats.results.geometry import LensRecord
 from faintfield.pipelines.live.capture_page import serve_page
 from faintfield.pipelines.live.guided import read_pixels
 from faintfield.pipelines.live.panel import CapturePanel, SessionFrames
-from faintfield.pipelines.live.planes_client import PlanesClient, live_planes
-from faintfield.pipelines.live.planes_messages import LiveOrder, LiveStatus
+from faintfield.pipelines.live.planes_client import LiveOrder, LiveStatus, PlanesClient, live_planes
 from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.capture.loop import Capture
 from faintfield.rig.devices import open_rig

@@ -12,7 +12,7 @@ from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.results.geometry import CameraPoses, LensRecord, NodeRecord
 from faintfield.pipelines.formats.sets.session_set import load_session
 from faintfield.pipelines.live.plane_accumulator import PlaneAccumulator
-from faintfield.pipelines.live.planes_messages import LiveFrame, LiveOrder
+from faintfield.pipelines.live.planes_client import LiveFrame, LiveOrder
 from faintfield.pipelines.live.planes_process import stretch
 from faintfield.pipelines.live.planes_scene import LiveScene, bins_of, live_scene
 from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
@@ -74,11 +74,11 @@ def test_frames_in_turn_give_planes_of_the_session(session: Path, bins: int) -> 
     frames = frames_of(session)
     void = frames[4]
     for frame in [frames[7], *frames[:7], *frames[8:]]:
-        planes.add(frame, [0])
+        planes.add(frame)
     # A frame that becomes void and is taken again, of the same file
     planes.remove(void)
     assert planes.complete == 8
-    planes.add(msgspec.structs.replace(void, intent=999), [0])
+    planes.add(msgspec.structs.replace(void, intent=999))
     assert (planes.complete, len(planes.nodes), len(planes.frames)) == (9, 9, 18)
 
     found = planes.picture(0, "mean")
@@ -131,7 +131,7 @@ def test_missing_noise_gives_dn_but_lens_is_needed(session: Path, tmp_path: Path
     scene = live_scene(msgspec.structs.replace(order, fx_px=410.0), frozen, frame)
     assert (scene.knows_noise, scene.elemental_set.lens.fx_px) == (False, 410.0)
     planes = PlaneAccumulator(scene, session / "frames", [_DEPTH_MM])
-    planes.add(frames_of(session)[8], [0])
+    planes.add(frames_of(session)[8])
     found = planes.picture(0, "view")
     assert found is not None
     assert np.median(found[0][found[1]]) == pytest.approx(2 * 100.0, rel=0.1)  # of one of two frames of a view
