@@ -45,13 +45,9 @@ SIMULATED_FIRMWARE = {"grbl": SimulatedGrbl, "grblhal": SimulatedGrblHal, "marli
 class Rig:
     """The devices of a capture, not yet connected, and their clock.
 
-    Parameters
-    ----------
-    arrange : callable
-        Called with kind and sweep at the beginning of each step; a simulated lab then does what a person does in a
-        real one.
-    camera_sees_stage : bool
-        Whether the camera moves with the stage: a real camera does not swing with a simulated one, nor share its clock.
+    `arrange` is called with kind and sweep at the beginning of each step; a simulated lab then does what a person does
+    in a real one. A real camera may look on while a simulated stage moves: then `camera_sees_stage` is False, as it
+    neither swings with the stage nor shares its clock.
     """
 
     stage: Gantry
@@ -64,15 +60,8 @@ class Rig:
 def open_rig(settings: RigSettings, traffic: TrafficLog | None = None, decode: Decode = lambda path: None) -> Rig:
     """Construct the stage and the camera of a rig.toml; neither is connected yet.
 
-    A real camera may look on while a simulated stage moves: a rehearsal without motors. `traffic` gets every byte to
-    and from the stage; `decode` reads the pixels of a file, so that a watched folder knows when a file is complete.
-
-    Raises
-    ------
-    PlanRefused
-        The camera is simulated and the stage is not, so that the camera's true position is not known; camera and stage
-        cannot share Micro-Manager; a plug-in cannot be used; or the stage has no homing switches that a drift check
-        could time.
+    `traffic` gets every byte to and from the stage; `decode` reads the pixels of a file, so that a watched folder knows
+    when a file is complete. Raises `PlanRefused` if camera, stage and drift check cannot be used together.
     """
     if settings.stage.protocol == "micromanager" and settings.drift.check:
         raise PlanRefused(
@@ -131,7 +120,8 @@ def open_stage(
     """Return the stage that `settings` describe, not yet connected.
 
     Protocol `simulated`, or a port `simulated:grbl`, `simulated:grblhal` or `simulated:marlin`, gives a simulated stage
-    with a clock of its own, so that motions take no real time.
+    with a clock of its own, so that motions take no real time. With `:pty` after it, every byte passes through a
+    pseudo-terminal and pyserial.
 
     Parameters
     ----------
@@ -161,18 +151,15 @@ def open_stage(
 
 
 def _simulated_bench(settings: StageSettings) -> Bench:
-    """Return the bench of the simulated stage that `settings` name, such as `simulated:grbl` or `simulated:grbl:pty`.
-
-    With `:pty`, every byte passes through a pseudo-terminal and pyserial.
-    """
     name, _, cable = settings.port.removeprefix(SIMULATED).partition(":")
-    if (name or "grbl") not in SIMULATED_FIRMWARE or cable not in ("", "pty"):
+    firmware = SIMULATED_FIRMWARE.get(name or "grbl")
+    if firmware is None or cable not in ("", "pty"):
         raise PlanRefused(
             f"{settings.port}: no such stage; choose {', '.join(SIMULATED_FIRMWARE)}, with or without :pty after it"
         )
     if not cable:
-        return Bench(SIMULATED_FIRMWARE[name or "grbl"])
+        return Bench(firmware)
     link = PtyLink()
-    bench = Bench(SIMULATED_FIRMWARE[name], link)
+    bench = Bench(firmware, link)
     weakref.finalize(bench, link.close)
     return bench

@@ -1,32 +1,5 @@
 """The exceptions of the rig, in one tree: catch `RigError` to catch them all.
 
-RigError
-├── StageError
-│   ├── StageAlarm
-│   ├── StageTimeout
-│   ├── StageLost
-│   ├── StageRejected
-│   ├── StageUnfit
-│   ├── DriftUnknown
-│   └── PositionLost
-│       └── PositionDrifted
-├── PlanRefused
-│   ├── OutsideTravel
-│   ├── KeepOutCrossed
-│   ├── NotHomed
-│   ├── WrongFirmware
-│   ├── UnknownPlugin
-│   └── PluginFailed
-├── CameraError
-│   ├── CameraTimeout
-│   └── MissingExtra
-├── SessionError
-│   ├── SessionCorrupt
-│   ├── SessionBusy
-│   ├── SessionUnreadable
-│   └── SessionUnwritable
-└── CaptureStopped
-
 A `StageError` concerns the stage, a `CameraError` the camera, and a `SessionError` the files of a capture; a
 `PlanRefused` is raised before anything moves, and `CaptureStopped` when the operator stops a capture. Every message is
 one line that says what is wrong, the value found, its limit, and what to do.
@@ -44,24 +17,21 @@ class StageError(RigError):
     ----------
     position_kept : bool
         Whether the controller still knows the position of the stage; if not, the stage must be homed.
+    suspect : tuple
+        Frames that a check for drift puts in doubt: those since the last passed check, in order.
     """
 
     position_kept = False
 
+    def __init__(self, message: str, *, position_kept: bool | None = None, suspect: tuple[object, ...] = ()) -> None:
+        super().__init__(message)
+        self.suspect = suspect
+        if position_kept is not None:
+            self.position_kept = position_kept
+
 
 class StageAlarm(StageError):
-    """The controller has stopped and reported why.
-
-    Attributes
-    ----------
-    code : int or None
-        The controller's number of the alarm, if it has one.
-    """
-
-    def __init__(self, message: str, *, code: int | None = None, position_kept: bool = False) -> None:
-        super().__init__(message)
-        self.code = code
-        self.position_kept = position_kept
+    """The controller has stopped and reported why."""
 
 
 class StageTimeout(StageError):
@@ -88,27 +58,12 @@ class PositionLost(StageError):
     """The stage is not at its target."""
 
 
-class _SuspectFrames(StageError):
-    def __init__(self, message: str, *, suspect: tuple[object, ...] = ()) -> None:
-        super().__init__(message)
-        self.suspect = suspect
+class PositionDrifted(PositionLost):
+    """Homing again showed lost steps: positions since the last passed check are suspect."""
 
 
-class PositionDrifted(_SuspectFrames, PositionLost):
-    """Homing again showed lost steps: positions since the last passed check are suspect.
-
-    Attributes
-    ----------
-    suspect : tuple
-        Frames recorded since the last passed check, in order.
-    """
-
-
-class DriftUnknown(_SuspectFrames):
-    """Homing could not be timed, as answers were delayed: nothing is known about lost steps.
-
-    It has the frames since the last passed check in `suspect`, as `PositionDrifted` has.
-    """
+class DriftUnknown(StageError):
+    """Homing could not be timed, as answers were delayed: nothing is known about lost steps."""
 
     position_kept = True
 
@@ -150,7 +105,7 @@ class CameraTimeout(CameraError):
 
 
 class MissingExtra(CameraError):
-    """The package for this kind of camera is not installed."""
+    """The package for this kind of camera or stage is not installed."""
 
 
 class SessionError(RigError):

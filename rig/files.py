@@ -15,13 +15,7 @@ MAX_NAME_LENGTH = 200
 
 
 def open_regular(path: Path) -> BufferedReader:
-    """Open a regular file, or a link to one, for reading.
-
-    Raises
-    ------
-    OSError
-        It cannot be opened, or is a pipe, a device, a socket or a folder.
-    """
+    """Open a regular file, or a link to one, for reading; raise OSError for a pipe, a device, a socket or a folder."""
     _require_regular(path, os.stat(path))  # before it is opened, which can already act on a device
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
@@ -33,13 +27,7 @@ def open_regular(path: Path) -> BufferedReader:
 
 
 def read_regular(path: Path, max_bytes: int) -> bytes:
-    """Return the content of a regular file.
-
-    Raises
-    ------
-    OSError
-        The file cannot be opened or read, is not a regular file, is larger than `max_bytes`, or grows meanwhile.
-    """
+    """Return the content of a regular file; raise OSError if it is larger than `max_bytes`, or grows meanwhile."""
     with open_regular(path) as file:
         return read_all(file, max_bytes)
 
@@ -62,7 +50,7 @@ def require_size(file: BufferedReader, max_bytes: int) -> int:
 
 
 def sha256(path: Path) -> str:
-    """Return the SHA-256 of a regular file's bytes, in hexadecimal; raise OSError as `open_regular` does."""
+    """Return the SHA-256 of a regular file's bytes, in hexadecimal."""
     with open_regular(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -73,11 +61,7 @@ def _require_regular(path: Path, state: os.stat_result) -> None:
 
 
 def is_plain_name(name: str) -> bool:
-    """Return whether `name` is that of a file in the very folder it is joined to.
-
-    It has no separator, is not `.` or `..`, not empty, not longer than `MAX_NAME_LENGTH`, and contains printable ASCII
-    characters only, as all names that faintfield makes do.
-    """
+    """Return whether `name` is that of a file in the very folder it is joined to, in printable ASCII as all of ours."""
     return (
         0 < len(name) <= MAX_NAME_LENGTH
         and name.isascii()

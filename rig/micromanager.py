@@ -4,11 +4,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
+from faintfield.rig.errors import MissingExtra
+
 type User = Literal["camera", "stage"]
-
-
-class PackageMissing(Exception):
-    """pymmcore-plus is not installed."""
 
 
 class NotOffered(Exception):
@@ -46,21 +44,19 @@ class SharedCore:
         self._given_up = 0
 
     def import_package(self) -> None:
-        """Import pymmcore-plus, which takes a while the first time; raises `PackageMissing`."""
+        """Import pymmcore-plus, which takes a while the first time; raises `MissingExtra`."""
         try:
             import pymmcore_plus  # noqa: F401
         except ImportError as failure:
-            raise PackageMissing(
+            raise MissingExtra(
                 "'micromanager' needs a package that is not installed; run: pip install 'faintfield[micromanager]'"
             ) from failure
 
     def acquire(self, user: User) -> Any:
         """Return the core, with its devices loaded.
 
-        Raises
-        ------
-        RuntimeError, OSError
-            A device cannot be loaded, a call of the other user still hangs, or this one was given up meanwhile.
+        Raises RuntimeError or OSError if a device cannot be loaded, a call of the other user still hangs, or this one
+        was given up meanwhile.
         """
         if self._hanging and self._users:
             raise RuntimeError(
@@ -102,10 +98,7 @@ class SharedCore:
         try:
             if self.adapters:
                 core.setDeviceAdapterSearchPaths([self.adapters])
-            if self.configuration:
-                core.loadSystemConfiguration(Path(self.configuration))
-            else:
-                core.loadSystemConfiguration()
+            core.loadSystemConfiguration(*([Path(self.configuration)] if self.configuration else []))
         except BaseException:
             core.unloadAllDevices()
             raise

@@ -92,8 +92,8 @@ class Grid(Struct, frozen=True, forbid_unknown_fields=True):
 
     def centre(self) -> "Stop":
         """Return the centre node, whose camera is the reference frame."""
-        row, column = centre_node(self.rows, self.columns)
-        return Stop((row, column), self.position(row, column))
+        node = centre_node(self.rows, self.columns)
+        return Stop(node, self.position(*node))
 
 
 class Stop(Struct, frozen=True, forbid_unknown_fields=True):
@@ -110,16 +110,7 @@ class Stop(Struct, frozen=True, forbid_unknown_fields=True):
 class CaptureStep(Struct, frozen=True, forbid_unknown_fields=True):
     """One step of the experiment: the same exposures at every node, or at the centre node only.
 
-    Parameters
-    ----------
-    kind : str
-        Purpose of the frames.
-    exposure_s : tuple of float
-        Exposure times in s, in order, at each stop.
-    frames_per_node : int
-        Number of frames of each exposure time at a stop.
-    at : str
-        `grid` or `centre`.
+    At each stop there are `frames_per_node` frames of each exposure time, in the order of `exposure_s`.
     """
 
     kind: StepKind
@@ -141,22 +132,9 @@ class CaptureStep(Struct, frozen=True, forbid_unknown_fields=True):
 class CapturePlan(Struct, frozen=True, forbid_unknown_fields=True):
     """A whole capture; it does not change once it is made.
 
-    Parameters
-    ----------
-    stops : tuple of Stop
-        The nodes in the order in which every step visits them.
-    centre : Stop
-        The centre node, where steps with `at = "centre"` are taken.
-    steps : tuple of CaptureStep
-        Steps in order.
-    approach_mm : float
-        Distance below a position from which an axis approaches it, always in the same direction.
-    frame_bytes : int
-        Size of a frame on disk.
-    settle_s : float
-        Rest at each stop before the first exposure.
-    readout_s : float
-        Duration of a frame besides its exposure.
+    Every step visits the `stops` in order, or only the `centre`. `approach_mm` is how far below a position an axis
+    turns to arrive upwards, `frame_bytes` the size of a frame on disk, `settle_s` the rest at each stop before the
+    first exposure, and `readout_s` the duration of a frame besides its exposure.
     """
 
     stops: tuple[Stop, ...]
@@ -202,13 +180,11 @@ class CapturePlan(Struct, frozen=True, forbid_unknown_fields=True):
 
     def duration_s(self, motion: MotionLimits, feed_mm_per_s: float, start: Point | None = None) -> float:
         """Return the duration of the capture without prompts, from the controller's rates and accelerations."""
-        stops = sum(len(self.stops_of(step)) for step in self.steps)
-        exposing_s = sum(
-            len(self.stops_of(s)) * s.frames_per_node * (sum(s.exposure_s) + len(s.exposure_s) * self.readout_s)
-            for s in self.steps
-        )
-        moving_s = path_duration_s(self.path(start), motion, feed_mm_per_s)
-        return moving_s + stops * (_ARRIVAL_S + self.settle_s) + exposing_s
+        total_s = path_duration_s(self.path(start), motion, feed_mm_per_s)
+        for step in self.steps:
+            exposing_s = step.frames_per_node * sum(step.exposure_s) + step.frames_per_stop() * self.readout_s
+            total_s += len(self.stops_of(step)) * (_ARRIVAL_S + self.settle_s + exposing_s)
+        return total_s
 
 
 def check_frame_count(count: int) -> None:
@@ -218,24 +194,10 @@ def check_frame_count(count: int) -> None:
 
 
 class PlannedFrame(Struct, frozen=True):
-    """One frame that the plan asks for.
+    """One frame that the plan asks for: the one with index `number`, in the step with index `step`.
 
-    Parameters
-    ----------
-    number : int
-        Index in the plan.
-    step : int
-        Index of its step in the plan.
-    kind : str
-        Kind of that step.
-    sweep : int
-        Number of earlier steps of the same kind: the sweep of a board, the light level of a flat.
-    stop : Stop
-        Node and position of the stage.
-    exposure_s : float
-        Exposure time in s.
-    repeat : int
-        Index among the frames of the same exposure time at the same stop.
+    `sweep` is the number of earlier steps of the same kind: the sweep of a board, the light level of a flat. `repeat`
+    is the index among the frames of the same exposure time at the same stop.
     """
 
     number: int

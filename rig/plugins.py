@@ -21,9 +21,6 @@ STAGES = "faintfield.stages"
 # Key in rig.toml, and built-in drivers, of each group.
 _BUILT_IN = {CAMERAS: ("camera.backend", BUILT_IN_BACKENDS), STAGES: ("stage.protocol", BUILT_IN_PROTOCOLS)}
 
-# Keys of `[camera]` that are not the plug-in's own.
-_COMMON = MosaicSettings.__struct_fields__
-
 
 @dataclass(frozen=True)
 class CameraPlugin[T: Struct]:
@@ -61,41 +58,31 @@ class StagePlugin[T: Struct]:
 def fold_plugins(content: Any) -> Any:
     """Return the content of a rig.toml as `RigSettings` takes it: with what no built-in driver reads as `options`.
 
-    Raises
-    ------
-    UnknownPlugin
-        A driver is neither built in nor installed.
+    Raises `UnknownPlugin` if a driver is neither built in nor installed.
     """
     if not isinstance(content, dict):
         return content
     camera, stage = content.get("camera"), content.get("stage")
     if isinstance(camera, dict) and isinstance(name := camera.get("backend"), str) and name not in BUILT_IN_BACKENDS:
         _entry_points(CAMERAS, name)
-        options = {key: value for key, value in camera.items() if key not in ("backend", *_COMMON)}
-        common = {key: value for key, value in camera.items() if key in _COMMON}
-        content = content | {"camera": {"backend": "plugin", "name": name, "options": options, **common}}
+        own = _with_options({key: camera[key] for key in camera if key != "backend"}, MosaicSettings)
+        content = content | {"camera": {"backend": "plugin", "name": name, **own}}
     if isinstance(stage, dict) and isinstance(name := stage.get("protocol"), str) and name not in WITHOUT_OPTIONS:
         if name not in BUILT_IN_PROTOCOLS:
             _entry_points(STAGES, name)
-        known = set(StageSettings.__struct_fields__) - {"options"}
-        options = {key: value for key, value in stage.items() if key not in known}
-        common = {key: value for key, value in stage.items() if key in known}
-        content = content | {"stage": {**common, "options": options}}
+        content = content | {"stage": _with_options(stage, StageSettings)}
     return content
 
 
-def plugin_camera(settings: PluginSettings, clock: Clock) -> Camera:
-    """Return the camera that a plug-in makes.
+def _with_options(table: dict[str, Any], kind: type[Struct]) -> dict[str, Any]:
+    """Move the keys of `table` that `kind` does not have to a table `options`."""
+    known = set(kind.__struct_fields__) - {"options"}
+    options = {key: value for key, value in table.items() if key not in known}
+    return {key: value for key, value in table.items() if key in known} | {"options": options}
 
-    Raises
-    ------
-    UnknownPlugin
-        No plug-in of this name is installed; the message lists those that are, and those that are built in.
-    PluginFailed
-        The plug-in cannot be used.
-    PlanRefused
-        Its settings are wrong.
-    """
+
+def plugin_camera(settings: PluginSettings, clock: Clock) -> Camera:
+    """Return the camera that a plug-in makes; raises `PlanRefused` if its settings are wrong or it cannot be used."""
     plugin = _load(CAMERAS, settings.name, CameraPlugin)
     options = checked_options(settings.options, plugin.settings, f"[camera] with backend = {settings.name!r}")
     return PluginCamera(settings.name, _make(settings.name, lambda: plugin.make(options, clock)))

@@ -5,25 +5,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from ctypes import c_double, c_int
 
+from faintfield.rig.cameras.aravis_frames import FrameTimes, Moment, PixelFormat, Stamps
 from faintfield.rig.cameras.aravis_library import AravisError, AravisLibrary, Reference
-from faintfield.rig.cameras.aravis_pixels import PixelFormat
-from faintfield.rig.cameras.aravis_times import FrameTimes, Moment, Stamps
 from faintfield.rig.cameras.protocol import CameraReport, Exposure, Metadata, Pixels, call_within
 from faintfield.rig.cameras.settings import AravisSettings
-from faintfield.rig.errors import CameraError, CameraTimeout, in_one_line
+from faintfield.rig.errors import CameraError, CameraTimeout
 
-# ArvBufferStatus, in words; 0 is success.
-_STATUS = {
-    -1: "its state is unknown",
-    1: "no data came",
-    2: "its packets did not all come in time",
-    3: "packets are missing",
-    4: "a packet came with a number that it cannot have",
-    5: "more data came than a frame has",
-    6: "it was still arriving",
-    7: "it was aborted",
-    8: "it holds no picture",
-}
+# The most frequent ArvBufferStatus, in words; 0 is success.
+_STATUS = {1: "no data came", 2: "its packets did not all come in time", 3: "packets are missing"}
 
 # No sensor has more rows or columns, and no frame more bytes.
 _MAX_SIDE_PX = 65_536
@@ -37,12 +26,7 @@ _AUTO_OFF = 0
 class AravisDevice:
     """A camera that is connected and waits for requests; its methods block, and may hang if the camera does.
 
-    Raises
-    ------
-    AravisError
-        No camera is found, or it cannot be set up.
-    CameraError
-        The camera keeps another region, pixel format or gain.
+    Raises `AravisError` if no camera is found, and `CameraError` if it keeps another region, pixel format or gain.
     """
 
     def __init__(self, library: AravisLibrary, settings: AravisSettings) -> None:
@@ -79,34 +63,27 @@ class AravisDevice:
     def report(self) -> CameraReport:
         """Return vendor, model and serial number, region, format and limits."""
         with self._in_use:
-            return self._report()
+            width, height = self._region[2:]
+            settings = {
+                "PixelFormat": self._format.name,
+                "Region": f"{width} x {height} at {self._region[0]}, {self._region[1]}",
+                "ExposureTime": "{:g} to {:g} s".format(*self._exposure_range_s()),
+                **self._settings.features,
+            }
+            if self._call("arv_camera_is_gain_available"):
+                settings["Gain"] = f"{self._library.call('arv_camera_get_gain', self._camera.pointer):g}"
+            return CameraReport(
+                self._name,
+                width * height * (1 if self._format.bits == 8 else 2) + 512,
+                readout_s=0.05,
+                settings=settings,
+                exposure_range_s=self._exposure_range_s(),
+            )
 
     def take(self, exposure_s: float) -> tuple[Pixels, Metadata]:
         """Expose, and return values and metadata of the frame."""
         with self._in_use:
             return self._take(exposure_s)
-
-    def _report(self) -> CameraReport:
-        left, upper, width, height = self._region
-        shortest_us, longest_us = self._library.numbers(
-            "arv_camera_get_exposure_time_bounds", c_double, 2, self._camera.pointer
-        )
-        settings = {
-            "PixelFormat": self._format.name,
-            "Region": f"{width} x {height} at {left}, {upper}",
-            "ExposureTime": f"{1e-6 * shortest_us:g} to {1e-6 * longest_us:g} s",
-            **self._settings.features,
-        }
-        if self._call("arv_camera_is_gain_available"):
-            settings["Gain"] = f"{self._library.call('arv_camera_get_gain', self._camera.pointer):g}"
-        sample_bytes = 1 if self._format.bits == 8 else 2
-        return CameraReport(
-            self._name,
-            width * height * sample_bytes + 512,
-            readout_s=0.05,
-            settings=settings,
-            exposure_range_s=(1e-6 * shortest_us, 1e-6 * longest_us),
-        )
 
     def _take(self, exposure_s: float) -> tuple[Pixels, Metadata]:
         library = self._library
@@ -161,9 +138,6 @@ class AravisDevice:
             self._call("arv_camera_set_gain_auto", _AUTO_OFF)
         if settings.gain is not None:
             self._set_gain(settings.gain)
-        if self._call("arv_camera_are_chunks_available"):
-            with suppress(AravisError):  # not every camera has this one
-                self._call("arv_camera_set_chunks", b"Timestamp")
 
     def _set_gain(self, gain: float) -> None:
         self._call("arv_camera_set_gain", gain)
@@ -205,15 +179,17 @@ class AravisDevice:
             )
         return region
 
+    def _exposure_range_s(self) -> tuple[float, float]:
+        bounds_us = self._library.numbers("arv_camera_get_exposure_time_bounds", c_double, 2, self._camera.pointer)
+        return 1e-6 * bounds_us[0], 1e-6 * bounds_us[1]
+
     def _set_exposure(self, exposure_s: float) -> None:
         self._exposure_s = None  # what the camera keeps after a failure is not known
-        shortest_us, longest_us = self._library.numbers(
-            "arv_camera_get_exposure_time_bounds", c_double, 2, self._camera.pointer
-        )
-        if not 0.99 * shortest_us <= 1e6 * exposure_s <= 1.01 * longest_us:
+        shortest_s, longest_s = self._exposure_range_s()
+        if not 0.99 * shortest_s <= exposure_s <= 1.01 * longest_s:
             raise CameraError(
-                f"exposure_s = {exposure_s:g} is not among the camera's, {1e-6 * shortest_us:g} to "
-                f"{1e-6 * longest_us:g}; choose one of them"
+                f"exposure_s = {exposure_s:g} is not among the camera's, {shortest_s:g} to {longest_s:g}; choose one "
+                "of them"
             )
         self._call("arv_camera_set_exposure_time", 1e6 * exposure_s)
         set_s = 1e-6 * self._library.call("arv_camera_get_exposure_time", self._camera.pointer)
@@ -253,8 +229,9 @@ class AravisDevice:
     def _metadata(self, frame: int, requested: Moment, now: Moment, exposure_s: float) -> Metadata:
         """Return what is known of a frame, after checking that it began after its request."""
         library = self._library
-        received_ns = library.call("arv_buffer_get_system_timestamp", frame)
-        stamps = Stamps(received_ns, library.call("arv_buffer_get_timestamp", frame))
+        stamps = Stamps(
+            library.call("arv_buffer_get_system_timestamp", frame), library.call("arv_buffer_get_timestamp", frame)
+        )
         self._times.check(stamps, requested, now, 0.0 if self._pretends else exposure_s)
         metadata: dict[str, str | int | float] = {
             "camera": self._name,
@@ -263,13 +240,6 @@ class AravisDevice:
             "received_ns": stamps.received_ns,
             "camera_time_ns": stamps.camera_ns,
         }
-        if library.call("arv_buffer_has_chunks", frame):
-            parser = library.reference("arv_camera_create_chunk_parser", self._camera.pointer)
-            if parser is not None:
-                with suppress(AravisError):  # other chunks may have been switched on
-                    value = library.call("arv_chunk_parser_get_integer_value", parser.pointer, frame, b"ChunkTimestamp")
-                    metadata["chunk_timestamp"] = value
-                parser.release()
         temperature_c = self.temperature_c()
         if temperature_c is not None:
             metadata["temperature_c"] = temperature_c
@@ -309,12 +279,7 @@ class AravisCamera:
     def expose(self, exposure_s: float, number: int) -> Exposure:
         """Trigger one exposure and read its frame; no acquisition runs before or after it.
 
-        Raises
-        ------
-        CameraTimeout
-            No frame came.
-        CameraError
-            The frame is incomplete, has another size or format, or its exposure began before this call.
+        Raises `CameraError` for a frame that is incomplete, of another size or format, or begun before this call.
         """
         device = self._opened()
         what = f"an exposure of {exposure_s:g} s"
@@ -338,13 +303,9 @@ class AravisCamera:
         return self._device
 
     def _bounded[T](self, call: Callable[[], T], what: str, extra_s: float = 0.0) -> T:
+        remedy = "check its cable, its power and [camera], and that no other program has it"
         try:
-            return call_within(self._settings.answer_s + extra_s, call, what)
+            return call_within(self._settings.answer_s + extra_s, call, what, AravisError, remedy)
         except CameraTimeout:
             self._device = None  # the thread of the call keeps it, and disconnects it should the call return
             raise
-        except AravisError as failure:
-            raise CameraError(
-                f"the camera failed at {what}: {in_one_line(failure)}; check its cable, its power and [camera], and "
-                "that no other program has it"
-            ) from failure

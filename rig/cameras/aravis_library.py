@@ -20,7 +20,6 @@ _FAILING: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "arv_camera_is_exposure_auto_available": (c_int, (c_void_p,)),
     "arv_camera_is_gain_available": (c_int, (c_void_p,)),
     "arv_camera_is_gain_auto_available": (c_int, (c_void_p,)),
-    "arv_camera_are_chunks_available": (c_int, (c_void_p,)),
     "arv_camera_get_vendor_name": (c_char_p, (c_void_p,)),
     "arv_camera_get_model_name": (c_char_p, (c_void_p,)),
     "arv_camera_get_device_id": (c_char_p, (c_void_p,)),
@@ -41,19 +40,16 @@ _FAILING: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "arv_camera_set_pixel_format_from_string": (None, (c_void_p, c_char_p)),
     "arv_camera_set_region": (None, (c_void_p, c_int, c_int, c_int, c_int)),
     "arv_camera_set_trigger": (None, (c_void_p, c_char_p)),
-    "arv_camera_set_chunks": (None, (c_void_p, c_char_p)),
     "arv_camera_gv_set_packet_size": (None, (c_void_p, c_int)),
     "arv_camera_start_acquisition": (None, (c_void_p,)),
     "arv_camera_software_trigger": (None, (c_void_p,)),
     "arv_camera_stop_acquisition": (None, (c_void_p,)),
-    "arv_chunk_parser_get_integer_value": (ctypes.c_int64, (c_void_p, c_void_p, c_char_p)),
     "arv_device_set_features_from_string": (c_int, (c_void_p, c_char_p)),
 }
 
 # Result and arguments of those that cannot.
 _PLAIN: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "arv_enable_interface": (None, (c_char_p,)),
-    "arv_camera_create_chunk_parser": (c_void_p, (c_void_p,)),
     "arv_camera_get_device": (c_void_p, (c_void_p,)),
     "arv_camera_is_gv_device": (c_int, (c_void_p,)),
     "arv_camera_gv_set_stream_options": (None, (c_void_p, c_int)),
@@ -67,7 +63,6 @@ _PLAIN: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "arv_buffer_get_frame_id": (c_uint64, (c_void_p,)),
     "arv_buffer_get_timestamp": (c_uint64, (c_void_p,)),
     "arv_buffer_get_system_timestamp": (c_uint64, (c_void_p,)),
-    "arv_buffer_has_chunks": (c_int, (c_void_p,)),
     "arv_stream_push_buffer": (None, (c_void_p, c_void_p)),
     "arv_stream_timeout_pop_buffer": (c_void_p, (c_void_p, c_uint64)),
 }
@@ -103,13 +98,7 @@ class Reference:
 
 
 class AravisLibrary:
-    """The functions of libaravis that the driver uses, by their names in C.
-
-    Raises
-    ------
-    MissingExtra
-        The library is not installed, or too old.
-    """
+    """The functions of libaravis that the driver uses, by their names in C; `MissingExtra` if it lacks one."""
 
     def __init__(self) -> None:
         try:

@@ -66,24 +66,19 @@ class GPhoto2Camera:
         """Disconnect; a camera that does not answer is ignored."""
         camera, self._camera, self._shutter_s = self._camera, None, None
         if camera is not None:
-            try:
-                call_within(self._settings.answer_s, camera.exit, "disconnecting")
-            except (CameraError, self._gphoto2.GPhoto2Error):
-                pass  # any fault was already raised when the camera was used
+            with suppress(CameraError):  # any fault was already raised when the camera was used
+                call_within(self._settings.answer_s, camera.exit, "disconnecting", self._gphoto2.GPhoto2Error)
 
     def _bounded(self, call: Any, what: str, extra_s: float = 0.0) -> Any:
         if self._camera is None and call != self._connect:
             raise CameraError("the camera is not connected; open it first")
+        bound_s = self._settings.answer_s + 2.0 * extra_s
+        remedy = "check cable, card, battery and that no other program has it, then go on"
         try:
-            return call_within(self._settings.answer_s + 2.0 * extra_s, call, what)
+            return call_within(bound_s, call, what, self._gphoto2.GPhoto2Error, remedy)
         except CameraTimeout:
             self._camera = None  # it hangs, so it is not asked to disconnect
             raise
-        except self._gphoto2.GPhoto2Error as failure:
-            raise CameraError(
-                f"the camera failed at {what}: {failure.string} ({failure.code}); check cable, card, battery and that "
-                "no other program has it, then go on"
-            ) from failure
 
     def _connect(self) -> Any:
         camera = self._gphoto2.Camera()
@@ -116,8 +111,8 @@ class GPhoto2Camera:
         raise CameraError("the camera lets no program set its exposure time; turn its dial to M (manual)")
 
     def _shutter_choices(self) -> dict[float, str]:
-        choices = ((choice, shutter_s(choice)) for choice in self._shutter().get_choices())
-        return {seconds: choice for choice, seconds in choices if seconds is not None}
+        choices = list(self._shutter().get_choices())
+        return {seconds: choice for choice in choices if (seconds := shutter_s(choice)) is not None}
 
     def _set_shutter(self, exposure_s: float) -> None:
         choices = self._shutter_choices()
@@ -144,21 +139,18 @@ class GPhoto2Camera:
         self._camera.set_single_config(name, widget)
 
     def _accepted(self, widget: Any, name: str, value: str) -> str | int | float:
-        """Return a value in the type of its setting; raises `CameraError` for one that the camera does not offer."""
+        """Return a value in the type of its setting."""
         gphoto2, kind = self._gphoto2, widget.get_type()
         if widget.get_readonly() and value != str(widget.get_value()):
             raise CameraError(
                 f"camera.settings.{name} = {value!r}: the camera lets no program set this, it is "
                 f"{widget.get_value()!r}; set it at the camera, and remove the key"
             )
-        if kind in (gphoto2.GP_WIDGET_RADIO, gphoto2.GP_WIDGET_MENU):
-            choices = list(widget.get_choices())
+        if kind in (gphoto2.GP_WIDGET_RADIO, gphoto2.GP_WIDGET_MENU, gphoto2.GP_WIDGET_TOGGLE):
+            toggle = kind == gphoto2.GP_WIDGET_TOGGLE
+            choices = ["0", "1"] if toggle else list(widget.get_choices())
             if value in choices:
-                return value
-        elif kind == gphoto2.GP_WIDGET_TOGGLE:
-            choices = ["0", "1"]
-            if value in choices:
-                return int(value)
+                return int(value) if toggle else value
         elif kind == gphoto2.GP_WIDGET_RANGE:
             low, high, step = widget.get_range()
             choices = [f"{low:g} to {high:g} in steps of {step:g}"]

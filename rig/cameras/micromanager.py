@@ -7,8 +7,8 @@ from typing import Any
 
 from faintfield.rig.cameras.protocol import CameraReport, Exposure, Metadata, call_within
 from faintfield.rig.cameras.settings import MicroManagerSettings
-from faintfield.rig.errors import CameraError, CameraTimeout, MissingExtra, in_one_line
-from faintfield.rig.micromanager import NotOffered, PackageMissing, SharedCore, set_properties
+from faintfield.rig.errors import CameraError, CameraTimeout
+from faintfield.rig.micromanager import NotOffered, SharedCore, set_properties
 
 # Names that device adapters give the measured temperature of the sensor in °C, the surest first.
 _TEMPERATURES = ("CCDTemperature", "SensorTemperature", "Temperature")
@@ -24,10 +24,7 @@ class MicroManagerCamera:
 
     def open(self) -> None:
         """Load the configuration, and change the camera's properties as configured."""
-        try:
-            self._shared.import_package()
-        except PackageMissing as failure:
-            raise MissingExtra(f"backend {failure}") from failure
+        self._shared.import_package()
         self.close()
         what = f"loading {self._settings.configuration or 'the demonstration configuration'}"
         try:
@@ -62,22 +59,18 @@ class MicroManagerCamera:
     def _bounded[T](self, call: Callable[[], T], what: str, extra_s: float = 0.0, *, connecting: bool = False) -> T:
         if self._core is None and not connecting:
             raise CameraError("the camera is not connected; open it first")
+        remedy = "check its cable, its power and the configuration file"
         try:
-            return call_within(self._settings.answer_s + extra_s, call, what)
+            return call_within(self._settings.answer_s + extra_s, call, what, (RuntimeError, OSError), remedy)
         except CameraTimeout:
             self._core = None
             self._shared.abandon("camera")  # it hangs, so it is not asked to disconnect
             raise
         except NotOffered as failure:
             raise CameraError(f"camera.properties: {failure}") from failure
-        except (RuntimeError, OSError) as failure:
-            raise CameraError(
-                f"the camera failed at {what}: {in_one_line(failure)}; check its cable, its power and the "
-                "configuration file"
-            ) from failure
 
     def _release(self) -> None:
-        with suppress(CameraError, RuntimeError):  # any fault was already raised when the camera was used
+        with suppress(CameraTimeout, RuntimeError):  # any fault was already raised when the camera was used
             call_within(self._settings.answer_s, lambda: self._shared.release("camera"), "disconnecting")
 
     def _load(self) -> Any:

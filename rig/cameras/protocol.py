@@ -9,7 +9,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from faintfield.rig.clock import result_within
-from faintfield.rig.errors import CameraTimeout
+from faintfield.rig.errors import CameraError, CameraTimeout, in_one_line
 
 type Pixels = NDArray[Any]
 type Metadata = Mapping[str, str | int | float | Sequence[float] | None]
@@ -106,10 +106,16 @@ class Thermometer(Protocol):
         """Return the temperature in °C, None if this camera has no sensor for it."""
 
 
-def call_within[T](bound_s: float, call: Callable[[], T], what: str) -> T:
+def call_within[T](
+    bound_s: float,
+    call: Callable[[], T],
+    what: str,
+    failures: type[Exception] | tuple[type[Exception], ...] = (),
+    remedy: str = "",
+) -> T:
     """Return the result of `call`, or raise `CameraTimeout` if there is none within `bound_s`; see `result_within`.
 
-    The message says `what` the call does.
+    The `failures` of its library become `CameraError`s with a `remedy`; messages say `what` the call does.
     """
     try:
         return result_within(bound_s, call, "camera")
@@ -117,3 +123,5 @@ def call_within[T](bound_s: float, call: Callable[[], T], what: str) -> T:
         raise CameraTimeout(
             f"the camera did not finish {what} in {bound_s:g} s; check cable and battery, switch it off and on"
         ) from failure
+    except failures as failure:
+        raise CameraError(f"the camera failed at {what}: {in_one_line(failure)}; {remedy}") from failure

@@ -5,7 +5,7 @@ from typing import Any
 
 from msgspec import Struct
 
-from faintfield.rig.cameras.aravis_pixels import PixelFormat
+from faintfield.rig.cameras.aravis_frames import PixelFormat
 
 type Mosaic = tuple[str, ...]
 

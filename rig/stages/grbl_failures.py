@@ -90,7 +90,7 @@ def alarm_failure(code: int) -> StageAlarm:
     """Return the exception for an alarm."""
     kept = code == SOFT_LIMIT_ALARM
     meaning = _ALARMS.get(code, "see the firmware's list of alarms")
-    return StageAlarm(f"ALARM:{code}: {meaning}; {_ALARM_REMEDIES.get(code, _LOOK)}", code=code, position_kept=kept)
+    return StageAlarm(f"ALARM:{code}: {meaning}; {_ALARM_REMEDIES.get(code, _LOOK)}", position_kept=kept)
 
 
 def error_failure(command: str, code: int) -> StageRejected:

@@ -18,7 +18,7 @@ from faintfield.rig.errors import (
     WrongFirmware,
     in_one_line,
 )
-from faintfield.rig.micromanager import NotOffered, PackageMissing, SharedCore, set_properties
+from faintfield.rig.micromanager import NotOffered, SharedCore, set_properties
 from faintfield.rig.stages.motion import timeout_s
 from faintfield.rig.stages.protocol import AnswerTime, AxisIndex, Box, Identity, MotionLimits, Point
 
@@ -81,15 +81,7 @@ class MicroManagerStage(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class MicroManagerController:
-    """A `Controller` for one XY stage.
-
-    Parameters
-    ----------
-    shared, clock : SharedCore, Clock
-        The core, which the camera may use as well; the clock of the waits between reports.
-    options, travel_mm : MicroManagerStage, Box or None
-        The stage, its limits and its origin; the configured travel, as adapters report none.
-    """
+    """A `Controller` for one XY stage; `travel_mm` is the configured travel, as adapters report none."""
 
     def __init__(self, shared: SharedCore, options: MicroManagerStage, travel_mm: Box | None, clock: Clock) -> None:
         self._shared = shared
@@ -102,10 +94,7 @@ class MicroManagerController:
 
     def connect(self, wait_s: float = 0.0) -> None:
         """Load the configuration and set the stage's properties; there is no port to wait for."""
-        try:
-            self._shared.import_package()
-        except PackageMissing as failure:
-            raise StageLost(f"stage.protocol = {failure}") from failure
+        self._shared.import_package()
         self.close()
         try:
             loading = "loading the configuration"
@@ -136,10 +125,7 @@ class MicroManagerController:
     def home(self, axis: AxisIndex | None, bound_s: float) -> AnswerTime:
         """Let the adapter home both axes, or take the origin that was confirmed; return how long it took.
 
-        Raises
-        ------
-        StageUnfit
-            The confirmed origin has been used since the stage was connected. Nothing shows that it is still right.
+        A confirmed origin is good once for each connection: nothing shows that it is still right after a failure.
         """
         begun_s = self._clock.now_s()
         if self._options.origin == "confirmed":
@@ -239,9 +225,9 @@ class MicroManagerController:
 
     def _move(self, function: str, target_um: tuple[float, ...], bound_s: float, what: str) -> None:
         """Call a function of the core that moves the stage, and wait until the adapter says that it has ended."""
+        core = self._core
 
         def work() -> None:
-            core = self._core
             getattr(core, function)(self._label, *target_um)
             usual_ms = core.getTimeoutMs()  # the camera's too
             core.setTimeoutMs(math.ceil(1e3 * bound_s))

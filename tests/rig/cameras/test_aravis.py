@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 
 from faintfield.rig.cameras.aravis import AravisCamera, AravisDevice
+from faintfield.rig.cameras.aravis_frames import Moment
 from faintfield.rig.cameras.aravis_library import AravisLibrary, Reference
-from faintfield.rig.cameras.aravis_times import Moment
 from faintfield.rig.cameras.settings import AravisSettings
 from faintfield.rig.errors import CameraError, MissingExtra
 from faintfield.testing import camera_contract

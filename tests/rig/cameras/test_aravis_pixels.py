@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from faintfield.rig.cameras.aravis_pixels import PixelFormat
+from faintfield.rig.cameras.aravis_frames import PixelFormat
 from faintfield.rig.errors import CameraError
 
 MOSAICS = {"RG": ("RG", "GB"), "GR": ("GR", "BG"), "GB": ("GB", "RG"), "BG": ("BG", "GR")}

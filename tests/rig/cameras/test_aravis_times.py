@@ -2,7 +2,7 @@
 
 import pytest
 
-from faintfield.rig.cameras.aravis_times import FrameTimes, Moment, Stamps
+from faintfield.rig.cameras.aravis_frames import FrameTimes, Moment, Stamps
 from faintfield.rig.errors import CameraError
 
 S = 1_000_000_000

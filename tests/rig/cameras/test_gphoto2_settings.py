@@ -18,8 +18,8 @@ class Failure(Exception):
     """The error of the library, with its code."""
 
     def __init__(self, code: int) -> None:
-        super().__init__(code)
-        self.code, self.string = code, f"error {code}"
+        super().__init__(f"[{code}] error {code}")
+        self.code = code
 
 
 class Widget:
@@ -129,5 +129,5 @@ def test_setting_not_offered_is_named(body: Body, name: str, value: str, words: 
 
 def test_failing_camera_does_not_lack_a_setting(body: Body) -> None:
     body.broken = True
-    with pytest.raises(CameraError, match=r"failed at setting iso = 200: error -2 \(-2\); "):
+    with pytest.raises(CameraError, match=r"failed at setting iso = 200: \[-2\] error -2; "):
         open_with(iso="200")

@@ -99,9 +99,8 @@ def test_emergency_stop_has_to_be_released(bench: Bench, stage: Gantry) -> None:
     stage.move_to(-100.0, -100.0)
     bench.clock.after(0.5, firmware(bench, SimulatedGrblHal).press_emergency_stop)
     for act in (lambda: stage.move_to(-300.0, -300.0), stage.recover, stage.recover):
-        with pytest.raises(StageAlarm, match=r"ALARM:10: .*release the emergency stop, then") as caught:
+        with pytest.raises(StageAlarm, match=r"^ALARM:10: .*release the emergency stop, then"):
             act()
-        assert caught.value.code == 10
         assert not stage.trusted
     firmware(bench, SimulatedGrblHal).release_emergency_stop()
     stage.recover()
