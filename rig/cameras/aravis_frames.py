@@ -68,8 +68,8 @@ class PixelFormat:
     def values(self, content: bytes, width: int, height: int) -> Pixels:
         """Return a frame without padding, (row, column), uint8 or uint16; what follows it, such as chunks, is ignored.
 
-        Values are as the sensor counts them: those of 12 bits end at 4095. Raises `CameraError` if bytes are missing, or
-        a value has more bits than the format.
+        Values are as the sensor counts them: those of 12 bits end at 4095. Raises `CameraError` if bytes are missing,
+        or a value has more bits than the format.
         """
         needed = self.frame_bytes(width, height)
         if min(width, height) < 1 or len(content) < needed:

@@ -11,11 +11,8 @@ from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.motion import path_duration_s
 from faintfield.rig.stages.protocol import Point
 
-# Lowest rate of position reports, per second: GRBL is asked five times a second.
-_MIN_REPORTS_PER_S = 4.0
-
-# Position reports that are timed.
-_REPORTS = 10
+# Lowest rate of position reports, per second: GRBL is asked five times a second; and how many are timed.
+_MIN_REPORTS_PER_S, _REPORTS = 4.0, 10
 
 
 class Check(Struct, frozen=True):
@@ -28,24 +25,20 @@ class Check(Struct, frozen=True):
 
 
 def check_conformance(stage: Gantry) -> Iterator[Check]:
-    """Check a connected stage, and yield each result.
+    """Check a connected stage, and yield each result; the stage homes and moves within the middle 40 % of its travel.
 
-    The stage homes and moves within the middle 40 % of its travel.
-
-    Raises
-    ------
-    StageError
-        The stage failed, so that no more checks are possible.
+    Raises `StageError` if the stage failed, so that no more checks are possible.
     """
-    warnings = stage.identify().warnings
-    yield Check("settings", not warnings, "; ".join(warnings) or "nothing to change", "nothing to change")
-    bound_s, homing_s = stage.identify().homing_bound_s / 1.5, stage.home().duration_s
+    identity = stage.identify()
+    warnings = "; ".join(identity.warnings)
+    yield Check("settings", not warnings, warnings or "nothing to change", "nothing to change")
+    bound_s, homing_s = identity.homing_bound_s / 1.5, stage.home().duration_s
     yield Check("homing", homing_s < bound_s, f"{homing_s:.1f} s", f"< {bound_s:.0f} s")
     yield _limits(stage)
     yield _speed(stage)
     yield _arrival(stage)
     yield _report_rate(stage)
-    if stage.identify().has_switches:
+    if identity.has_switches:
         yield _repeatability(stage)
 
 
@@ -69,9 +62,8 @@ def _speed(stage: Gantry) -> Check:
     stage.move_to(*high)
     taken_s = stage.clock.now_s() - started_s
     limit_s = 1.25 * predicted_s + 0.5
-    return Check(
-        "speed", taken_s <= limit_s, f"{math.dist(low, high):.0f} mm in {taken_s:.2f} s", f"<= {limit_s:.2f} s"
-    )
+    measured = f"{math.dist(low, high):.0f} mm in {taken_s:.2f} s"
+    return Check("speed", taken_s <= limit_s, measured, f"<= {limit_s:.2f} s")
 
 
 def _arrival(stage: Gantry) -> Check:
@@ -111,9 +103,6 @@ def _repeatability(stage: Gantry) -> Check:
 
 def _corners(stage: Gantry) -> tuple[Point, Point]:
     """Return the lower and the upper corner of the middle 40 % of the travel."""
-    travel = stage.travel()
-    low, high = (
-        Point(*(a + share * (b - a) for a, b in (travel.x_mm, travel.y_mm)))  # the same share of each axis
-        for share in (0.3, 0.7)
-    )
+    (x0, x1), (y0, y1) = stage.travel().x_mm, stage.travel().y_mm
+    low, high = (Point(x0 + share * (x1 - x0), y0 + share * (y1 - y0)) for share in (0.3, 0.7))
     return low, high

@@ -33,9 +33,9 @@ _MAX_TIMINGS, _MAX_BEGINNINGS = 5, 3
 
 
 class Drift(Struct, frozen=True):
-    """The distance of the carriages from their count when the stage was homed again, and the largest that passes.
+    """Distance of the carriages from their count, away from the switches, and the largest that passes.
 
-    It counts away from the switch: per axis, or one number for both if they home together.
+    There is one number per axis, or one for both if they home together.
     """
 
     away_mm: tuple[float, ...]
@@ -72,14 +72,9 @@ class DriftWatch:
     def begin(self) -> None:
         """Home, and measure how long homing takes from known distances; call again whenever the stage was homed.
 
-        Homing resets the count: frames that were recorded before and not checked can no longer be checked.
-
-        Raises
-        ------
-        PlanRefused
-            The limit cannot be resolved, or the time of homing shows no drift.
-        PositionDrifted, DriftUnknown
-            Homing does not take the same time twice.
+        Homing resets the count: frames that were recorded before and not checked can no longer be checked. Raises
+        `PlanRefused` if the limit cannot be resolved, or the time of homing shows no drift, and `PositionDrifted` or
+        `DriftUnknown` if homing does not take the same time twice.
         """
         self.unchecked.clear()
         self._speed_mm_per_s.clear()
@@ -102,16 +97,11 @@ class DriftWatch:
                 return
 
     def check(self) -> Drift:
-        """Home again: the unchecked frames are confirmed if this returns, and suspect if it raises.
+        """Home again: the unchecked frames are confirmed if this returns.
 
-        Raises
-        ------
-        PositionDrifted
-            There is drift; the stage may need `recover` and `home`.
-        DriftUnknown
-            Answers were delayed, so that there may be drift or none.
-        PlanRefused
-            There is nothing to compare with, because `begin` did not succeed.
+        They are suspect if it raises `PositionDrifted`, after which the stage may need `recover` and `home`, or
+        `DriftUnknown`, when delayed answers hide whether there is drift. `PlanRefused` means that `begin` did not
+        succeed.
         """
         if not self.begun:
             raise PlanRefused("drift cannot be checked: homing was not timed at the beginning; begin the watch first")
@@ -192,8 +182,7 @@ class DriftWatch:
 
     def _require_open_switches(self) -> None:
         """Move to where a switch closes if its axis has drifted by the limit, and raise if one is closed."""
-        pull_off = self._stage.identify().pull_off_mm
-        self._stage.move_to(*self._inward_point(self._limit_mm - pull_off))
+        self._stage.move_to(*self._inward_point(self._limit_mm - self._stage.identify().pull_off_mm))
         if closed := self._stage.switches():
             axes = " and ".join("xy"[axis] for axis in sorted(closed))
             raise self._drift_failure(f"the switch of {axes} is closed more than {self._limit_mm:g} mm early")
@@ -225,17 +214,10 @@ class DriftWatch:
 
 
 def recover(stage: Gantry, may_home: Callable[[str], bool], watch: DriftWatch | None = None) -> None:
-    """Make the stage usable again after a `StageError`.
+    """Make the stage usable again after a `StageError`, or raise another one.
 
-    Homing needs the answer True of `may_home`, which is called with a question. The watch begins again if the stage is
-    homed, or if it could not begin.
-
-    Raises
-    ------
-    StageError
-        The stage cannot be recovered; the message says what to do.
-    NotHomed
-        Homing was declined and the position is not known.
+    Homing needs the answer True of `may_home`, which is called with a question; otherwise `NotHomed` is raised. The
+    watch begins again if the stage is homed, or if it could not begin.
     """
     stage.recover()
     if stage.trusted and (watch is None or watch.begun):

@@ -3,51 +3,36 @@
 from faintfield.rig.errors import StageAlarm, StageRejected
 from faintfield.rig.stages.grbl_messages import Report
 
-SOFT_LIMIT_ALARM = 2
-"""The only alarm that keeps the position."""
+# The only alarm that keeps the position; that of a grblHAL which has started and must be homed.
+SOFT_LIMIT_ALARM, HOMING_REQUIRED_ALARM = 2, 11
 
+# The alarms after which the controller obeys nothing but a reset; those above 2 are grblHAL's.
 CRITICAL_ALARMS = (1, 2, 10, 17)
-"""The alarms after which the controller obeys nothing but a reset; those above 2 are grblHAL's."""
 
-HOMING_REQUIRED_ALARM = 11
-"""The alarm of a grblHAL that has started and must be homed."""
-
+# The errors of a command that the present state does not allow; those above 9 are grblHAL's.
 LOCKED_ERRORS = (9, 45, 46, 50, 51, 79)
-"""The errors of a command that the present state does not allow; those above 9 are grblHAL's."""
 
 _LOOK = "look for the cause, then recover and home it"
 
-# ALARM:N → meaning; those from 10 on are grblHAL's, and GRBL has another 10
+# ALARM:N → meaning, remedy; those from 10 on are grblHAL's, and GRBL has another 10. Probes and spindles have others.
 _ALARMS = {
-    1: "a limit switch was hit; the position is lost",
-    2: "a target was outside the soft limits; the position is kept",
-    3: "reset while moving; the position is lost",
-    4: "probe was already closed",
-    5: "probe found nothing",
-    6: "homing failed: reset during homing",
-    7: "homing failed: safety door opened",
-    8: "homing failed: a switch did not open on pulling off",
-    9: "homing failed: no switch was found",
-    10: "the emergency stop is pressed (or GRBL found no switch of the second motor when homing)",
-    11: "homing is required",
-    12: "a limit switch is closed",
-    13: "the probe was touched",
-    14: "the spindle did not reach its speed",
-    15: "homing failed: the second motor's switch was not found",
-    16: "the controller failed its test of itself",
-    17: "a motor driver reports a fault",
-    18: "homing failed: it is not set up",
-}
-
-# ALARM:N → remedy, where looking for the cause is not enough
-_ALARM_REMEDIES = {
-    SOFT_LIMIT_ALARM: "recover it",
-    10: "release the emergency stop, then recover and home it",
-    HOMING_REQUIRED_ALARM: "home it",
-    12: "move the carriage off its switch by hand, then recover and home it",
-    16: "switch the controller off and on, then recover and home it",
-    17: "switch the controller off, look at motors and drivers, then recover and home it",
-    18: "correct $22 and $44 to $46, then recover and home it",
+    1: ("a limit switch was hit; the position is lost", _LOOK),
+    2: ("a target was outside the soft limits; the position is kept", "recover it"),
+    3: ("reset while moving; the position is lost", _LOOK),
+    6: ("homing failed: reset during homing", _LOOK),
+    7: ("homing failed: safety door opened", _LOOK),
+    8: ("homing failed: a switch did not open on pulling off", _LOOK),
+    9: ("homing failed: no switch was found", _LOOK),
+    10: (
+        "the emergency stop is pressed (or GRBL found no switch of the second motor when homing)",
+        "release the emergency stop, then recover and home it",
+    ),
+    11: ("homing is required", "home it"),
+    12: ("a limit switch is closed", "move the carriage off its switch by hand, then recover and home it"),
+    15: ("homing failed: the second motor's switch was not found", _LOOK),
+    16: ("the controller failed its test of itself", "switch the controller off and on, then recover and home it"),
+    17: ("a motor driver reports a fault", "switch it off, look at motors and drivers, then recover and home it"),
+    18: ("homing failed: it is not set up", "correct $22 and $44 to $46, then recover and home it"),
 }
 
 # error:N → meaning, remedy
@@ -88,9 +73,8 @@ _STATES = {
 
 def alarm_failure(code: int) -> StageAlarm:
     """Return the exception for an alarm."""
-    kept = code == SOFT_LIMIT_ALARM
-    meaning = _ALARMS.get(code, "see the firmware's list of alarms")
-    return StageAlarm(f"ALARM:{code}: {meaning}; {_ALARM_REMEDIES.get(code, _LOOK)}", position_kept=kept)
+    meaning, remedy = _ALARMS.get(code, ("see the firmware's list of alarms", _LOOK))
+    return StageAlarm(f"ALARM:{code}: {meaning}; {remedy}", position_kept=code == SOFT_LIMIT_ALARM)
 
 
 def error_failure(command: str, code: int) -> StageRejected:

@@ -11,19 +11,10 @@ from faintfield.rig.stages.protocol import Box, MotionLimits, Point
 
 
 def duration_s(start: Point, end: Point, motion: MotionLimits, feed_mm_per_s: float = math.inf) -> float:
-    """Return the duration of a straight motion from rest to rest.
+    """Return the duration of a straight motion from rest to rest; `feed_mm_per_s` is the requested speed.
 
     The speed along the line is the highest that keeps every axis within its own rate, likewise the acceleration. A
     motion of length d at speed v and acceleration a takes d/v + v/a, or 2 sqrt(d/a) when it is too short to reach v.
-
-    Parameters
-    ----------
-    start, end : Point
-        Ends of the motion.
-    motion : MotionLimits
-        Rates and accelerations of the axes.
-    feed_mm_per_s : float
-        Requested speed along the line.
     """
     length_mm = math.dist(start, end)
     if length_mm == 0.0:
@@ -42,15 +33,10 @@ def path_duration_s(path: Sequence[Point], motion: MotionLimits, feed_mm_per_s: 
 
 
 def one_sided_path(start: Point, target: Point, approach_mm: float) -> tuple[Point, ...]:
-    """Return a path to `target` on which every axis arrives upwards.
+    """Return a path to `target` on which every axis arrives upwards: `target`, perhaps after a turning point.
 
     Screws and belts have play: the carriage stops at a different place when it arrives from the other side. An axis
     that would arrive from above first goes `approach_mm` past its target and then back up.
-
-    Returns
-    -------
-    tuple of Point
-        `target` alone, or a turning point and `target`.
     """
     turn = Point(*(b - approach_mm if b < a else b for a, b in zip(start, target, strict=True)))
     return (target,) if turn == target else (turn, target)
@@ -77,13 +63,7 @@ class StageWorkspace(Struct, frozen=True):
     keep_out: tuple[Box, ...] = ()
 
     def check_path(self, path: Sequence[Point]) -> None:
-        """Raise if a path leaves the travel or meets a keep-out box on any of its straight segments.
-
-        Raises
-        ------
-        OutsideTravel, KeepOutCrossed
-            The message names the position or segment.
-        """
+        """Raise `OutsideTravel` or `KeepOutCrossed` for the first bad position or straight segment of a path."""
         for point in path:
             if not self.travel_mm.holds(point, _ROUNDING_MM):
                 raise OutsideTravel(

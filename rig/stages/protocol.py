@@ -26,13 +26,7 @@ class Point(NamedTuple):
 
 
 class Box(Struct, frozen=True, forbid_unknown_fields=True):
-    """A rectangle of positions, including its edges.
-
-    Parameters
-    ----------
-    x_mm, y_mm : (float, float)
-        Lower and upper end along each axis.
-    """
+    """A rectangle of positions from the lower to the upper end along each axis, including its edges."""
 
     x_mm: tuple[float, float]
     y_mm: tuple[float, float]
@@ -65,16 +59,14 @@ class MotionLimits(Struct, frozen=True):
 
 
 class Identity(Struct, frozen=True):
-    """Description of a controller: firmware, limits, settings.
+    """Description of a controller.
 
     Parameters
     ----------
-    firmware : str
-        Name and version, as reported.
+    firmware, settings : str, dict
+        Name and version, and the controller's settings, as reported; for the record.
     travel_mm : Box
         Positions that the controller allows.
-    motion : MotionLimits
-        Rates and accelerations.
     tolerance_mm : (float, float)
         Half a motor step plus the rounding of reports, per axis: how far a report may be from its target.
     homing_bound_s : float
@@ -83,8 +75,6 @@ class Identity(Struct, frozen=True):
         Whether homing moves both axes at once, and neither can be homed alone.
     pull_off_mm : float
         Distance by which homing backs off the switches.
-    settings : dict
-        The controller's settings as reported, for the record.
     warnings : tuple of str
         Settings that work but should be changed, each with its remedy.
     has_switches : bool
@@ -104,16 +94,9 @@ class Identity(Struct, frozen=True):
 
 
 class Position(Struct, frozen=True):
-    """A reported position, and whether it can be trusted.
+    """A reported position; it is `trusted` if nothing since homing could have changed the stage's count of steps.
 
-    Parameters
-    ----------
-    point : Point
-        The reported position.
-    tolerance_mm : (float, float)
-        How far a report may be from its target, per axis.
-    trusted : bool
-        Whether the stage was homed and nothing since could have changed its count of steps.
+    `tolerance_mm` is how far the report may be from its target, per axis.
     """
 
     point: Point
@@ -122,8 +105,8 @@ class Position(Struct, frozen=True):
 
     def is_at(self, target: Point) -> bool:
         """Return whether this trusted report puts the stage at `target`."""
-        near = zip(self.point, target, self.tolerance_mm, strict=True)
-        return self.trusted and all(abs(here - there) <= tolerance for here, there, tolerance in near)
+        axes = zip(self.point, target, self.tolerance_mm, strict=True)
+        return self.trusted and all(abs(here - there) <= tolerance for here, there, tolerance in axes)
 
 
 class AnswerTime(NamedTuple):
@@ -181,7 +164,7 @@ class Controller(Protocol):
     def recover(self, wait_s: float) -> bool:
         """Make the controller accept commands again, without moving; return whether the position is kept.
 
-        Waits up to `wait_s` for a port that is lost.
+        It waits up to `wait_s` for a port that is lost.
         """
 
     def close(self) -> None:
@@ -190,7 +173,7 @@ class Controller(Protocol):
 
 type ProtocolName = Literal["grbl", "marlin", "simulated"]
 
-# Firmware that is driven over a serial port; protocols that no options belong to; all that are built in.
+# Firmware that is driven over a serial port; protocols without options; all that are built in.
 SERIAL_PROTOCOLS = ("grbl", "marlin")
 WITHOUT_OPTIONS = (*SERIAL_PROTOCOLS, "simulated")
 BUILT_IN_PROTOCOLS = (*WITHOUT_OPTIONS, "micromanager")
@@ -198,8 +181,9 @@ BUILT_IN_PROTOCOLS = (*WITHOUT_OPTIONS, "micromanager")
 # Prefix of the port of a simulated stage; the name of its controller follows.
 SIMULATED = "simulated:"
 
-# pyserial has others, of which one writes a file (`spy://`), and a rig.toml may come from anyone.
 _MAX_RECONNECT_S = 86400.0
+
+# pyserial has others, of which one writes a file (`spy://`), and a rig.toml may come from anyone.
 _URL_SCHEMES = ("socket", "rfc2217", "hwgrep", "alt")
 
 
@@ -252,9 +236,9 @@ class StageSettings(Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"stage.port = {self.port!r} is not {self.protocol!r}; set stage.protocol to 'simulated'")
         scheme, of_url, _ = self.port.partition("://")
         if of_url and scheme not in _URL_SCHEMES:
+            schemes = ":// or ".join(_URL_SCHEMES)
             raise ValueError(
-                f"stage.port = {self.port!r}; give a serial device, or a URL that begins with "
-                f"{' or '.join(f'{scheme}://' for scheme in _URL_SCHEMES)}"
+                f"stage.port = {self.port!r}; give a serial device, or a URL that begins with {schemes}://"
             )
         if self.axes[0] == self.axes[1] or not set(self.axes) <= set("XYZ"):
             raise ValueError(f"stage.axes must be two different letters of X, Y, Z; got {', '.join(self.axes)}")
