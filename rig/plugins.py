@@ -17,7 +17,6 @@ from faintfield.rig.stages.protocol import BUILT_IN_PROTOCOLS, WITHOUT_OPTIONS, 
 
 CAMERAS = "faintfield.cameras"
 STAGES = "faintfield.stages"
-
 # Key in rig.toml, and built-in drivers, of each group.
 _BUILT_IN = {CAMERAS: ("camera.backend", BUILT_IN_BACKENDS), STAGES: ("stage.protocol", BUILT_IN_PROTOCOLS)}
 

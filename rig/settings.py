@@ -11,7 +11,7 @@ from faintfield.rig.plan import CaptureStep, Grid, StepKind, check_frame_count
 from faintfield.rig.stages.protocol import StageSettings
 
 # Longest rest at a node; all frames of the measurement are held in memory.
-MAX_REST_S = 3600.0
+_MAX_REST_S = 3600.0
 
 
 class BoardSettings(Struct, frozen=True, forbid_unknown_fields=True):
@@ -25,10 +25,9 @@ class BoardSettings(Struct, frozen=True, forbid_unknown_fields=True):
         Number of squares.
     square_mm, marker_mm : float
         Sides of a square and of a marker.
-    dictionary : str
-        OpenCV's name of the marker dictionary.
-    first_marker_id : int
-        Number of the first marker; boards with different markers can be told apart.
+    dictionary, first_marker_id : str, int
+        OpenCV's name of the marker dictionary; number of the first marker: boards with different markers can be told
+        apart.
     """
 
     name: str
@@ -73,10 +72,8 @@ class SettleSettings(Struct, frozen=True, forbid_unknown_fields=True):
 
     Parameters
     ----------
-    measure : bool
-        Measure the rest once per session, from short frames after a move.
-    exposure_s : float
-        Exposure time of the short frames.
+    measure, exposure_s : bool, float
+        Measure the rest once per session, from short frames after a move; exposure time of these.
     limit_px : float
         Largest shift of the picture that does no harm.
     longest_s : float
@@ -95,8 +92,8 @@ class SettleSettings(Struct, frozen=True, forbid_unknown_fields=True):
         if min(self.exposure_s, self.longest_s, self.limit_px) <= 0.0 or self.wait_s < 0.0:
             raise ValueError(f"settle times and limits must be positive; got {self}")
         for name in ("exposure_s", "longest_s", "wait_s"):
-            if (duration_s := getattr(self, name)) > MAX_REST_S:
-                raise ValueError(f"settle.{name} = {duration_s:g}; at most {MAX_REST_S:g} s are waited for rest")
+            if (duration_s := getattr(self, name)) > _MAX_REST_S:
+                raise ValueError(f"settle.{name} = {duration_s:g}; at most {_MAX_REST_S:g} s are waited for rest")
 
 
 class CheckSettings(Struct, frozen=True, forbid_unknown_fields=True):
@@ -108,10 +105,9 @@ class CheckSettings(Struct, frozen=True, forbid_unknown_fields=True):
         Value of a saturated pixel; by default the largest value of the file's data type.
     saturated_share : float
         Largest share of saturated pixels in a lit frame.
-    least_contrast_dn : float
-        Smallest difference between the bright and the dark parts of a charuco or bright frame.
-    least_flat_dn : float
-        Smallest median of a flat frame.
+    least_contrast_dn, least_flat_dn : float
+        Smallest difference between the bright and the dark parts of a charuco or bright frame; smallest median of a
+        flat frame.
     sharpness_share : float
         Smallest sharpness of a charuco or bright frame, as a share of the median of its step.
     board_corners : int
@@ -139,12 +135,10 @@ class DriftSettings(Struct, frozen=True, forbid_unknown_fields=True):
 
     Parameters
     ----------
-    check : bool
-        Check for drift after every step over the grid.
+    check, every_nodes : bool, int
+        Check for drift after every step over the grid; and after this many nodes as well, 0 means not.
     limit_mm : float
         Smallest drift that counts.
-    every_nodes : int
-        Check after this many nodes as well; 0 means not.
     """
 
     check: bool = True
@@ -193,13 +187,7 @@ class StepSettings(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SceneSettings(Struct, frozen=True, forbid_unknown_fields=True):
-    """The `[scene]` table.
-
-    Parameters
-    ----------
-    depth_mm : tuple of float
-        Distances of the objects from the camera, at which `faintfield run` reconstructs planes.
-    """
+    """The `[scene]` table: distances of the objects from the camera, at which `faintfield run` reconstructs planes."""
 
     depth_mm: tuple[float, ...] = ()
 

@@ -13,11 +13,9 @@ from faintfield.rig.errors import CameraError, CameraTimeout
 
 # The most frequent ArvBufferStatus, in words; 0 is success.
 _STATUS = {1: "no data came", 2: "its packets did not all come in time", 3: "packets are missing"}
-
 # No sensor has more rows or columns, and no frame more bytes.
 _MAX_SIDE_PX = 65_536
 _MAX_PAYLOAD = 2_000_000_000
-
 # ARV_GV_STREAM_OPTION_PACKET_SOCKET_DISABLED, and ARV_AUTO_OFF
 _NO_PACKET_SOCKET = 1
 _AUTO_OFF = 0

@@ -12,17 +12,13 @@ from faintfield.rig.errors import CameraError
 _NAME = re.compile(r"(?:Mono|Bayer(RG|GR|GB|BG))(?:(8|10|12|14|16)|(10|12)(p|Packed))")
 # Colours of the second row below each first row.
 _SECOND_ROW = {"RG": "GB", "GR": "BG", "GB": "RG", "BG": "GR"}
-
 # An exposure may be this much shorter than it was set.
 _SHORTEST_SHARE = 0.9
-
 # The computer's date may run this much faster or slower than its clock while it is corrected, besides a jump in s.
 _DATE_RATE = 1e-3
 _DATE_JUMP_S = 0.01
-
 # How often clock and date are read for one moment.
 _READINGS = 3
-
 # The camera's clock may run this much faster or slower than the computer's; and how exact its time stamps are, in s.
 _CAMERA_RATE = 2e-4
 _CAMERA_JITTER_S = 0.01

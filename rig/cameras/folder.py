@@ -14,18 +14,14 @@ from faintfield.rig.errors import CameraError, CameraTimeout
 
 # Interval in s at which the folder is listed.
 _POLL_S = 0.25
-
 # A file is decoded, to see whether it is complete, when it has not changed for this time in s.
 _QUIET_S = 0.5
-
 # File systems keep times rounded: ext4 to a tick of 4 ms to 10 ms, NFS and HFS+ to 1 s at worst, FAT to 2 s. A file is
 # too old only if it is so by more than this.
 _TIME_GRAIN_S = 2.0
-
 # The end of a file that was given its size before it was written is zeros. So is that of a file whose last pixels are
 # black; therefore such a file is given more time, but not refused.
 _ZERO_TAIL_BYTES = 512
-
 # A file for this moment is made, and removed, to learn the time by the clock of the folder's file system.
 _PROBE = ".faintfield-time"
 

@@ -1,5 +1,6 @@
 """The `[camera]` table of rig.toml, one type for each backend."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -10,16 +11,13 @@ from faintfield.rig.cameras.aravis_frames import PixelFormat
 type Mosaic = tuple[str, ...]
 
 # Largest frame that is simulated; rendering takes some hundred bytes of memory for each pixel.
-MAX_SIMULATED_PIXELS = 40_000_000
-
+_MAX_SIMULATED_PIXELS = 40_000_000
 # Values of `backend` that are built in.
 BUILT_IN_BACKENDS = ("gphoto2", "micromanager", "aravis", "folder", "simulated")
-
 # GenICam features that have keys of their own in `[camera]`, or that each frame sets.
 _OWN_FEATURES = {"PixelFormat", "Gain", "ExposureTime"}
-
 # Longest time limit of an operation in s.
-MAX_ANSWER_S = 3600.0
+_MAX_ANSWER_S = 3600.0
 
 
 class CoolingSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -30,10 +28,8 @@ class CoolingSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     settle_temperature_c : float, optional
         Temperature of the sensor that a capture waits for before the first frame of each step; by default it does not
         wait. The camera's own settings make it cool.
-    settle_tolerance_c : float
-        Largest difference from it.
-    settle_limit_s : float
-        Time limit for the wait.
+    settle_tolerance_c, settle_limit_s : float
+        Largest difference from it, and time limit for the wait.
     """
 
     settle_temperature_c: float | None = None
@@ -45,10 +41,8 @@ class CoolingSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         if wanted_c is not None and not -273.15 <= wanted_c < 200.0:
             raise ValueError(f"camera.settle_temperature_c = {wanted_c:g}; give degrees Celsius")
         if not (self.settle_tolerance_c > 0.0 and self.settle_limit_s > 0.0):
-            raise ValueError(
-                f"camera.settle_tolerance_c = {self.settle_tolerance_c:g} and settle_limit_s = "
-                f"{self.settle_limit_s:g}; both are positive, correct them"
-            )
+            limits = f"{self.settle_tolerance_c:g} and settle_limit_s = {self.settle_limit_s:g}"
+            raise ValueError(f"camera.settle_tolerance_c = {limits}; both are positive, correct them")
         if wanted_c is None and (self.settle_tolerance_c, self.settle_limit_s) != (0.5, 900.0):
             raise ValueError(
                 "camera.settle_tolerance_c and settle_limit_s need settle_temperature_c; give it, or remove them"
@@ -84,10 +78,8 @@ class GPhoto2Settings(CoolingSettings, frozen=True, forbid_unknown_fields=True, 
         Port such as `usb:001,004`, if there are several cameras; by default the first that is found.
     settings : dict
         Values by libgphoto2's names, set when the camera is opened, such as `iso = "100"`.
-    frame_mb : float
-        Upper estimate of the size of a raw file.
-    answer_s : float
-        Time limit for every operation, in addition to the exposure.
+    frame_mb, answer_s : float
+        Upper estimate of the size of a raw file; time limit for every operation, in addition to the exposure.
     keep_on_card : bool
         Keep the file on the camera's card as well.
     """
@@ -106,10 +98,9 @@ class MicroManagerSettings(
 
     Parameters
     ----------
-    configuration : str
-        Micro-Manager's .cfg file; by default that of the demonstration camera.
-    adapters : str
-        Folder of the device adapters; by default the one that pymmcore-plus finds.
+    configuration, adapters : str
+        Micro-Manager's .cfg file, by default that of the demonstration camera; folder of the device adapters, by
+        default the one that pymmcore-plus finds.
     properties : dict
         Properties of the camera, set when it is opened, such as `Binning = "1"`.
     answer_s : float
@@ -162,16 +153,15 @@ class AravisSettings(CoolingSettings, frozen=True, forbid_unknown_fields=True, t
             raise ValueError(f"camera.features has {', '.join(own)}, which other keys or the capture set; remove it")
         if self.packet_bytes is not None and not 576 <= self.packet_bytes <= 65535:
             raise ValueError(f"camera.packet_bytes = {self.packet_bytes}; give 576 to 65535")
-        bayer = self.mosaic is not None
-        if self.region_px is not None:
-            left, upper, width, height = self.region_px
-            if min(left, upper) < 0 or min(width, height) < 1 or (bayer and (left % 2 or upper % 2)):
-                raise ValueError(
-                    f"camera.region_px = {list(self.region_px)}; give left column, upper row, width and height in the "
-                    "sensor, the first two even for a mosaic"
-                )
-        if not 0.0 < self.answer_s <= MAX_ANSWER_S:
-            raise ValueError(f"camera.answer_s = {self.answer_s:g}; give more than 0 and at most {MAX_ANSWER_S:g} s")
+        left, upper, width, height = self.region_px or (0, 0, 1, 1)
+        odd = self.mosaic is not None and (left % 2 or upper % 2)
+        if min(left, upper) < 0 or min(width, height) < 1 or odd:
+            raise ValueError(
+                f"camera.region_px = {[left, upper, width, height]}; give left column, upper row, width and height in "
+                "the sensor, the first two even for a mosaic"
+            )
+        if not 0.0 < self.answer_s <= _MAX_ANSWER_S:
+            raise ValueError(f"camera.answer_s = {self.answer_s:g}; give more than 0 and at most {_MAX_ANSWER_S:g} s")
 
     @property
     def mosaic(self) -> Mosaic | None:
@@ -184,10 +174,9 @@ class PluginSettings(MosaicSettings, frozen=True, forbid_unknown_fields=True, ta
 
     Parameters
     ----------
-    name : str
-        Name of the entry point in the group `faintfield.cameras`, which is `backend` in rig.toml.
-    options : dict
-        The other keys of the table, which the plug-in's own settings type checks.
+    name, options : str, dict
+        Name of the entry point in the group `faintfield.cameras`, which is `backend` in rig.toml; the other keys of the
+        table, which the plug-in's own settings type checks.
     """
 
     name: str
@@ -199,10 +188,8 @@ class FolderSettings(MosaicSettings, frozen=True, forbid_unknown_fields=True, ta
 
     Parameters
     ----------
-    folder : str
-        Folder of the files, which stay there; the session keeps copies.
-    suffixes : tuple of str
-        Suffixes of files that are frames.
+    folder, suffixes : str, tuple of str
+        Folder of the files, which stay there, as the session keeps copies; suffixes of files that are frames.
     frame_mb : float
         Upper estimate of the size of a file.
     arrival_s : float
@@ -270,9 +257,8 @@ class SimulatedSettings(MosaicSettings, frozen=True, forbid_unknown_fields=True,
         super().__post_init__()
         if min(self.size_px) < 8:
             raise ValueError(f"camera.size_px = {list(self.size_px)} is too small; give at least 8 x 8")
-        width, height = self.size_px
-        if width * height > MAX_SIMULATED_PIXELS:
-            size = f"{width * height} pixels, at most {MAX_SIMULATED_PIXELS} are simulated"
+        if (pixels := math.prod(self.size_px)) > _MAX_SIMULATED_PIXELS:
+            size = f"{pixels} pixels, at most {_MAX_SIMULATED_PIXELS} are simulated"
             raise ValueError(f"camera.size_px = {list(self.size_px)} has {size}; give a smaller frame")
         if self.gain_dn_per_e <= 0 or min(self.read_noise_e, self.position_error_mm, self.rotation_error_mrad) < 0:
             raise ValueError("camera: a gain is positive, and read noise and errors are not negative; correct them")

@@ -24,10 +24,8 @@ from faintfield.rig.stages.protocol import AnswerTime, AxisIndex, Point
 
 # Longest delay in s by which serial adapters hold back a short answer; it limits the resolution.
 _JITTER_S = 0.016
-
 # Distance in mm from which homing is timed; half of it serves to measure the speed.
 _RUN_UP_MM = 10.0
-
 # Attempts, while answers are delayed: to time one homing, and to measure all times at the beginning.
 _MAX_TIMINGS, _MAX_BEGINNINGS = 5, 3
 

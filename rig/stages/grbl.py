@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from operator import truediv
 
-from faintfield.rig.errors import StageError, StageLost, StageTimeout, WrongFirmware
+from faintfield.rig.errors import StageError, StageTimeout, WrongFirmware
 from faintfield.rig.stages import grbl_messages as grbl
 from faintfield.rig.stages.grbl_failures import (
     CRITICAL_ALARMS,
@@ -23,27 +23,22 @@ from faintfield.rig.stages.grbl_failures import (
 )
 from faintfield.rig.stages.motion import timeout_s
 from faintfield.rig.stages.protocol import AnswerTime, AxisIndex, Identity, Point
-from faintfield.rig.stages.transport import LineTransport, Ok, motion_words, restart_failure
+from faintfield.rig.stages.transport import LineTransport, Ok, motion_words, read_twice, restart_failure
 
 # GRBL's real-time characters.
 _CANCEL_JOG, _RESET, _HOLD, _STATUS_REQUEST = b"\x85", b"\x18", b"!", b"?"
-
 # Between status requests, in s; GRBL's documentation recommends at most five a second.
 _POLL_INTERVAL_S = 0.2
-
 # Waits in s: for the banner after the port was opened and the boot loader has run; for the banner after a reset; for
 # the status report of a board that did not restart; for the response to a command.
 _BOOT_S = 3.0
 _RESET_S = 0.4
 _FIRST_REPORT_S = 1.0
 _ANSWER_S = timeout_s(0.0)
-
 # Longest recovery besides slowing down, in s: enough for three resets, each with its wait for the banner.
 _RECOVERY_S = 2.0
-
 # Reports in a row that show the same position before a motion that was told to stop counts as stuck.
 _UNCHANGED_REPORTS = 2
-
 # GRBL reports the work offset in at least every 30th report.
 _MAX_REPORTS_TO_OFFSET = 40
 
@@ -86,12 +81,7 @@ class GrblController:
     def identify(self) -> Identity:
         """Read build information and settings, the settings twice since the line has no checksum."""
         build = {message.kind: message.text for message in self._command("$I") if isinstance(message, grbl.Feedback)}
-        first, second = self._read_settings(), self._read_settings()
-        if first != second:
-            numbers = sorted(first.keys() | second.keys())
-            differing = ", ".join(f"${number}" for number in numbers if first.get(number) != second.get(number))
-            raise StageLost(f"{differing} read differently twice in a row: the line is disturbed; try a shorter cable")
-        identity = grbl.GrblSettings(first, build).identity(self._index)
+        identity = grbl.GrblSettings(read_twice(self._read_settings), build).identity(self._index)
         motion = identity.motion
         self._braking_s = max(map(truediv, motion.rate_mm_per_s, motion.acceleration_mm_per_s2))
         for _ in range(_MAX_REPORTS_TO_OFFSET):

@@ -5,13 +5,10 @@ from faintfield.rig.stages.grbl_messages import Report
 
 # The only alarm that keeps the position; that of a grblHAL which has started and must be homed.
 SOFT_LIMIT_ALARM, HOMING_REQUIRED_ALARM = 2, 11
-
 # The alarms after which the controller obeys nothing but a reset; those above 2 are grblHAL's.
 CRITICAL_ALARMS = (1, 2, 10, 17)
-
 # The errors of a command that the present state does not allow; those above 9 are grblHAL's.
 LOCKED_ERRORS = (9, 45, 46, 50, 51, 79)
-
 _LOOK = "look for the cause, then recover and home it"
 
 # ALARM:N → meaning, remedy; those from 10 on are grblHAL's, and GRBL has another 10. Probes and spindles have others.

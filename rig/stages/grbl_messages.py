@@ -16,13 +16,10 @@ from faintfield.rig.stages.transport import Ok, Unknown
 
 _NUMBER = r"-?\d{1,7}(?:\.\d{1,6})?"
 _VECTOR = rf"{_NUMBER}(?:,{_NUMBER}){{1,5}}"
-
 # Reports and commands have three decimals, and each rounds by up to half a micrometre.
 _ROUNDING_MM = 0.001
-
 # The soft limits of jogs, in the settings of grblHAL only.
 _HAL_SETTING = 40
-
 # The value of $1 that keeps the motors on between motions.
 _KEEP_MOTORS_ON = 255
 

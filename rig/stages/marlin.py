@@ -11,25 +11,21 @@ from faintfield.rig.errors import StageAlarm, StageLost, StageRejected, StageTim
 from faintfield.rig.stages import marlin_messages as marlin
 from faintfield.rig.stages.motion import timeout_s
 from faintfield.rig.stages.protocol import AnswerTime, AxisIndex, Box, Identity, Point
-from faintfield.rig.stages.transport import LineTransport, Ok, motion_words, restart_failure
+from faintfield.rig.stages.transport import LineTransport, Ok, motion_words, read_twice, restart_failure
 
 # Waits in s: for the first line after the port was opened and the boot loader has run; for the answer to a command; for
 # the echo of a marker.
 _BOOT_S = 3.0
 _ANSWER_S = timeout_s(0.0)
 _ECHO_S = 0.7
-
 # How much longer (s) a command may take while Marlin says every two seconds that it is busy, or that it waits for its
 # button to be pressed; and how long after each such message the next one is waited for.
 _MAX_BUSY_S, _MAX_PAUSED_S = 15.0, 600.0
 _BUSY_S = 5.0
-
 # A controller that has sent nothing for this long (s) has finished its greeting.
 _QUIET_S = 0.2
-
 # Answers that are under way when a motion is aborted arrive within this time (s).
 _DISCARD_S = 0.1
-
 # Attempts: to send a line, and to start counting lines.
 _MAX_SENDINGS = 6
 _MAX_STARTS = 3
@@ -58,10 +54,8 @@ class MarlinController:
     def identify(self) -> Identity:
         """Read capabilities and settings, the settings twice since answers have no checksum."""
         about = self._command("M115")
-        first, second = self._read_settings(), self._read_settings()
-        if first != second:
-            raise StageLost("the settings read differently twice in a row: the line is disturbed; try a shorter cable")
-        return marlin.marlin_identity((*about, *first), self._axes, self._travel_mm)
+        settings = read_twice(self._read_settings)
+        return marlin.marlin_identity((*about, *settings), self._axes, self._travel_mm)
 
     def home(self, axis: AxisIndex | None, bound_s: float) -> AnswerTime:
         """Home the named axis or both, and no others, such as a focus drive."""

@@ -20,7 +20,6 @@ _AREA_BOX = rf"min:\{{x:({_NUMBER}),y:({_NUMBER})[^}}]*\}},max:\{{x:({_NUMBER}),
 _CORNER = rf"X:?({_NUMBER}) Y:?({_NUMBER})(?: Z:?{_NUMBER})?"
 # Errors about a damaged line, which the controller has not executed and asks for again.
 _TRANSMISSION = r"(?i)checksum|line number|expected line"
-
 # Reports have two decimals and commands three; each rounds by up to half of its last digit.
 _ROUNDING_MM = 0.0055
 

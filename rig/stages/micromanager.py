@@ -23,14 +23,11 @@ from faintfield.rig.stages.motion import timeout_s
 from faintfield.rig.stages.protocol import AnswerTime, AxisIndex, Box, Identity, MotionLimits, Point
 
 _UM_PER_MM = 1e3
-
 # MM::XYStageDevice
 _XY_STAGE = 6
-
 # Time between two reports that are compared, in s; largest difference of equal ones, as a share of the tolerance.
 _REST_S = 0.05
 _EQUAL_SHARE = 0.1
-
 # Time limit of a stop in s when nothing may wait longer.
 _ABORT_S = 2.0
 
@@ -40,15 +37,12 @@ class MicroManagerStage(Struct, frozen=True, forbid_unknown_fields=True):
 
     Parameters
     ----------
-    configuration : str
-        Micro-Manager's .cfg file; by default that of the demonstration devices. The same as that of the camera, if
-        Micro-Manager drives the camera, too.
-    adapters : str
-        Folder of the device adapters; by default the one that pymmcore-plus finds.
-    device : str
-        Label of the stage in the configuration; by default its XY stage.
-    properties : dict
-        Properties of the stage, set when it is connected, such as its speed.
+    configuration, adapters : str
+        Micro-Manager's .cfg file, by default that of the demonstration devices; the same as that of the camera, if
+        Micro-Manager drives the camera, too; folder of the device adapters, by default the one pymmcore-plus finds.
+    device, properties : str, dict
+        Label of the stage in the configuration, by default its XY stage; properties of the stage, set when it is
+        connected, such as its speed.
     origin : str
         `home`: homing makes the adapter find its origin. `confirmed`: the adapter cannot; the origin is the one that
         the stage had when it was connected, and you say with this setting that it is right.
@@ -57,10 +51,8 @@ class MicroManagerStage(Struct, frozen=True, forbid_unknown_fields=True):
         much longer.
     tolerance_mm : float
         How far a report may be from its target.
-    homing_bound_s : float
-        Time after which homing counts as failed.
-    answer_s : float
-        Time limit for every other call, in addition to the motion.
+    homing_bound_s, answer_s : float
+        Time after which homing counts as failed, and time limit for every other call, in addition to the motion.
     """
 
     configuration: str = ""

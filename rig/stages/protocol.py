@@ -177,12 +177,9 @@ type ProtocolName = Literal["grbl", "marlin", "simulated"]
 SERIAL_PROTOCOLS = ("grbl", "marlin")
 WITHOUT_OPTIONS = (*SERIAL_PROTOCOLS, "simulated")
 BUILT_IN_PROTOCOLS = (*WITHOUT_OPTIONS, "micromanager")
-
 # Prefix of the port of a simulated stage; the name of its controller follows.
 SIMULATED = "simulated:"
-
 _MAX_RECONNECT_S = 86400.0
-
 # pyserial has others, of which one writes a file (`spy://`), and a rig.toml may come from anyone.
 _URL_SCHEMES = ("socket", "rfc2217", "hwgrep", "alt")
 

@@ -16,14 +16,11 @@ type Direction = Literal["sent", "received"]
 
 # Bytes kept of a line without end, which is noise: longer than any line of the controllers.
 _MAX_LINE_BYTES = 1024
-
 # Time in s between two attempts to open a port that is missing.
 _REOPEN_S = 0.5
-
 # The port is looked at this often (s), so that it is known how long an answer may have waited there. Two such times are
 # as much as serial adapters hold back a short answer.
 _LOOK_S = 0.008
-
 # Timeout of a write in s, for a port that has stopped accepting bytes.
 _WRITE_TIMEOUT_S = 2.0
 
@@ -208,6 +205,14 @@ def motion_words(axes: tuple[str, str], point: Point, feed_mm_per_s: float) -> s
     """Return coordinates and feed of a command that moves."""
     x, y = axes
     return f"{x}{point.x_mm:.3f} {y}{point.y_mm:.3f} F{60.0 * feed_mm_per_s:.1f}"
+
+
+def read_twice[T](read: Callable[[], T]) -> T:
+    """Return what `read` returns twice in a row; raises `StageLost` if it differs, as answers have no checksum."""
+    first = read()
+    if read() != first:
+        raise StageLost("the settings read differently twice in a row: the line is disturbed; try a shorter cable")
+    return first
 
 
 def restart_failure() -> StageLost:
