@@ -7,20 +7,12 @@ from functools import partial
 
 import msgspec
 
+from faintfield.rig.cameras import settings as cameras
 from faintfield.rig.cameras.aravis import AravisCamera
 from faintfield.rig.cameras.folder import FolderCamera
 from faintfield.rig.cameras.gphoto2 import GPhoto2Camera
 from faintfield.rig.cameras.micromanager import MicroManagerCamera
 from faintfield.rig.cameras.protocol import Camera, Decode
-from faintfield.rig.cameras.settings import (
-    AravisSettings,
-    CameraSettings,
-    FolderSettings,
-    GPhoto2Settings,
-    MicroManagerSettings,
-    PluginSettings,
-    SimulatedSettings,
-)
 from faintfield.rig.clock import Clock, WallClock
 from faintfield.rig.errors import PlanRefused
 from faintfield.rig.micromanager import SharedCore
@@ -64,13 +56,11 @@ def open_rig(settings: RigSettings, traffic: TrafficLog | None = None, decode: D
     when a file is complete. Raises `PlanRefused` if camera, stage and drift check cannot be used together.
     """
     if settings.stage.protocol == "micromanager" and settings.drift.check:
-        raise PlanRefused(
-            "drift.check = true times homing switches, of which Micro-Manager knows none; set it to false"
-        )
+        raise PlanRefused("drift.check = true times homing switches, which Micro-Manager lacks; set it to false")
     bench = _simulated_bench(settings.stage) if settings.stage.simulated else None
     core = _shared_core(settings)
     stage = open_stage(settings.stage, traffic, bench, core)
-    if not isinstance(settings.camera, SimulatedSettings):
+    if not isinstance(settings.camera, cameras.SimulatedSettings):
         camera = _open_camera(settings.camera, core, decode)
         return Rig(stage, camera, stage.clock, lambda kind, sweep: None, camera_sees_stage=bench is None)
     if bench is None:
@@ -80,23 +70,23 @@ def open_rig(settings: RigSettings, traffic: TrafficLog | None = None, decode: D
     return Rig(stage, SimulatedCamera(settings.camera, stage.clock, lab), stage.clock, lab.arrange)
 
 
-def _open_camera(settings: CameraSettings, core: SharedCore | None, decode: Decode) -> Camera:
+def _open_camera(settings: cameras.CameraSettings, core: SharedCore | None, decode: Decode) -> Camera:
     match settings:
-        case GPhoto2Settings():
+        case cameras.GPhoto2Settings():
             return GPhoto2Camera(settings)
-        case MicroManagerSettings():
+        case cameras.MicroManagerSettings():
             return MicroManagerCamera(settings, core)
-        case AravisSettings():
+        case cameras.AravisSettings():
             return AravisCamera(settings)
-        case FolderSettings():
+        case cameras.FolderSettings():
             return FolderCamera(settings, WallClock(), decode)
-        case PluginSettings():
+        case cameras.PluginSettings():
             return plugin_camera(settings, WallClock())
     raise TypeError(f"no driver for {type(settings).__name__}")
 
 
 def _shared_core(settings: RigSettings) -> SharedCore | None:
-    if not isinstance(settings.camera, MicroManagerSettings) or settings.stage.protocol != "micromanager":
+    if not isinstance(settings.camera, cameras.MicroManagerSettings) or settings.stage.protocol != "micromanager":
         return None
     camera, stage = settings.camera, _micromanager_stage(settings.stage)
     if (camera.configuration, camera.adapters) != (stage.configuration, stage.adapters):
@@ -154,9 +144,7 @@ def _simulated_bench(settings: StageSettings) -> Bench:
     name, _, cable = settings.port.removeprefix(SIMULATED).partition(":")
     firmware = SIMULATED_FIRMWARE.get(name or "grbl")
     if firmware is None or cable not in ("", "pty"):
-        raise PlanRefused(
-            f"{settings.port}: no such stage; choose {', '.join(SIMULATED_FIRMWARE)}, with or without :pty after it"
-        )
+        raise PlanRefused(f"{settings.port}: no such stage; choose {', '.join(SIMULATED_FIRMWARE)}")
     if not cable:
         return Bench(firmware)
     link = PtyLink()

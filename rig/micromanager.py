@@ -48,9 +48,8 @@ class SharedCore:
         try:
             import pymmcore_plus  # noqa: F401
         except ImportError as failure:
-            raise MissingExtra(
-                "'micromanager' needs a package that is not installed; run: pip install 'faintfield[micromanager]'"
-            ) from failure
+            remedy = "pip install 'faintfield[micromanager]'"
+            raise MissingExtra(f"'micromanager' is not installed; run: {remedy}") from failure
 
     def acquire(self, user: User) -> Any:
         """Return the core, with its devices loaded.

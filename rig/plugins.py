@@ -1,7 +1,8 @@
 """Cameras and stages from other packages, found by their entry points; docs/plugins.md shows one."""
 
 import difflib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
@@ -84,7 +85,8 @@ def plugin_camera(settings: PluginSettings, clock: Clock) -> Camera:
     """Return the camera that a plug-in makes; raises `PlanRefused` if its settings are wrong or it cannot be used."""
     plugin = _load(CAMERAS, settings.name, CameraPlugin)
     options = checked_options(settings.options, plugin.settings, f"[camera] with backend = {settings.name!r}")
-    return PluginCamera(settings.name, _make(settings.name, lambda: plugin.make(options, clock)))
+    with _naming(PluginFailed, f"the plug-in {settings.name!r} failed", "correct its settings, or tell its authors"):
+        return PluginCamera(settings.name, plugin.make(options, clock))
 
 
 class PluginCamera:
@@ -96,34 +98,31 @@ class PluginCamera:
 
     def open(self) -> None:
         """Connect to the camera."""
-        self._named(self._camera.open)
+        with self._naming():
+            self._camera.open()
 
     def report(self) -> CameraReport:
         """Return the camera's name, limits and settings."""
-        return self._named(self._camera.report)
+        with self._naming():
+            return self._camera.report()
 
     def expose(self, exposure_s: float, number: int) -> Exposure:
         """Take one frame."""
-        return self._named(lambda: self._camera.expose(exposure_s, number))
+        with self._naming():
+            return self._camera.expose(exposure_s, number)
 
     def temperature_c(self) -> float | None:
         """Return the temperature of the sensor in °C, None if the camera reports none."""
-        camera = self._camera
-        return self._named(camera.temperature_c) if isinstance(camera, Thermometer) else None
+        with self._naming():
+            return self._camera.temperature_c() if isinstance(self._camera, Thermometer) else None
 
     def close(self) -> None:
         """Disconnect."""
-        self._named(self._camera.close)
+        with self._naming():
+            self._camera.close()
 
-    def _named[T](self, call: Callable[[], T]) -> T:
-        try:
-            return call()
-        except RigError:
-            raise
-        except Exception as failure:  # a plug-in may raise anything
-            raise CameraError(
-                f"the plug-in {self._name!r} failed: {type(failure).__name__}: {in_one_line(failure)}; tell its authors"
-            ) from failure
+    def _naming(self) -> AbstractContextManager[None]:
+        return _naming(CameraError, f"the plug-in {self._name!r} failed", "tell its authors", passing=RigError)
 
 
 def plugin_controller(settings: StageSettings, clock: Clock) -> Controller:
@@ -131,7 +130,8 @@ def plugin_controller(settings: StageSettings, clock: Clock) -> Controller:
     name = settings.protocol
     plugin = _load(STAGES, name, StagePlugin)
     options = checked_options(settings.options, plugin.settings, f"[stage] with protocol = {name!r}")
-    return _make(name, lambda: plugin.make(options, settings, clock))
+    with _naming(PluginFailed, f"the plug-in {name!r} failed", "correct its settings, or tell its authors"):
+        return plugin.make(options, settings, clock)
 
 
 def checked_options[T](options: Mapping[str, Any], kind: type[T], place: str) -> T:
@@ -162,30 +162,25 @@ def _load[T](group: str, name: str, kind: type[T]) -> T:
     packages = sorted({f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value for entry in entries})
     if len(packages) > 1:
         raise UnknownPlugin(f"{key} = {name!r} is offered by {' and '.join(packages)}; uninstall all but one")
-    try:
+    what = f"the plug-in {name!r} of {packages[0]}"
+    with _naming(PluginFailed, f"{what} cannot be imported", "install what it needs, or another version of it"):
         plugin = entries[0].load()
-    except Exception as failure:
-        raise PluginFailed(
-            f"the plug-in {name!r} of {packages[0]} cannot be imported: {type(failure).__name__}: "
-            f"{in_one_line(failure)}; install what it needs, or another version of it"
-        ) from failure
     settings = getattr(plugin, "settings", None)
     strict = (
         isinstance(settings, type) and issubclass(settings, Struct) and settings.__struct_config__.forbid_unknown_fields
     )
     if not isinstance(plugin, kind) or not strict:
-        raise PluginFailed(
-            f"the plug-in {name!r} of {packages[0]} is no {kind.__name__} whose settings forbid unknown fields; "
-            "install a version of it that fits this version of faintfield"
-        )
+        state = f"is no {kind.__name__} whose settings forbid unknown fields"
+        raise PluginFailed(f"{what} {state}; install a version of it that fits this version of faintfield")
     return plugin
 
 
-def _make[T](name: str, make: Callable[[], T]) -> T:
+@contextmanager
+def _naming(kind: type[RigError], what: str, remedy: str, passing: type[Exception] | tuple[()] = ()) -> Iterator[None]:
+    """Raise a failure inside, of whatever type, as one of `kind`; those of type `passing` pass as they are."""
     try:
-        return make()
-    except Exception as failure:
-        raise PluginFailed(
-            f"the plug-in {name!r} failed: {type(failure).__name__}: {in_one_line(failure)}; correct its settings, or "
-            "tell its authors"
-        ) from failure
+        yield
+    except passing:
+        raise
+    except Exception as failure:  # a plug-in may raise anything
+        raise kind(f"{what}: {type(failure).__name__}: {in_one_line(failure)}; {remedy}") from failure

@@ -174,9 +174,8 @@ class StepSettings(Struct, frozen=True, forbid_unknown_fields=True):
         if self.at not in (None, "grid", "centre"):
             raise ValueError(f"step.at = {self.at!r}; give 'grid' or 'centre'")
         if self.photons_per_s is not None and not (self.kind == "flat" and 0.0 < self.photons_per_s < math.inf):
-            raise ValueError(
-                f"step.photons_per_s = {self.photons_per_s} in a {self.kind} step; give it in flats, positive"
-            )
+            state = f"{self.photons_per_s} in a {self.kind} step"
+            raise ValueError(f"step.photons_per_s = {state}; give it in flats, positive")
         self.step()
 
     def step(self) -> CaptureStep:

@@ -106,10 +106,8 @@ class AravisDevice:
                 frame = library.reference("arv_stream_timeout_pop_buffer", stream.pointer, wait_us)
                 now = Moment.now()
             if frame is None:
-                raise CameraTimeout(
-                    f"no frame came within {1e-6 * wait_us:g} s; check the cable, and for a network camera the "
-                    "firewall and camera.packet_bytes"
-                )
+                waited = f"{1e-6 * wait_us:g} s"
+                raise CameraTimeout(f"no frame came within {waited}; check cable, firewall and camera.packet_bytes")
             try:
                 return self._values(frame.pointer), self._metadata(frame.pointer, requested, now, exposure_s)
             finally:
@@ -158,15 +156,11 @@ class AravisDevice:
             sensor = self._library.numbers("arv_camera_get_sensor_size", c_int, 2, self._camera.pointer)
             if left + width > sensor[0] or upper + height > sensor[1]:
                 size = f"{sensor[0]} x {sensor[1]}"
-                raise CameraError(
-                    f"camera.region_px = {list(region_px)} leaves the sensor of {size} pixels; correct it"
-                )
+                raise CameraError(f"camera.region_px = {region_px} leaves the sensor of {size} pixels; correct it")
             self._call("arv_camera_set_region", *region_px)
         region = self._library.numbers("arv_camera_get_region", c_int, 4, self._camera.pointer)
         if region_px is not None and region != region_px:
-            raise CameraError(
-                f"the camera reads the region {list(region)} instead of {list(region_px)}; choose another"
-            )
+            raise CameraError(f"the camera reads the region {list(region)} instead of {list(region_px)}; set another")
         left, upper, width, height = region
         if not (0 < width <= _MAX_SIDE_PX and 0 < height <= _MAX_SIDE_PX):
             raise CameraError(f"the camera reports a frame of {width} x {height} pixels; set camera.region_px")
@@ -185,10 +179,8 @@ class AravisDevice:
         self._exposure_s = None  # what the camera keeps after a failure is not known
         shortest_s, longest_s = self._exposure_range_s()
         if not 0.99 * shortest_s <= exposure_s <= 1.01 * longest_s:
-            raise CameraError(
-                f"exposure_s = {exposure_s:g} is not among the camera's, {shortest_s:g} to {longest_s:g}; choose one "
-                "of them"
-            )
+            limits = f"{shortest_s:g} to {longest_s:g}"
+            raise CameraError(f"exposure_s = {exposure_s:g} is not among the camera's, {limits}; choose one of them")
         self._call("arv_camera_set_exposure_time", 1e6 * exposure_s)
         set_s = 1e-6 * self._library.call("arv_camera_get_exposure_time", self._camera.pointer)
         if abs(set_s - exposure_s) > 0.01 * exposure_s:
@@ -210,10 +202,8 @@ class AravisDevice:
         library = self._library
         status = library.call("arv_buffer_get_status", frame)
         if status != 0:
-            raise CameraError(
-                f"the frame is incomplete: {_STATUS.get(status, f'state {status}')}; check the cable, and for a "
-                "network camera camera.packet_bytes and the load of the network"
-            )
+            reason = _STATUS.get(status, f"state {status}")
+            raise CameraError(f"the frame is incomplete: {reason}; check cable, network and camera.packet_bytes")
         size = (library.call("arv_buffer_get_image_width", frame), library.call("arv_buffer_get_image_height", frame))
         code = library.call("arv_buffer_get_image_pixel_format", frame)
         padding = library.numbers("arv_buffer_get_image_padding", c_int, 2, frame)

@@ -81,11 +81,9 @@ class PixelFormat:
                 values = _outer_bytes(stored, self.bits, width * height)
             case _:
                 values = stored if self.bits == 8 else stored.view("<u2").astype(np.uint16)
-        if int(values.max()) >> self.bits:
-            raise CameraError(
-                f"a value of {int(values.max())} came in {self.name}, which ends at {(1 << self.bits) - 1}; "
-                "the camera aligns its values otherwise: set another pixel_format"
-            )
+        top, limit = int(values.max()), (1 << self.bits) - 1
+        if top > limit:
+            raise CameraError(f"a value of {top} came in {self.name}, which ends at {limit}; set another pixel_format")
         return values.reshape(height, width)
 
 
@@ -161,10 +159,8 @@ class FrameTimes:
         passed_s = 1e-9 * (now.clock_ns - requested.clock_ns)
         by_date_s = 1e-9 * (now.date_ns - requested.date_ns)
         if abs(by_date_s - passed_s) > _DATE_JUMP_S + _DATE_RATE * passed_s:
-            raise CameraError(
-                f"the computer's date jumped by {by_date_s - passed_s:+.3f} s during the exposure, so the frame's time "
-                "is not known; take it again"
-            )
+            jump_s = by_date_s - passed_s
+            raise CameraError(f"the computer's date jumped by {jump_s:+.3f} s during the exposure; take it again")
         after_ns = stamps.received_ns - requested.date_ns // 1000 * 1000  # dates of the library end at microseconds
         after_s = 1e-9 * after_ns
         if after_s < _SHORTEST_SHARE * exposure_s:
@@ -179,10 +175,7 @@ class FrameTimes:
 
     def _check_own(self, stamps: Stamps, requested: Moment, exposure_s: float) -> None:
         if stamps.camera_ns <= self._newest_ns:
-            raise CameraError(
-                "a frame came that is not newer by the camera's clock than the one before; take it again, or open the "
-                "camera again if its clock was reset"
-            )
+            raise CameraError("a frame is not newer by the camera's clock than the one before; open the camera again")
         last = self._last.get(exposure_s)
         if last is None:
             return

@@ -156,7 +156,5 @@ class AravisLibrary:
         try:
             function = getattr(self._aravis, name)
         except AttributeError as failure:
-            raise MissingExtra(
-                f"backend 'aravis' needs {LIBRARY} {_VERSION} or newer, which has {name}; install it"
-            ) from failure
+            raise MissingExtra(f"backend 'aravis' needs {LIBRARY} {_VERSION} or newer; install it") from failure
         function.restype, function.argtypes = result, arguments

@@ -118,10 +118,8 @@ class FolderCamera:
             state = f"{arrival.path.name} never stopped growing"
             if arrival.problem:
                 state = f"{arrival.path.name} is not complete ({arrival.problem.partition('; ')[0]})"
-        raise CameraTimeout(
-            f"{self._folder}: {state} within {exposure_s + self._settings.arrival_s:g} s; "
-            "check that the camera's program is triggered and saves there"
-        )
+        bound_s = exposure_s + self._settings.arrival_s
+        raise CameraTimeout(f"{self._folder}: {state} within {bound_s:g} s; check that the program saves there")
 
     def close(self) -> None:
         """Forget the folder's files."""

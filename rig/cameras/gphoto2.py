@@ -30,9 +30,7 @@ class GPhoto2Camera:
         try:
             import gphoto2
         except ImportError as failure:
-            raise MissingExtra(
-                "backend 'gphoto2' needs a package that is not installed; run: pip install 'faintfield[gphoto2]'"
-            ) from failure
+            raise MissingExtra("'gphoto2' is not installed; run: pip install 'faintfield[gphoto2]'") from failure
         self._gphoto2 = gphoto2
         self.close()
         self._camera = self._bounded(self._connect, "connecting")
@@ -131,9 +129,9 @@ class GPhoto2Camera:
             present = self._read_settings()
             if name in present:
                 raise
+            names = ", ".join(sorted(present))
             raise CameraError(
-                f"camera.settings.{name} = {value!r}: the camera has no setting {name}, it has: "
-                f"{', '.join(sorted(present))}; correct the name"
+                f"camera.settings.{name} = {value!r}: the camera has no setting {name}, it has: {names}; correct it"
             ) from failure
         widget.set_value(self._accepted(widget, name, value))
         self._camera.set_single_config(name, widget)
@@ -141,11 +139,10 @@ class GPhoto2Camera:
     def _accepted(self, widget: Any, name: str, value: str) -> str | int | float:
         """Return a value in the type of its setting."""
         gphoto2, kind = self._gphoto2, widget.get_type()
+        key = f"camera.settings.{name} = {value!r}"
         if widget.get_readonly() and value != str(widget.get_value()):
-            raise CameraError(
-                f"camera.settings.{name} = {value!r}: the camera lets no program set this, it is "
-                f"{widget.get_value()!r}; set it at the camera, and remove the key"
-            )
+            state = f"the camera lets no program set this, it is {widget.get_value()!r}"
+            raise CameraError(f"{key}: {state}; set it at the camera, and remove the key")
         if kind in (gphoto2.GP_WIDGET_RADIO, gphoto2.GP_WIDGET_MENU, gphoto2.GP_WIDGET_TOGGLE):
             toggle = kind == gphoto2.GP_WIDGET_TOGGLE
             choices = ["0", "1"] if toggle else list(widget.get_choices())
@@ -161,10 +158,7 @@ class GPhoto2Camera:
             return value
         else:
             choices = ["nothing that a file can state"]
-        raise CameraError(
-            f"camera.settings.{name} = {value!r} is not offered by the camera, which offers: {', '.join(choices)}; "
-            "choose one of them"
-        )
+        raise CameraError(f"{key} is not offered by the camera, which offers: {', '.join(choices)}; choose one of them")
 
     def _release(self) -> tuple[bytes, str]:
         place = self._camera.capture(self._gphoto2.GP_CAPTURE_IMAGE)

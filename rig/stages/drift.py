@@ -187,9 +187,7 @@ class DriftWatch:
 
     def _homing_speed(self, difference_s: float) -> float:
         if difference_s <= 0.0:
-            raise PlanRefused(
-                "homing takes no longer from farther away, so its time shows no drift; set drift.check = false"
-            )
+            raise PlanRefused("homing takes no longer from farther away, which shows no drift; set drift.check = false")
         speed = 0.5 * _RUN_UP_MM / difference_s
         if speed * _JITTER_S > self._limit_mm:
             raise PlanRefused(

@@ -123,9 +123,8 @@ class Gantry:
             target = Point(start.x_mm + dx_mm, start.y_mm + dy_mm)
             self.workspace().check_path((start, target))
         elif not math.hypot(*by) <= _MAX_UNHOMED_JOG_MM:
-            raise OutsideTravel(
-                f"a jog by {by} without homing is longer than {_MAX_UNHOMED_JOG_MM:g} mm; jog less, or home first"
-            )
+            limit = f"{_MAX_UNHOMED_JOG_MM:g} mm"
+            raise OutsideTravel(f"a jog by {by} without homing is longer than {limit}; jog less, or home first")
         feed = self.feed_mm_per_s()
         predicted_s = duration_s(Point(0.0, 0.0), by, self.identify().motion, feed)
         with self._stopping_on_error():

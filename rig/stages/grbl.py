@@ -11,16 +11,8 @@ from contextlib import suppress
 from operator import truediv
 
 from faintfield.rig.errors import StageError, StageTimeout, WrongFirmware
+from faintfield.rig.stages import grbl_failures as failures
 from faintfield.rig.stages import grbl_messages as grbl
-from faintfield.rig.stages.grbl_failures import (
-    CRITICAL_ALARMS,
-    HOMING_REQUIRED_ALARM,
-    LOCKED_ERRORS,
-    SOFT_LIMIT_ALARM,
-    alarm_failure,
-    error_failure,
-    state_failure,
-)
 from faintfield.rig.stages.motion import timeout_s
 from faintfield.rig.stages.protocol import AnswerTime, AxisIndex, Identity, Point
 from faintfield.rig.stages.transport import LineTransport, Ok, motion_words, read_twice, restart_failure
@@ -114,7 +106,7 @@ class GrblController:
         """Return the machine position of a new report; raises unless the state is idle."""
         report = self._poll()
         if report.state != "Idle":
-            raise state_failure(report, self._alarm)
+            raise failures.state_failure(report, self._alarm)
         return self._machine_point(report)
 
     def switches(self) -> frozenset[AxisIndex]:
@@ -147,7 +139,7 @@ class GrblController:
         if report.state == "Alarm":
             # A controller that has restarted unseen reports zero.
             restarted = self._machine_point(report) == (0.0, 0.0)
-            if self._alarm != SOFT_LIMIT_ALARM or self._count_lost or restarted:
+            if self._alarm != failures.SOFT_LIMIT_ALARM or self._count_lost or restarted:
                 return False
             self._alarm = None
             self._command("$X")
@@ -169,15 +161,13 @@ class GrblController:
             if isinstance(message, Ok):
                 return messages
             if isinstance(message, grbl.ErrorCode):
-                if message.code in LOCKED_ERRORS:
+                if message.code in failures.LOCKED_ERRORS:
                     report = self._poll()
                     if report.state not in ("Idle", "Jog", "Run"):
-                        raise state_failure(report, self._alarm)
-                raise error_failure(text, message.code)
+                        raise failures.state_failure(report, self._alarm)
+                raise failures.error_failure(text, message.code)
             messages.append(message)
-        raise StageTimeout(
-            f"no answer to {text!r} within {bound_s:g} s; check cable and power, recover and home the stage"
-        )
+        raise StageTimeout(f"no answer to {text!r} within {bound_s:g} s; check cable and power, recover and home it")
 
     def _poll(self) -> grbl.Report:
         """Request a status report and return it."""
@@ -190,9 +180,7 @@ class GrblController:
         while (message := self._receive(deadline_s)) is not None:
             if isinstance(message, grbl.Report):
                 return message
-        raise StageTimeout(
-            f"no status report within {_ANSWER_S:g} s; check cable and power, recover and home the stage"
-        )
+        raise StageTimeout(f"no status report within {_ANSWER_S:g} s; check cable and power, recover and home it")
 
     def _bring_to_rest(self) -> grbl.Report:
         """Stop what moves, end what is on hold, and return a report of the state `Idle` or `Alarm`.
@@ -212,25 +200,23 @@ class GrblController:
             last = state
             if report is not None:
                 if report.state == "Alarm" and report.emergency_stop:
-                    raise state_failure(report, self._alarm)
-                critical = not was_reset and (report.substate or self._alarm) in CRITICAL_ALARMS
+                    raise failures.state_failure(report, self._alarm)
+                critical = not was_reset and (report.substate or self._alarm) in failures.CRITICAL_ALARMS
                 if report.state == "Idle" or (report.state == "Alarm" and not critical):
                     return report
                 if report.is_moving and unchanged < _UNCHANGED_REPORTS:
                     self._line.send({"Jog": _CANCEL_JOG, "Run": _HOLD}.get(report.state, b""))
                     continue
                 if report.state == "Door" and was_reset:
-                    raise state_failure(report, self._alarm)
+                    raise failures.state_failure(report, self._alarm)
                 self._count_lost = self._count_lost or report.is_moving
             # After critical alarms GRBL answers nothing but a reset, and ignores one that comes too early.
             self._reset(_RESET_S)
             was_reset, unchanged = True, 0
         self._count_lost = True
         self._line.send(_RESET)
-        raise StageTimeout(
-            f"the controller is not ready {within_s:g} s after it was told to stop, and was reset; "
-            "switch it off and on, then home it"
-        )
+        problem = f"the controller is not ready {within_s:g} s after it was told to stop, and was reset"
+        raise StageTimeout(f"{problem}; switch it off and on, then home it")
 
     def _poll_despite_failures(self) -> grbl.Report | None:
         self._line.send(_STATUS_REQUEST)
@@ -248,10 +234,10 @@ class GrblController:
 
         One report is not enough: between accepting a jog and starting it, GRBL is idle for a moment.
         """
-        started_s = self._clock.now_s()
+        started_s, bound_s = self._clock.now_s(), timeout_s(predicted_s)
         self._read_until(started_s + predicted_s)
         last: Point | None = None
-        while self._clock.now_s() < started_s + timeout_s(predicted_s):
+        while self._clock.now_s() < started_s + bound_s:
             report = self._poll()
             if report.state == "Idle":
                 point = self._machine_point(report)
@@ -261,11 +247,9 @@ class GrblController:
             elif report.state in ("Jog", "Run"):
                 last = None
             else:
-                raise state_failure(report, self._alarm)
-        raise StageTimeout(
-            f"the stage still moves after {timeout_s(predicted_s):.1f} s, where {predicted_s:.1f} s were expected; "
-            "it was told to stop: recover and home it"
-        )
+                raise failures.state_failure(report, self._alarm)
+        state = f"the stage still moves after {bound_s:.1f} s, where {predicted_s:.1f} s were expected"
+        raise StageTimeout(f"{state}; it was told to stop: recover and home it")
 
     def _machine_point(self, report: grbl.Report) -> Point:
         values = report.position
@@ -297,8 +281,8 @@ class GrblController:
         message = grbl.parse(text)
         self._note(message)
         # grblHAL raises the alarm that it must be homed whenever it has started: that is no failure
-        if isinstance(message, grbl.Alarm) and message.code != HOMING_REQUIRED_ALARM:
-            raise alarm_failure(message.code)
+        if isinstance(message, grbl.Alarm) and message.code != failures.HOMING_REQUIRED_ALARM:
+            raise failures.alarm_failure(message.code)
         if isinstance(message, grbl.Banner):
             raise restart_failure()
         return message
@@ -310,7 +294,7 @@ class GrblController:
             self._count_lost = True
         elif isinstance(message, grbl.Alarm):
             self._alarm = message.code
-            self._count_lost = self._count_lost or message.code != SOFT_LIMIT_ALARM
+            self._count_lost = self._count_lost or message.code != failures.SOFT_LIMIT_ALARM
 
     def _await_banner(self, within_s: float) -> bool:
         for text in self._line.lines_until(self._clock.now_s() + within_s):

@@ -191,8 +191,6 @@ class GrblSettings(Struct, frozen=True):
         """Return a setting; raises `WrongFirmware` if it was not reported or has an impossible value."""
         value = float(self.values.get(setting, "nan"))
         if not (value > 0.0 or (value == 0.0 and setting < 100 and setting not in (24, 25))):
-            raise WrongFirmware(
-                f"${setting}={self.values.get(setting, 'not reported')}: the stage cannot be driven; set it in the "
-                "controller"
-            )
+            state = self.values.get(setting, "not reported")
+            raise WrongFirmware(f"${setting}={state}: the stage cannot be driven with it; set it in the controller")
         return value

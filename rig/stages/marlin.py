@@ -221,6 +221,4 @@ class MarlinController:
                 "and its position is lost; recover and home it"
             )
         if isinstance(message, marlin.ErrorText) and not message.in_transmission:
-            raise StageAlarm(
-                f"the controller says {message.text!r} to {command!r}; find the cause, recover and home it"
-            )
+            raise StageAlarm(f"{command!r} was answered by {message.text!r}; find the cause, recover and home it")

@@ -201,11 +201,8 @@ class MicroManagerController:
         label = self._options.device or core.getXYStageDevice()
         stages = core.getLoadedDevicesOfType(_XY_STAGE)
         if label not in stages:
-            raise NotOffered(
-                f"the configuration has no XY stage {label!r}; choose from {', '.join(stages)}"
-                if stages
-                else "the configuration has no XY stage; name another one by stage.configuration"
-            )
+            choices = ", ".join(stages) or "those of another configuration"
+            raise NotOffered(f"the configuration has no XY stage {label!r}; choose from {choices}")
         set_properties(core, label, self._options.properties)
         return core, label
 

@@ -233,10 +233,8 @@ class StageSettings(Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"stage.port = {self.port!r} is not {self.protocol!r}; set stage.protocol to 'simulated'")
         scheme, of_url, _ = self.port.partition("://")
         if of_url and scheme not in _URL_SCHEMES:
-            schemes = ":// or ".join(_URL_SCHEMES)
-            raise ValueError(
-                f"stage.port = {self.port!r}; give a serial device, or a URL that begins with {schemes}://"
-            )
+            known = ":// or ".join(_URL_SCHEMES)
+            raise ValueError(f"stage.port = {self.port!r}; give a serial device, or a URL that begins with {known}://")
         if self.axes[0] == self.axes[1] or not set(self.axes) <= set("XYZ"):
             raise ValueError(f"stage.axes must be two different letters of X, Y, Z; got {', '.join(self.axes)}")
         if self.approach_mm < 0.0:
