@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from faintfield.pipelines.arguments import PriorName, SolverOptions
 from faintfield.pipelines.paper.figure4 import SNRS, StagedObject, stage_object
-from faintfield.pipelines.reconstruction.planes.solutions import PriorName, Settings
 from faintfield.pipelines.reconstruction.planes.solve import solve
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.metrics import signal_scale_for_snr
@@ -83,7 +83,7 @@ def _residuals(
     )
     images = ElementalImages(electrons.astype(np.float32), dark_e, sensor.read_noise_e**2)
     planes = {"back-projection": back_projection(stage.operator, images)}
-    planes |= {prior: solve(stage.operator, images, "pmlem", Settings(prior=prior)).plane for prior in priors}
+    planes |= {prior: solve(stage.operator, images, "pmlem", SolverOptions(prior=prior)).plane for prior in priors}
     inside = tuple(slice(round(size * _RIM), round(size * (1 - _RIM))) for size in stage.bright.shape)
     of = {method: (plane - stage.bright * scale_e)[inside] for method, plane in planes.items()}
     sigma, sigma_of_tv = float(of["back-projection"].std()), float(smoothed(of["tv"]).std())

@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from benchmarks.bm3d_peer import Bm3d
 from benchmarks.prior_faults import BANDS, Residual, dark_samples, residuals_of_fields, specks
 from benchmarks.prior_pictures import ShownPlane, draw
+from faintfield.pipelines.arguments import PriorName, SolverOptions
 from faintfield.pipelines.paper.figure4 import SNRS, StagedObject, stage_object
-from faintfield.pipelines.reconstruction.planes.solutions import PriorName, Settings, Solution
+from faintfield.pipelines.reconstruction.planes.penalised import Solution
 from faintfield.pipelines.reconstruction.planes.solve import solve
 from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.solver.initialization import back_projection
@@ -107,7 +108,7 @@ class Bench:
     ) -> dict[str, Solution]:
         """Return the plane of an exposure by each method."""
         made: dict[str, Solution] = {
-            prior: solve(stage.operator, images, "pmlem", Settings(prior=prior, proposal=True)) for prior in PRIORS
+            prior: solve(stage.operator, images, "pmlem", SolverOptions(prior=prior, proposal=True)) for prior in PRIORS
         }
         if self.bm3d is not None:
             picture, case = back_projection(stage.operator, images), (snr, stage.name)

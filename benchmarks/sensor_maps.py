@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from faintfield.calib.noise import Conditions, NoiseCalibration, Series, calibrate, measure_series
 from faintfield.calib.noise_model import NoiseModel
-from faintfield.pipelines.reconstruction.planes.solutions import Settings
+from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.reconstruction.planes.solve import solve
 from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.metrics import signal_scale_for_snr
@@ -154,7 +154,7 @@ def picture_errors(sensor: Sensor, calibration: NoiseCalibration, rng: np.random
         electrons = np.stack([model.electrons(frame) for frame in frames])
         images = ElementalImages(electrons, model.background_e(0.1), model.read_variance_e2())
         operator = PlaneOperator(homographies, rays, grid, flat=flat.astype(np.float32))
-        plane = solve(operator, images, "pmlem", Settings()).plane
+        plane = solve(operator, images, "pmlem", SolverOptions()).plane
         errors[name] = float(np.mean((plane - truth) ** 2))
     return errors
 

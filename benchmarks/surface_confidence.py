@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from faintfield.pipelines.formats.sets.elemental_set import load_set
-from faintfield.pipelines.reconstruction.depth.luminance import default_bins, luminance
-from faintfield.pipelines.reconstruction.depth.search import between_pixels, nodes_of
+from faintfield.pipelines.reconstruction.depth.search import between_pixels, default_bins, luminance, nodes_of
 from faintfield.recon.surface.confidence import COEFFICIENTS, RIGHT_WITHIN, SURE, features
 from faintfield.recon.surface.estimate import equal_steps, first_depths, halves, next_depths
 from faintfield.recon.surface.evidence import DepthEvidence

@@ -21,7 +21,7 @@ import skimage.data
 from numpy.typing import NDArray
 
 from faintfield.calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray
-from faintfield.pipelines.reconstruction.planes.solutions import PriorName, Settings
+from faintfield.pipelines.arguments import PriorName, SolverOptions
 from faintfield.pipelines.reconstruction.planes.solve import solve
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.metrics import signal_scale_for_snr
@@ -133,7 +133,7 @@ _SYNTHETIC: dict[str, Callable[[np.random.Generator], NDArray[np.floating]]] = {
 def covered(scene: Scene, prior: PriorName) -> dict[str, float]:
     """Return the shares of samples whose interval holds the truth, and the seconds it took."""
     started = time.monotonic()
-    solution = solve(scene.operator, scene.images, "pmlem", Settings(uncertainty=True, prior=prior))
+    solution = solve(scene.operator, scene.images, "pmlem", SolverOptions(uncertainty=True, prior=prior))
     held = np.abs(solution.plane - scene.truth) <= _WITHIN * solution.sidecars["sigma"]
     seen = well_seen_samples(scene.operator.coverage())
     lit = seen & (scene.truth > 0)

@@ -1,10 +1,12 @@
-"""Types of command-line arguments, apart from the code that acts on them: numbers within limits, and words."""
+"""Types of command-line arguments, apart from the code that acts on them: numbers within limits, words, options."""
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
+
+from faintfield.recon.names import LikelihoodName, PenaltyName
 
 # No quantity is larger, and computing with numbers up to it does not overflow.
 _MAX_NUMBER = 1e9
@@ -59,3 +61,49 @@ class StageConnection:
     protocol: Literal["grbl", "marlin"] | None = None
     baud: int | None = None
     rig: Path | None = None
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class SolverOptions:
+    """Options of the light on planes and surfaces: given on the command line, solved by, and recorded.
+
+    Parameters
+    ----------
+    penalty_weight
+        β of the paper, in the unit of the number of views. auto: for pmlem, the weight that best predicts held-out
+        views; for pmlem-osl, a weight computed from the noise level.
+    penalty
+        Penalty of pmlem on differences between neighbouring samples: total variation (tv), total variation with small
+        differences squared (huber-tv), squared differences (quadratic), or none.
+    likelihood
+        Noise model of a pixel. auto: poisson-gaussian (exact) for read noise below 3 electrons, shifted-poisson
+        (faster) above. poisson ignores read noise; least-squares assumes Gaussian noise of fixed variance.
+    uncertainty
+        Save the standard deviation of each sample beside the planes of pmlem, joint and occlusion; see
+        docs/results.md for how often its intervals hold.
+    prior
+        What is expected of a picture. tv: little, and total variation alone decides. patches: that small patches of it
+        repeat. learned: what a small network was trained with. auto: whichever of these predicts held-out views best,
+        mixed. Less noise and more detail remain, and the data keep the last word: see docs/physics.md. By default auto
+        for pmlem, joint and occlusion, but tv for sweeps, which take several times as long with auto. A
+        surface without this option has the picture of tv with detail added by a filter of patches.
+    proposal
+        Save, beside each plane or the picture of a surface, what the prior proposed, and in standard deviations how far
+        the data moved it.
+    passes
+        Largest number of passes over the data.
+    """
+
+    penalty_weight: NotNegativeOrAuto = "auto"
+    penalty: PenaltyName = "tv"
+    likelihood: LikelihoodName | Literal["auto"] = "auto"
+    uncertainty: bool = False
+    prior: PriorName | None = None
+    proposal: bool = False
+    passes: Count | None = None
+
+    @property
+    def has_prior(self) -> bool:
+        """Return whether more than total variation is expected of a picture."""
+        return self.prior not in (None, "tv")

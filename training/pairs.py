@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.pipelines.reconstruction.planes.solutions import Settings
+from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.reconstruction.planes.solve import solve
 from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.metrics import signal_scale_for_snr
@@ -96,7 +96,7 @@ def exposure(random: np.random.Generator, shown: Picture) -> Exposure:
 def channels(exposed: Exposure, weight: float | None) -> NDArray[np.float32]:
     """Return back-projection, pilot, patch estimate, standard deviation of the noise, truth (5, row, column), in e⁻."""
     operator, images = exposed.operator, exposed.images
-    plane = solve(operator, images, "pmlem", Settings(penalty_weight=weight)).plane
+    plane = solve(operator, images, "pmlem", SolverOptions(penalty_weight="auto" if weight is None else weight)).plane
     noise = noise_of_back_projection(operator, images, plane)
     coverage = operator.coverage()
     pilot = operator.adjoint_of_forward(plane) / np.maximum(coverage, 1e-9)

@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.live.planes_client import LiveFrame, PictureKind
 from faintfield.pipelines.live.planes_scene import LiveScene
 from faintfield.pipelines.reconstruction.channels import lattice_noise, view_electrons
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
 from faintfield.pipelines.reconstruction.planes.penalised import MAX_PASSES, Objective
-from faintfield.pipelines.reconstruction.planes.solutions import Settings
 from faintfield.recon.depth.focus import FocusMeasure, RunningPlane, SeenByView, seen_by_view
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages, Image, binned
@@ -198,7 +198,7 @@ class PlaneAccumulator:
             _binned_sum(elemental_set.read_variance_e2(self._noise), bins),
         )
         operator = self._factory.of_views(self._depths_mm[index], self._grids[index], views, images.valid)
-        objective = Objective.of(SceneProblem(operator, images), Settings())
+        objective = Objective.of(SceneProblem(operator, images), SolverOptions())
         weight = universal_penalty_weight(operator, objective.posed.images, objective.start)
         before = self._refined.get(index)
         start, dual = objective.start, objective.posed.dual()

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
 from itertools import pairwise
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -16,9 +17,9 @@ from skimage.restoration import denoise_tv_chambolle
 
 from faintfield.calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray
 from faintfield.calib.lens import Lens
+from faintfield.pipelines.arguments import PriorName, SolverOptions
 from faintfield.pipelines.console import progress
 from faintfield.pipelines.formats.results.records import Method
-from faintfield.pipelines.reconstruction.planes.solutions import PriorName, Settings
 from faintfield.pipelines.reconstruction.planes.solve import solve
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.metrics import mean_square_error, signal_scale_for_snr
@@ -50,10 +51,10 @@ def _solved(
     method: Method,
     operator: PlaneOperator,
     images: ElementalImages,
-    weight: float | None = None,
+    weight: float | Literal["auto"] = "auto",
     prior: PriorName = "tv",
 ) -> Image:
-    return solve(operator, images, method, Settings(penalty_weight=weight, prior=prior)).plane
+    return solve(operator, images, method, SolverOptions(penalty_weight=weight, prior=prior)).plane
 
 
 def _clipped(operator: PlaneOperator, images: ElementalImages) -> Image:

@@ -2,15 +2,14 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from faintfield.pipelines.arguments import Count, Method, NotNegativeOrAuto, Positive, PriorName
+from faintfield.pipelines.arguments import Count, Method, Positive, SolverOptions
 from faintfield.pipelines.errors import WrongUsage
-from faintfield.recon.names import LikelihoodName, PenaltyName
 
 # Options that say where planes are, and all that a surface does not know.
 PLACES = ("depth", "sweep", "depth_mm", "sweep_mm", "disparity_px", "sweep_px", "plane_pose")
@@ -66,29 +65,6 @@ class Options:
         Short for --method joint: solve all planes together, so that no plane shows the blur of objects in another.
     occlusion
         Short for --method occlusion: solve all planes together, with nearer objects hiding farther ones.
-    penalty_weight
-        β of the paper, in the unit of the number of views. auto: for pmlem, the weight that best predicts held-out
-        views; for pmlem-osl, a weight computed from the noise level.
-    penalty
-        Penalty of pmlem on differences between neighbouring samples: total variation (tv), total variation with small
-        differences squared (huber-tv), squared differences (quadratic), or none.
-    likelihood
-        Noise model of a pixel. auto: poisson-gaussian (exact) for read noise below 3 electrons, shifted-poisson
-        (faster) above. poisson ignores read noise; least-squares assumes Gaussian noise of fixed variance.
-    uncertainty
-        Save the standard deviation of each sample beside the planes of pmlem, joint and occlusion; see
-        docs/results.md for how often its intervals hold.
-    prior
-        What is expected of a picture. tv: little, and total variation alone decides. patches: that small patches of it
-        repeat. learned: what a small network was trained with. auto: whichever of these predicts held-out views best,
-        mixed. Less noise and more detail remain, and the data keep the last word: see docs/physics.md. By default auto
-        for pmlem, joint and occlusion, but tv for sweeps, which take several times as long with auto. A
-        surface without this option has the picture of tv with detail added by a filter of patches.
-    proposal
-        Save, beside each plane or the picture of a surface, what the prior proposed, and in standard deviations how far
-        the data moved it.
-    passes
-        Largest number of passes over the data.
     pitch_mm
         Distance between samples of a plane; by default one detector pixel of the reference view.
     workers
@@ -112,20 +88,15 @@ class Options:
     method: list[Method] | None = None
     joint: bool = False
     occlusion: bool = False
-    penalty_weight: NotNegativeOrAuto = "auto"
-    penalty: PenaltyName = "tv"
-    likelihood: LikelihoodName | Literal["auto"] = "auto"
-    uncertainty: bool = False
-    prior: PriorName | None = None
-    proposal: bool = False
-    passes: Count | None = None
+    solver: SolverOptions = field(default_factory=SolverOptions)
     pitch_mm: Positive | None = None
     workers: Count | None = None
     scheduler: str | None = None
 
     def given(self, names: Sequence[str]) -> list[str]:
         """Return those of some options that are given, as a user writes them."""
-        return [f"--{name.replace('_', '-')}" for name in names if getattr(self, name)]
+        values = vars(self.solver) | vars(self)
+        return [f"--{name.replace('_', '-')}" for name in names if values[name]]
 
 
 DEFAULTS = Options()

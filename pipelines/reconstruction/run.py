@@ -33,8 +33,8 @@ from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.formats.sets.ground_truth import read_truth
 from faintfield.pipelines.formats.sets.stated import in_units, light_per_e, plane_stem
 from faintfield.pipelines.formats.units import StatedUnits
+from faintfield.pipelines.reconstruction.accuracy import assess, write_depth_errors
 from faintfield.pipelines.reconstruction.channels import SHARE_OF_DISK, channel_layouts, keeping_frames
-from faintfield.pipelines.reconstruction.depth.accuracy import write_depth_errors
 from faintfield.pipelines.reconstruction.depth.depth_map import (
     check_light,
     check_sweep,
@@ -43,7 +43,6 @@ from faintfield.pipelines.reconstruction.depth.depth_map import (
 )
 from faintfield.pipelines.reconstruction.operators import default_pitch_px, plane_grid, tilted_grid
 from faintfield.pipelines.reconstruction.overview import look_at, write_overview
-from faintfield.pipelines.reconstruction.planes.accuracy import assess
 from faintfield.pipelines.reconstruction.planes.sweep import Runner, Sweep, run_serially
 from faintfield.pipelines.reconstruction.request import Request, distinct_depths, folder_of_method
 from faintfield.recon.operator.grid import PlaneGrid
@@ -184,7 +183,7 @@ def _sweep(elemental_set: ElementalSet, folders: dict[Method, Path], request: Re
             options = in_units(elemental_set, request.of_plane(name, place).options(name, elemental_set.poses))
             origin = msgspec.structs.replace(all_planes[name], options=options)
             files.append(PlaneFiles(folder, name, place, channels, origin, plane_stem(elemental_set, place)))
-    return Sweep(elemental_set, layouts, grids, files, all_planes, request.settings, request.with_focus)
+    return Sweep(elemental_set, layouts, grids, files, all_planes, request.solver, request.with_focus)
 
 
 def _warn(elemental_set: ElementalSet, records: list[PlaneRecord]) -> None:

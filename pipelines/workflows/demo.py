@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.noise_model import NoiseModel
-from faintfield.pipelines.arguments import Method
+from faintfield.pipelines.arguments import Method, SolverOptions
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.exchange.imported_set import relative
 from faintfield.pipelines.formats.files import check_free, write_json, write_record
@@ -30,8 +30,8 @@ from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, load_
 from faintfield.pipelines.formats.toml_files import write_toml
 from faintfield.pipelines.live.guided import capture_session
 from faintfield.pipelines.pages.report import write_report
+from faintfield.pipelines.reconstruction.accuracy import assess
 from faintfield.pipelines.reconstruction.options import Options
-from faintfield.pipelines.reconstruction.planes.accuracy import assess
 from faintfield.pipelines.reconstruction.request import DEFAULT_METHOD, Request, folder_of_method, select_planes
 from faintfield.pipelines.simulation.synthetic_set import NOISE_FREE, render_scene, write_ground_truth
 from faintfield.pipelines.workflows.reconstruct import reconstruct_and_report
@@ -103,7 +103,7 @@ def run_demo(out: Path, quick: bool, snr: float, seed: int) -> DemoResult:
     )
     capture_session(settings, session, unattended=True, page=False)
     depths = list(settings.scene.depth_mm)
-    asked = Options(depth_mm=[*depths], method=_METHODS, prior="tv")
+    asked = Options(depth_mm=[*depths], method=_METHODS, solver=SolverOptions(prior="tv"))
     run_steps(session, session_steps(session, select_planes(asked)))
     inform("looking up the truth, and reconstructing with it and without any measured poses, for comparison")
     truth = write_truth(out / "truth", session, snr)

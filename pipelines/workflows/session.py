@@ -107,7 +107,7 @@ def run_session(session: Path, options: Options, lens: LensName = "opencv5", lim
     if options.given(PLACES):
         planes = select_planes(options)
         # A session is in mm: what is wrong with its depths is found before it is calibrated
-        distinct_depths([*planes.depths_mm, *planes.own, *planes.swept_mm, *planes.own_swept])
+        distinct_depths(planes.numbers("mm", "own"))
     elif surface is None or options.given(OF_PLANES):
         raise WrongUsage(
             "no plane is asked for; give --depth-mm or --sweep-mm FIRST:LAST:COUNT, or state [scene] depth_mm in the "

@@ -4,12 +4,13 @@ from pathlib import Path
 
 import pytest
 
+from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.results.plane_files import plane_name
 from faintfield.pipelines.formats.results.records import Metrics
 from faintfield.pipelines.formats.sets.session_set import load_session
+from faintfield.pipelines.reconstruction.accuracy import assess
 from faintfield.pipelines.reconstruction.options import Options
-from faintfield.pipelines.reconstruction.planes.accuracy import assess
 from faintfield.pipelines.reconstruction.request import DEFAULT_METHOD, Request, select_planes
 from faintfield.pipelines.reconstruction.run import reconstruct_set
 from faintfield.pipelines.workflows.demo import true_set, write_truth
@@ -38,7 +39,8 @@ RIGS = {
 def test_unusual_rig_gives_right_picture(name: str, tmp_path: Path) -> None:
     camera, checks = RIGS[name]
     session = captured(tmp_path, rig_toml(camera=f"{camera}\n{_BRIGHT_ENOUGH}", checks=checks))
-    run_steps(session, session_steps(session, select_planes(Options(depth_mm=[_DEPTH_MM], prior="tv"))))
+    asked = Options(depth_mm=[_DEPTH_MM], solver=SolverOptions(prior="tv"))
+    run_steps(session, session_steps(session, select_planes(asked)))
     truth = write_truth(tmp_path / "truth", session, 1.0)
     plane = session / "reconstructions" / f"{plane_name(_DEPTH_MM)}.tiff"
     measured = error(assess(load_session(session), {(DEFAULT_METHOD, _DEPTH_MM): plane}, truth))

@@ -29,7 +29,7 @@ SHAPE, PITCH = (90, 120), 1 / 150
 GRID = PlaneGrid(SHAPE, PITCH, (-59.5 * PITCH, -44.5 * PITCH))
 
 OPTIONS = SurfaceOptions(
-    depth_range_mm=None, penalty_weight="auto", penalty="total variation", likelihood="exact", poses="measured"
+    depth_range_mm=None, penalty_weight="auto", penalty="tv", likelihood="poisson-gaussian", poses="measured"
 )
 
 

@@ -9,12 +9,14 @@ exports can do without have defaults, so that results of earlier versions and th
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 from msgspec import UNSET, Meta, Struct, UnsetType
 
 from faintfield.pipelines.arguments import Method as Method
+from faintfield.pipelines.arguments import PriorName, SolverOptions
 from faintfield.pipelines.formats.provenance import Provenance
 from faintfield.pipelines.formats.units import StatedUnits
 
@@ -233,18 +235,18 @@ class DepthMapRecord(Struct, frozen=True):
         return [self.file, self.confidence, self.all_in_focus]
 
 
-class ReconstructionOptions(Struct, frozen=True):
-    """The options of `faintfield reconstruct` as they took effect."""
-
+@dataclass(frozen=True, kw_only=True)
+class _Planes:
     method: Method | UnsetType = UNSET
     depth_mm: list[float] | UnsetType = UNSET
-    penalty_weight: float | Literal["auto"] | UnsetType = UNSET
-    penalty: str | UnsetType = UNSET
-    likelihood: str | UnsetType = UNSET
-    uncertainty: bool | UnsetType = UNSET
-    prior: str | UnsetType = UNSET
-    proposal: bool | UnsetType = UNSET
-    passes: int | UnsetType | None = UNSET
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReconstructionOptions(SolverOptions, _Planes):
+    """The options of `faintfield reconstruct` as they took effect."""
+
+    prior: PriorName | UnsetType | None = UNSET  # type: ignore[assignment]
+    proposal: bool | UnsetType = UNSET  # type: ignore[assignment]
     pitch_mm: float | UnsetType | None = UNSET
     focus: bool | UnsetType = UNSET
     auto_sweep: Count | UnsetType = UNSET

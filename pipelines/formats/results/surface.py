@@ -5,11 +5,13 @@ states. Depths are in the `unit` of the surface: mm; those of the poses if their
 of disparity from one node to the next.
 """
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 from msgspec import UNSET, Meta, Struct, UnsetType
 
+from faintfield.pipelines.arguments import PriorName, SolverOptions
 from faintfield.pipelines.errors import MissingFile
 from faintfield.pipelines.formats.files import file_within, files_below
 from faintfield.pipelines.formats.provenance import Provenance
@@ -32,21 +34,23 @@ SURFACE_FILE = "surface.json"
 type Share = Annotated[float, Meta(ge=0, le=1)]
 
 
-class SurfaceOptions(Struct, frozen=True, kw_only=True):
+@dataclass(frozen=True, kw_only=True)
+class _Range:
+    depth_range_mm: tuple[float, float] | None
+    unit: Literal["mm", "px", "relative"] = "mm"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfaceOptions(SolverOptions, _Range):
     """The options of `faintfield reconstruct --surface` as they took effect.
 
     `depth_range_mm` is None if the range was to be found. `prior` is stated if one was asked for; otherwise the picture
     is that of total variation with detail added by a filter.
     """
 
-    depth_range_mm: tuple[float, float] | None
-    unit: Literal["mm", "px", "relative"] = "mm"
-    penalty_weight: float | Literal["auto"]
-    penalty: str
-    likelihood: str
-    prior: str | UnsetType = UNSET
-    proposal: bool | UnsetType = UNSET
-    passes: int | None = None
+    uncertainty: bool | UnsetType = UNSET  # type: ignore[assignment]
+    prior: PriorName | UnsetType | None = UNSET  # type: ignore[assignment]
+    proposal: bool | UnsetType = UNSET  # type: ignore[assignment]
     poses: Poses
 
 

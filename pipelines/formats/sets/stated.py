@@ -73,7 +73,7 @@ def rounded_depth(elemental_set: ElementalSet, depth_mm: float) -> float:
     return elemental_set.depth_of_disparity(round(elemental_set.disparity_of_depth(depth_mm), 3))
 
 
-def in_units[Record: Struct](elemental_set: ElementalSet, record: Record) -> Record:
+def in_units[Record](elemental_set: ElementalSet, record: Record) -> Record:
     """Return a record whose numbers are in the units of the set, given one in mm and electrons."""
     units = elemental_set.units
     if (units.depth, units.light) == ("mm", "electrons"):
@@ -86,11 +86,10 @@ class _Converter:
         self._loaded = elemental_set
         self._light = light_per_e(elemental_set)
 
-    def record[Record: Struct](self, record: Record) -> Record:
+    def record[Record](self, record: Record) -> Record:
         depth_mm = getattr(record, "depth_mm", None)
-        return structs.replace(
-            record, **{name: self._value(name, getattr(record, name), depth_mm) for name in record.__struct_fields__}
-        )
+        values = structs.asdict(record) if isinstance(record, Struct) else vars(record)
+        return type(record)(**{name: self._value(name, value, depth_mm) for name, value in values.items()})
 
     def _value(self, name: str, value: Any, depth_mm: Any) -> Any:
         """Return one field; lengths across a plane need its depth."""

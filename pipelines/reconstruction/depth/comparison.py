@@ -1,18 +1,33 @@
-"""Agreement of the views of a set at each of some depths, in bins of pixels: what autofocus compares."""
+"""Views of a set compared in bins of pixels: their agreement at each depth, and whether it could be chance."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import permutations
+from math import factorial
 from pathlib import Path
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from faintfield.pipelines.console import progress
+from faintfield.calib.homography import fronto_parallel_rt_ref_plane, transfer
+from faintfield.pipelines.console import inform, progress, working
 from faintfield.pipelines.formats.large_arrays import memory_or_file
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.channels import ChannelLayout, channel_layouts, load_channel
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
-from faintfield.recon.depth.agreement import Agreement, DepthEstimate, agreement, bins_for, depth_map
-from faintfield.recon.likelihood.images import ElementalImages
+from faintfield.recon.depth.agreement import (
+    Agreement,
+    DepthEstimate,
+    Significance,
+    agreement,
+    bins_for,
+    depth_map,
+    disagreement,
+    significance,
+)
+from faintfield.recon.errors import NothingInFocus
+from faintfield.recon.likelihood.images import ElementalImages, binned
 from faintfield.recon.operator.grid import PlaneGrid
 
 # Place between two pixels, in pixels, at which `w² + (1 − w)²` is 2/3, as on average: see `_between_bins`.
@@ -23,6 +38,32 @@ _MIN_BINS_ACROSS = 8
 
 # Bins of a view in one colour that are enough to find depths by: further colours would only take longer.
 _ENOUGH_BINS = 40_000
+
+# Most shuffles of a test.
+_SHUFFLES = 499
+
+# Largest p-value that is kept, by the fewest views: chance is taken for depth in one set of 500. Few views have few
+# orders; of three or four, only those are refused that agree as well or better in every other order, as copies do.
+_LARGEST_P = {7: 0.002, 5: 0.01, 3: 0.99}
+
+# Fewest views whose p-value means something, and is returned.
+_FEWEST_VIEWS = 5
+
+# Depths of each comparison, and the most samples and views, evenly chosen: for speed and memory.
+_DEPTHS, _MAX_SAMPLES, _MAX_VIEWS = 20, 1000, 49
+
+# Least share of the pixels of a view that have a number, or it is left out.
+_MIN_KNOWN = 0.5
+
+# Fewest bins along a side of a view.
+_MIN_BINS = 8
+
+# Another arrangement of the views is right if it agrees better than shuffled views by this many times as much, and with
+# at most this p-value, or that which is kept.
+_CLEARLY, _MAX_P_REARRANGED = 1.2, 0.01
+
+# Seed of the shuffles: the same set gives the same result.
+_SEED = 20
 
 
 @dataclass(frozen=True)
@@ -124,3 +165,194 @@ def _bins(
 def _sum(first: Agreement, second: Agreement) -> Agreement:
     """Return the agreement of two colours together."""
     return Agreement(*(a + b for a, b in zip(first, second, strict=True)))
+
+
+@dataclass(frozen=True)
+class _Views:
+    """Views from each other's places; the arguments of `disagreement`, and the nodes."""
+
+    light_e: NDArray[np.float32]
+    seen: NDArray[np.bool_]
+    known_variance_e2: float
+    nodes: list[tuple[int, int] | None]
+
+    def tried(self, places: NDArray[np.intp]) -> float:
+        """Return how much the views disagree if taken from these places."""
+        return disagreement(self.light_e, self.seen, places, self.known_variance_e2)
+
+
+def check_places(views: BinnedViews, range_mm: tuple[float, float]) -> Significance | None:
+    """Return how much better the views agree at their places than shuffled, over a whole range of depths.
+
+    It is None, and said so, for fewer than `_FEWEST_VIEWS` views: these have too few orders to tell.
+
+    Parameters
+    ----------
+    views : BinnedViews
+        The views of a set.
+    range_mm : (float, float)
+        Nearest and farthest depth of the search, which is repeated for each shuffle.
+
+    Raises
+    ------
+    NothingInFocus
+        Shuffled views agree as well, or views in reversed or exchanged rows and columns agree better.
+    """
+    chosen = _compared(views)
+    count = len(chosen)
+    if count < _FEWEST_VIEWS:
+        inform(
+            f"{count} views are too few to test by shuffles whether they agree by chance; {_FEWEST_VIEWS} are needed"
+        )
+    if count < min(_LARGEST_P):
+        return None
+    depths_mm = (1 / np.linspace(1 / range_mm[0], 1 / range_mm[1], _DEPTHS)).tolist()
+    with working("preparing the comparison of shuffled views"):
+        shown = _from_all_places(views, chosen, depths_mm)
+    stated = shown.tried(np.arange(count))
+    shuffled = [shown.tried(places) for places in progress(_shuffles(count), "comparing shuffled views")]
+    found = significance(stated, shuffled)
+    largest = next(p_value for fewest, p_value in _LARGEST_P.items() if count >= fewest)
+    _refuse_rearranged(views.elemental_set, shown, stated, shuffled, min(largest, _MAX_P_REARRANGED))
+    if found.p_value > largest:
+        raise NothingInFocus(
+            f"{views.elemental_set.folder}: the views agree no better than shuffled ones (p = {found.p_value:.2g} of "
+            f"{found.shuffles} shuffles, at most {largest:g} is needed): nothing moves between them as their places "
+            "say; correct order and places of the pictures, use more light, or make planes at depths given by --depth"
+        )
+    return found if count >= _FEWEST_VIEWS else None
+
+
+def _shuffles(count: int) -> list[NDArray[np.intp]]:
+    """Return different shuffles of places, all of them if there are few.
+
+    None keeps all or turns them round, which only exchanges near and far. A shuffle that came twice would count as two,
+    and p of a few views would be too small.
+    """
+    left_out = {tuple(range(count)), tuple(range(count))[::-1]}
+    if factorial(count) - len(left_out) <= _SHUFFLES:
+        return [np.array(places) for places in permutations(range(count)) if places not in left_out]
+    random, found = np.random.default_rng(_SEED), dict[tuple[int, ...], None]()
+    while len(found) < _SHUFFLES:
+        shuffled = tuple(random.permutation(count).tolist())
+        if shuffled not in left_out:
+            found[shuffled] = None
+    return [np.array(places) for places in found]
+
+
+def _refuse_rearranged(
+    elemental_set: ElementalSet, shown: _Views, statistic: float, shuffled: list[float], largest_p: float
+) -> None:
+    """Refuse views that agree clearly better with their rows or columns reversed, or exchanged (NothingInFocus)."""
+    chance = float(np.mean(shuffled))
+    tried = [(shown.tried(places), remedy) for remedy, places in _arrangements(shown.nodes)]
+    if not tried:
+        return
+    best, remedy = min(tried)
+    if significance(best, shuffled).p_value <= largest_p and chance - best > _CLEARLY * (chance - statistic):
+        raise NothingInFocus(
+            f"{elemental_set.folder}: the views agree better with {remedy}: "
+            f"by {chance - best:.3g} in squared deviations, "
+            f"and by {chance - statistic:.3g} as stated; import the pictures again so"
+        )
+
+
+def _arrangements(nodes: list[tuple[int, int] | None]) -> list[tuple[str, NDArray[np.intp]]]:
+    """Return other arrangements of the nodes, how an import makes them, and the place that each view then has.
+
+    Reversing rows and columns at once only exchanges near and far, which agreement cannot tell, so that is left out.
+    """
+    at = {node: index for index, node in enumerate(nodes) if node is not None}
+    row_of, column_of = (sorted({node[axis] for node in at}) for axis in (0, 1))
+    if len(at) < len(nodes) or min(len(row_of), len(column_of)) < 2:
+        return []
+    back = dict(zip(column_of, reversed(column_of), strict=True))
+    up = dict(zip(row_of, reversed(row_of), strict=True))
+    tried = [
+        ("reversed columns (--flip-columns)", [(row, back[column]) for row, column in at]),
+        ("reversed rows (--flip-rows)", [(up[row], column) for row, column in at]),
+        ("rows and columns exchanged (--transpose)", [(column, row) for row, column in at]),
+        (
+            "rows and columns exchanged, and rows reversed (--transpose --flip-rows)",
+            [(up.get(column, -1), row) for row, column in at],
+        ),
+    ]
+    return [(remedy, np.array([at[node] for node in moved])) for remedy, moved in tried if set(moved) == set(at)]
+
+
+def _compared(views: BinnedViews) -> list[int]:
+    """Return the views that are compared: evenly chosen, without those that are largely saturated or masked."""
+    layout, images = views.colours[0]
+    chosen = _evenly(views.elemental_set)
+    if images.valid is None:
+        return chosen
+    known = images.valid.reshape(-1, len(layout.lattices), images.valid[0].size).mean(axis=(1, 2))
+    return [view for view in chosen if known[view] >= _MIN_KNOWN]
+
+
+def _from_all_places(views: BinnedViews, chosen: list[int], depths_mm: list[float]) -> _Views:
+    """Return what some views show of the planes, in one colour, if taken from each of their places."""
+    elemental_set, (layout, images) = views.elemental_set, views.colours[0]
+    shape, bins = images.electrons.shape[1:], 1
+    while (shape[0] // bins) * (shape[1] // bins) > _MAX_SAMPLES and min(shape) // (2 * bins) >= _MIN_BINS:
+        bins *= 2
+    electrons = binned(
+        images.electrons - images.background_e if np.ndim(images.background_e) == 0 else images.electrons, bins
+    )
+    light = electrons.reshape(-1, len(layout.lattices), *electrons.shape[1:]).mean(axis=1)[chosen] * bins**2
+    known = (float(np.mean(images.background_e)) + float(np.mean(images.read_variance_e2))) * bins**2
+    places_px = _places_px(elemental_set, chosen, depths_mm, light.shape[1:], views.bins_px * bins)
+    shown = np.empty((len(chosen), len(chosen), *places_px.shape[1:3]), np.float32)
+    for place, at in enumerate(places_px):
+        for view, image in enumerate(light.astype(np.float32)):
+            shown[place, view] = cv2.remap(
+                image, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+            )
+    inside = (places_px >= 0) & (places_px <= np.array(light.shape[:0:-1]) - 1)
+    return _Views(
+        shown,
+        inside.all(axis=-1),
+        known / len(layout.lattices),
+        [elemental_set.settings.view[view].node for view in chosen],
+    )
+
+
+def _places_px(
+    elemental_set: ElementalSet, chosen: list[int], depths_mm: list[float], shape: tuple[int, ...], bins_px: int
+) -> NDArray[np.float32]:
+    """Return where others see the bins of the reference view at each depth: column, row (view, depth, bin, 2)."""
+    rows, columns = np.indices(shape)
+    pixels = (np.stack([columns.ravel(), rows.ravel()], axis=-1) + 0.5) * bins_px - 0.5
+    camera, poses = elemental_set.settings.camera, elemental_set.poses_rt_cam_ref
+    shifts = elemental_set.principal_points_px() - np.array([camera.cx_px, camera.cy_px])
+    straight = pixels - shifts[elemental_set.reference_view]
+    seen = [
+        [
+            transfer(elemental_set.lens, poses[view], fronto_parallel_rt_ref_plane(depth), straight) + shifts[view]
+            for depth in depths_mm
+        ]
+        for view in chosen
+    ]
+    places = (np.array(seen) + 0.5) / bins_px - 0.5
+    # Outside is outside, also behind a camera
+    return np.clip(np.nan_to_num(places, nan=-1.0), -1.0, shape[::-1]).astype(np.float32)
+
+
+def _evenly(elemental_set: ElementalSet) -> list[int]:
+    """Return the views that are compared: all, or those of some rows and columns, evenly and symmetrically chosen."""
+    nodes = [view.node for view in elemental_set.settings.view]
+    if len(nodes) <= _MAX_VIEWS:
+        return list(range(len(nodes)))
+    if any(node is None for node in nodes):
+        return np.linspace(0, len(nodes) - 1, _MAX_VIEWS).astype(int).tolist()
+    kept = []
+    for axis in (0, 1):
+        values = sorted({node[axis] for node in nodes if node is not None})
+        wanted = min(
+            len(values), max(int(_MAX_VIEWS**0.5), _MAX_VIEWS // len({node[1 - axis] for node in nodes if node}))
+        )
+        half = np.linspace(0, len(values) - 1, wanted)
+        kept.append(
+            {values[round(float(at))] for at in half} | {values[len(values) - 1 - round(float(at))] for at in half}
+        )
+    return [index for index, node in enumerate(nodes) if node is not None and node[0] in kept[0] and node[1] in kept[1]]

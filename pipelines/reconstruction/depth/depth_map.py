@@ -1,5 +1,6 @@
 """The depth map of a sweep, its confidence, and the all-in-focus picture: computed, written, recorded."""
 
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,13 +17,27 @@ from faintfield.pipelines.formats.results.plane_files import Origin, read_curren
 from faintfield.pipelines.formats.results.records import DEPTH_MAP_FILE, DepthMapFileRecord, DepthMapRecord, Method
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.formats.sets.stated import unit_of_maps
-from faintfield.pipelines.reconstruction.depth.map_pictures import map_picture
 from faintfield.pipelines.reconstruction.operators import plane_grid
 
 # The file of the depths by their unit.
 _FILES = {"mm": "depth_mm.tiff", "px": "disparity_px.tiff", "relative": "depth.tiff"}
 
 ALL_IN_FOCUS, CONFIDENCE = "all_in_focus", "depth_confidence"
+
+# Hatching of unknown values: two levels of grey (0 to 1), and their period.
+_MARK_GREY, _MARK_DARK, _MARK_PERIOD_PX = 0.62, 0.5, 12
+
+# Widths in inches of the picture and of the map in it, and the height of what is not the map.
+_PICTURE_WIDTH_IN, _MAP_WIDTH_IN, _MARGIN_IN = 8.6, 7.2, 0.6
+
+# Size of letters, to be read where a page shows the picture at half its size.
+_FONT_PT = 15
+
+# Quantiles of the known values between which a map is drawn if nothing else limits it.
+_QUANTILES = (0.01, 0.99)
+
+# Widest range of a map of equal values, as a share of them, so that rounding errors are not drawn as a relief.
+_MIN_RANGE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -128,8 +143,7 @@ def write_depth_map(
 def _map_of(elemental_set: ElementalSet, depths_mm: Sequence[float], disparities_px: Mapping[float, float]) -> _Map:
     """Return the depth map of a sweep, nearest depth first, in px if there are disparities."""
     # Here, because planes need none of it
-    from faintfield.pipelines.reconstruction.depth.luminance import default_bins
-    from faintfield.pipelines.reconstruction.depth.search import depths_of_set, enlarged, in_unit
+    from faintfield.pipelines.reconstruction.depth.search import default_bins, depths_of_set, enlarged, in_unit
     from faintfield.recon.surface.confidence import SURE
 
     bins, shape = default_bins(elemental_set), plane_grid(elemental_set, 1.0).shape
@@ -193,3 +207,40 @@ def _all_in_focus(paths: Sequence[Path], index: NDArray[np.floating]) -> NDArray
         sharp = part if sharp is None else sharp + part
     assert sharp is not None
     return sharp
+
+
+def map_picture(values: NDArray[np.floating], label: str, low: float, high: float) -> bytes:
+    """Return a map (row, column) as PNG in colours from `low` to `high`; NaNs are hatched grey.
+
+    The colour bar ends in a point where values lie beyond it.
+    """
+    from matplotlib.figure import Figure  # loading it costs most of a second
+
+    rows, columns = np.indices(values.shape)
+    hatch = np.where((rows + columns) % _MARK_PERIOD_PX < 2, _MARK_DARK, _MARK_GREY)
+    figure = Figure(
+        figsize=(_PICTURE_WIDTH_IN, _MARGIN_IN + _MAP_WIDTH_IN * values.shape[0] / values.shape[1]),
+        layout="constrained",
+    )
+    axes = figure.subplots()
+    axes.imshow(hatch, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+    shown = axes.imshow(values, cmap="viridis", vmin=low, vmax=high, interpolation="nearest")
+    axes.set_axis_off()
+    below, above = bool((values < low).any()), bool((values > high).any())
+    extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get((below, above), "neither")
+    bar = figure.colorbar(shown, extend=extend, fraction=0.05, pad=0.02)
+    bar.set_label(label, size=_FONT_PT)
+    bar.ax.tick_params(labelsize=_FONT_PT)
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=110, metadata={"Software": None})
+    return content.getvalue()
+
+
+def robust_limits(values: NDArray[np.floating]) -> tuple[float, float]:
+    """Return limits between which nearly all known values of a map lie; 0 and 1 if none is known."""
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return 0.0, 1.0
+    low, high = np.quantile(known, _QUANTILES).tolist()
+    room = max(_MIN_RANGE * max(abs(low), abs(high)) - (high - low), 0) / 2 or (0.5 if high == low else 0)
+    return low - room, high + room

@@ -1,1 +1,1 @@
-"""The planes of a set: settings and solutions, solvers, priors, tasks in one process or several."""
+"""Planes: solvers, priors, and the tasks of a sweep in one process or several."""

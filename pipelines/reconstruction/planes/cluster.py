@@ -20,8 +20,7 @@ from faintfield.pipelines.formats.large_arrays import mapped
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.channels import ChannelLayout, load_channel
 from faintfield.pipelines.reconstruction.planes.processes import in_processes
-from faintfield.pipelines.reconstruction.planes.sweep import Runner, run_serially
-from faintfield.pipelines.reconstruction.planes.tasks import Channel, PlaneTask, do_task
+from faintfield.pipelines.reconstruction.planes.sweep import Channel, PlaneTask, Runner, do_task, run_serially
 from faintfield.recon.likelihood.images import ElementalImages
 
 _LOST = "run the same command again, and only what is missing is done; the logs of the workers say more"

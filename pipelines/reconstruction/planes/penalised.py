@@ -1,14 +1,14 @@
 """PMLEM with its weight chosen from the data: planes at the certified optimum of likelihood and penalty."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 from msgspec import structs
 
+from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.formats.results.records import Certificate, PenaltyRecord, SolveRecord, WeightScore
-from faintfield.pipelines.reconstruction.planes.solutions import Settings, Solution, mean_e
 from faintfield.recon.likelihood.images import Image, select_likelihood
 from faintfield.recon.solver.cross_validation import MIN_VIEWS, cross_validated_weight
 from faintfield.recon.solver.data_fit import SceneProblem
@@ -41,6 +41,47 @@ _PMLEM_CERTIFICATE = (
 
 
 @dataclass(frozen=True)
+class Solution:
+    """One colour of a plane.
+
+    Attributes
+    ----------
+    plane : float array (row, column)
+        In expected electrons.
+    record : SolveRecord
+        How it was solved.
+    sidecars : dict of str to float array (row, column)
+        What else is known of each sample: `sigma`, its standard deviation in electrons; `opacity`, 0 to 1;
+        `proposal`, in electrons, of a prior; `moved`, the plane less the proposal in standard deviations of the noise.
+    """
+
+    plane: Image
+    record: SolveRecord
+    sidecars: dict[str, Image] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Pilot:
+    """Start of the prior of one colour.
+
+    Attributes
+    ----------
+    solution : Solution
+        The plane of total variation.
+    other_colours : float array (row, column)
+        The sum of the same plane in the other colours, in electrons.
+    """
+
+    solution: Solution
+    other_colours: Image
+
+
+def mean_e(plane: Image) -> float:
+    """Return the mean of a plane, summed in float64."""
+    return float(np.mean(plane, dtype=np.float64))
+
+
+@dataclass(frozen=True)
 class Objective:
     """Objective that PMLEM minimises, without the penalty's weight.
 
@@ -62,23 +103,23 @@ class Objective:
     level_e: float
 
     @classmethod
-    def of(cls, posed: SceneProblem, settings: Settings) -> "Objective":
-        """Choose likelihood and penalty according to the settings, the light and the noise."""
+    def of(cls, posed: SceneProblem, options: SolverOptions) -> "Objective":
+        """Choose likelihood and penalty according to the options, the light and the noise."""
         start = posed.start()
         level_e = mean_light_e(posed.operator, start)
-        likelihood = select_likelihood(posed.images, settings.likelihood, level_e)
+        likelihood = select_likelihood(posed.images, options.likelihood, level_e)
         posed = replace(posed, images=replace(posed.images, likelihood=likelihood))
 
         def noise_e() -> float:
             return float(1 / np.sqrt(np.median(posed.fit(level_e).metric(start)[posed.well_seen()])))
 
-        return cls(posed, Penalty.for_noise(settings.penalty, noise_e), start, level_e)
+        return cls(posed, Penalty.for_noise(options.penalty, noise_e), start, level_e)
 
 
-def solve_pmlem(objective: Objective, settings: Settings) -> list[Solution]:
+def solve_pmlem(objective: Objective, options: SolverOptions) -> list[Solution]:
     """Run PMLEM to its certificate and return the planes; all their records are of the one iteration."""
-    choice = _choose_weight(objective, settings)
-    record, iterate = certified(objective, choice.start, choice.weight, choice.dual, settings)
+    choice = _choose_weight(objective, options)
+    record, iterate = certified(objective, choice.start, choice.weight, choice.dual, options)
     record = structs.replace(
         record,
         penalty_weight_chosen=choice.chosen,
@@ -122,7 +163,7 @@ def with_sigma(
 
 
 def certified(
-    objective: Objective, start: Image, weight: float, dual: DualField, settings: Settings
+    objective: Objective, start: Image, weight: float, dual: DualField, options: SolverOptions
 ) -> tuple[SolveRecord, Image]:
     """Run PMLEM with a given weight to its certificate; return its record and samples.
 
@@ -136,7 +177,7 @@ def certified(
         tolerance=_TOLERANCE,
         dual=dual,
     )
-    limit = settings.passes or MAX_PASSES
+    limit = options.passes or MAX_PASSES
     for count, iterate in enumerate(iterates, 1):
         if iterate.certificate.distance <= _TOLERANCE or max(count, iterate.passes) >= limit:
             break
@@ -153,12 +194,12 @@ def certified(
     return record, iterate.plane
 
 
-def solve_then_sigma(objective: Objective, settings: Settings) -> tuple[Solution, Callable[[], Image]]:
+def solve_then_sigma(objective: Objective, options: SolverOptions) -> tuple[Solution, Callable[[], Image]]:
     """Reconstruct one colour of one plane by PMLEM; also return a function that computes its standard deviation.
 
     That takes memory for many planes, but neither the images nor the operator: the caller can drop these first.
     """
-    (solution,) = solve_pmlem(objective, settings)
+    (solution,) = solve_pmlem(objective, options)
     (local,) = local_fits(objective.posed.operator, objective.posed.fit(objective.level_e), solution.plane)
     weight, generator = solution.record.penalty_weight or 0.0, np.random.default_rng(_SEED)
     return solution, partial(standard_deviation, local, weight, objective.penalty, generator)
@@ -191,13 +232,13 @@ class _Choice:
     curve: list[WeightScore] | None = None
 
 
-def _choose_weight(objective: Objective, settings: Settings) -> _Choice:
+def _choose_weight(objective: Objective, options: SolverOptions) -> _Choice:
     """Return the penalty weight for PMLEM: as given, or else by cross-validation."""
     posed, start = objective.posed, objective.start
-    if settings.penalty == "none":
+    if options.penalty == "none":
         return _Choice(0.0, "none: no penalty", start, posed.dual())
-    if settings.penalty_weight is not None:
-        return _Choice(settings.penalty_weight, "given", start, posed.dual())
+    if options.penalty_weight != "auto":
+        return _Choice(options.penalty_weight, "given", start, posed.dual())
     guess = universal_penalty_weight(posed.operator, posed.images, start)
     if len(posed.operator.seeing_views) < MIN_VIEWS:
         return _Choice(guess, "from the noise level: too few views to hold some out", start, posed.dual())

@@ -7,9 +7,9 @@ from functools import partial
 import numpy as np
 from msgspec import UNSET, structs
 
+from faintfield.pipelines.arguments import PriorName, SolverOptions
 from faintfield.pipelines.formats.results.records import PriorRecord, SolveRecord
-from faintfield.pipelines.reconstruction.planes.penalised import Objective, certified, with_sigma
-from faintfield.pipelines.reconstruction.planes.solutions import PriorName, Settings, Solution, mean_e
+from faintfield.pipelines.reconstruction.planes.penalised import Objective, Solution, certified, mean_e, with_sigma
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.prior.collaborative import patch_candidates
 from faintfield.recon.prior.evidence import Evidence, evidence_of_planes, misfits
@@ -21,19 +21,19 @@ from faintfield.recon.solver.uncertainty import Answers, LocalProblem
 def with_prior(
     objective: Objective,
     solutions: Sequence[Solution],
-    settings: Settings,
+    options: SolverOptions,
     *,
     other_colours: Image | None = None,
 ) -> list[Solution]:
-    """Return planes under the prior of the settings, given those of total variation.
+    """Return planes under the prior of the options, given those of total variation.
 
     The proposal x̂ is a mixture of candidates chosen by held-out views. What is returned is the certified optimum of
     `min L(f) + β TV(f − x̂)` over f ≥ 0, with the β of total variation: where the data contradict the proposal, they
     win. Its record says how far they moved it. Groups of alike patches are found in the sum with `other_colours`
-    (samples), if given. Standard deviations are added where the settings ask for them.
+    (samples), if given. Standard deviations are added where the options ask for them.
     """
     operator = objective.posed.operator
-    if settings.prior == "tv":
+    if not options.has_prior:
         found, answers = list(solutions), None
     elif len(operator.seeing_views) < MIN_VIEWS:
         found, answers = [_without(solution, "too few views to hold some out") for solution in solutions], None
@@ -42,16 +42,14 @@ def with_prior(
         evidences = evidence_of_planes(operator, objective.posed.images, samples, other_colours=other_colours)
         why_not = _contradiction(objective, samples, evidences)
         made = (
-            None
-            if why_not
-            else _about_proposals(objective, solutions, evidences, settings, other_colours=other_colours)
+            None if why_not else _about_proposals(objective, solutions, evidences, options, other_colours=other_colours)
         )
         if made is None:
             why_not = why_not or "total variation predicts held-out views best"
             found, answers = [_without(solution, why_not) for solution in solutions], None
         else:
             found, answers = made
-    return with_sigma(objective, found, answers) if settings.uncertainty else found
+    return with_sigma(objective, found, answers) if options.uncertainty else found
 
 
 def _contradiction(objective: Objective, samples: Image, evidences: Sequence[Evidence]) -> str | None:
@@ -72,7 +70,7 @@ def _about_proposals(
     objective: Objective,
     solutions: Sequence[Solution],
     evidences: Sequence[Evidence],
-    settings: Settings,
+    options: SolverOptions,
     *,
     other_colours: Image | None,
 ) -> tuple[list[Solution], Callable[[int, LocalProblem], Answers]] | None:
@@ -80,14 +78,14 @@ def _about_proposals(
     operator, first = objective.posed.operator, solutions[0].record
     weight = first.penalty_weight or 0.0
     samples = operator.samples_of([solution.plane for solution in solutions])
-    no_network = _why_no_network(evidences) if settings.prior != "patches" else None
-    candidates = _candidates(settings.prior if no_network is None else "patches")
+    no_network = _why_no_network(evidences) if options.prior != "patches" else None
+    candidates = _candidates(options.prior if no_network is None else "patches")
     proposals = propose(objective.posed, samples, evidences, weight, candidates, other_colours=other_colours)
     if all(weights.get("tv") == 1 for proposal in proposals for weights in proposal.mixture.values()):
         return None
     proposed = operator.samples_of([proposal.picture for proposal in proposals])
     dual = replace(objective.posed.dual(), proposal=proposed)
-    record, found = certified(objective, np.maximum(proposed, 1e-3 * objective.start), weight, dual, settings)
+    record, found = certified(objective, np.maximum(proposed, 1e-3 * objective.start), weight, dual, options)
     record = structs.replace(
         record,
         penalty_weight_chosen=first.penalty_weight_chosen,
@@ -100,7 +98,7 @@ def _about_proposals(
         return ProposalAnswers(problem, proposals[index], solutions[index].plane)
 
     return [
-        _solution(plane, record, solution.sidecars, proposal, settings, no_network)
+        _solution(plane, record, solution.sidecars, proposal, options, no_network)
         for plane, solution, proposal in planes
     ], answers
 
@@ -113,7 +111,7 @@ def _why_no_network(evidences: Sequence[Evidence]) -> str | None:
     return next((reason for reason in reasons if reason is not None), None)
 
 
-def _candidates(prior: PriorName) -> Candidates:
+def _candidates(prior: PriorName | None) -> Candidates:
     """Return the function that makes the candidates of a prior."""
     if prior == "patches":
         return patch_candidates
@@ -136,7 +134,7 @@ def _solution(
     record: SolveRecord,
     sidecars: dict[str, Image],
     proposal: PlaneProposal,
-    settings: Settings,
+    options: SolverOptions,
     no_network: str | None,
 ) -> Solution:
     """Return one plane with how far the data moved it from its proposal."""
@@ -145,12 +143,12 @@ def _solution(
     seen = np.isfinite(proposal.sigma)
     rms = float(np.sqrt(np.mean(np.square(moved[seen], dtype=np.float64))))
     prior = PriorRecord(
-        name=settings.prior,
+        name=options.prior or "tv",
         mixture=proposal.mixture,
         moved_sigma=rms,
         no_network=UNSET if no_network is None else no_network,
     )
-    if settings.proposal:
+    if options.proposal:
         sidecars = sidecars | {"proposal": proposal.picture, "moved": moved}
     return Solution(plane, structs.replace(record, mean_e=mean_e(plane), prior=prior), sidecars)
 

@@ -1,14 +1,25 @@
-"""One colour of one plane: run a method on it and record how it went."""
+"""One colour of planes by each method, one after the other or all together: g = Σ_z H_z f_z + b."""
 
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 
+import numba
 import numpy as np
+from msgspec import structs
 
+from faintfield.pipelines.arguments import SolverOptions
+from faintfield.pipelines.console import inform
+from faintfield.pipelines.errors import MemoryShort
+from faintfield.pipelines.formats.large_arrays import available_bytes
+from faintfield.pipelines.formats.plane_poses import Place
 from faintfield.pipelines.formats.results.records import Certificate, Method, SolveRecord
-from faintfield.pipelines.reconstruction.planes.penalised import Objective, solve_pmlem
+from faintfield.pipelines.reconstruction.operators import OperatorFactory
+from faintfield.pipelines.reconstruction.planes.penalised import Objective, Pilot, Solution, mean_e, solve_pmlem
 from faintfield.pipelines.reconstruction.planes.prior import with_prior
-from faintfield.pipelines.reconstruction.planes.solutions import Pilot, Settings, Solution, mean_e
+from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages, Image, select_likelihood
+from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.occlusion import opacity
 from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.solver.initialization import (
@@ -38,9 +49,17 @@ _EPSILON_OF_SCALE = 0.005
 # What the last pass says, in words.
 _ONE_STEP_LATE_CERTIFICATE = "relative change of the last pass; one-step-late iterations prove no optimum"
 
+# Arrays as large as all planes that their fit needs, beside one for each thread: while a weight is chosen, or planes
+# hide others.
+_ARRAYS_OF_SAMPLES = 23
+
 
 def solve(
-    operator: PlaneOperator, images: ElementalImages, method: Method, settings: Settings, pilot: Pilot | None = None
+    operator: PlaneOperator,
+    images: ElementalImages,
+    method: Method,
+    options: SolverOptions,
+    pilot: Pilot | None = None,
 ) -> Solution:
     """Reconstruct one plane of one colour, by a prior from its pilot if there is one.
 
@@ -56,24 +75,24 @@ def solve(
             plane, SolveRecord(penalty_weight=None, penalty_weight_chosen=chosen, passes=1, mean_e=mean_e(plane))
         )
     if method == "pmlem":
-        objective = Objective.of(SceneProblem(operator, images), settings)
+        objective = Objective.of(SceneProblem(operator, images), options)
         if pilot:
-            return with_prior(objective, [pilot.solution], settings, other_colours=pilot.other_colours)[0]
-        return with_prior(objective, solve_pmlem(objective, settings), settings)[0]
+            return with_prior(objective, [pilot.solution], options, other_colours=pilot.other_colours)[0]
+        return with_prior(objective, solve_pmlem(objective, options), options)[0]
     start = smooth_start(operator, images)
-    likelihood = select_likelihood(images, settings.likelihood, mean_light_e(operator, start))
+    likelihood = select_likelihood(images, options.likelihood, mean_light_e(operator, start))
     images = replace(images, likelihood=likelihood)
-    return _solve_one_step_late(operator, images, start, method, settings)
+    return _solve_one_step_late(operator, images, start, method, options)
 
 
 def _solve_one_step_late(
-    operator: PlaneOperator, images: ElementalImages, start: Image, method: Method, settings: Settings
+    operator: PlaneOperator, images: ElementalImages, start: Image, method: Method, options: SolverOptions
 ) -> Solution:
     """Run MLEM or one-step-late PMLEM as published."""
     epsilon = _EPSILON_OF_SCALE * float(np.quantile(start, 0.99)) ** 2
-    weight, chosen = _one_step_late_weight(operator, images, start, method, settings)
+    weight, chosen = _one_step_late_weight(operator, images, start, method, options)
     steps: list[IterationStep] = []
-    limit = settings.passes or _MAX_PASSES[method]
+    limit = options.passes or _MAX_PASSES[method]
     for iterate in pmlem_one_step_late(operator, images, start, penalty_weight=weight, epsilon=epsilon):
         steps.append(iterate.step)
         if len(steps) >= limit or settled(steps, _SETTLED):
@@ -99,11 +118,123 @@ def _solve_one_step_late(
 
 
 def _one_step_late_weight(
-    operator: PlaneOperator, images: ElementalImages, start: Image, method: Method, settings: Settings
+    operator: PlaneOperator, images: ElementalImages, start: Image, method: Method, options: SolverOptions
 ) -> tuple[float, str]:
     """Return β and how it was chosen."""
     if method == "mlem":
         return 0.0, "none: maximum likelihood"
-    if settings.penalty_weight is not None:
-        return settings.penalty_weight, "given"
+    if options.penalty_weight != "auto":
+        return options.penalty_weight, "given"
     return universal_penalty_weight(operator, images, start), "from the noise level"
+
+
+def solve_together(
+    factory: OperatorFactory,
+    images: ElementalImages,
+    grids: Mapping[Place, PlaneGrid],
+    methods: Collection[Method],
+    options: SolverOptions,
+    pilots: Mapping[Place, Pilot] | None = None,
+) -> dict[Method, dict[Place, Solution]]:
+    """Reconstruct all planes of one colour together, so that no plane has to explain the light of the others.
+
+    Parameters
+    ----------
+    grids : mapping of Place to PlaneGrid
+        The samples of each plane.
+    methods : collection of Method
+        "joint", "occlusion" or both; with the latter planes hide those behind them if that explains the images better.
+    pilots : mapping of Place to Pilot, optional
+        What a prior begins with: planes of "joint" by total variation.
+
+    Returns
+    -------
+    dict of Method to dict of Place to Solution
+        All records are of one iteration: its penalty weight, passes, objective and certificate.
+    """
+    _check_memory(grids.values())
+    operator = factory.of_scene(grids)
+    objective = Objective.of(SceneProblem(operator, images), options)
+    joint = [pilots[place].solution for place in grids] if pilots else solve_pmlem(objective, options)
+    other_colours = operator.samples_of([pilots[place].other_colours for place in grids]) if pilots else None
+    found: dict[Method, list[Solution]] = {}
+    if "joint" in methods:
+        found["joint"] = with_prior(objective, joint, options, other_colours=other_colours)
+    if "occlusion" in methods:
+        found["occlusion"] = _with_occlusion(
+            factory, objective, grids, joint, options, other_colours, found.get("joint")
+        )
+    return {method: dict(zip(grids, planes, strict=True)) for method, planes in found.items()}
+
+
+def _check_memory(grids: Iterable[PlaneGrid]) -> None:
+    """Refuse to begin without memory for the arrays as large as all planes."""
+    samples = sum(rows * columns for rows, columns in (grid.shape for grid in grids))
+    arrays = _ARRAYS_OF_SAMPLES + int(numba.config.NUMBA_NUM_THREADS)
+    needed, free = arrays * samples * np.dtype(np.float32).itemsize, available_bytes()
+    if needed > free:
+        raise MemoryShort(
+            f"planes found together need {needed / 1e9:.3g} GB beside the images, and {free / 1e9:.3g} GB of "
+            "memory are free; ask for fewer planes, a larger --pitch-mm, or --method pmlem"
+        )
+
+
+def _with_occlusion(
+    factory: OperatorFactory,
+    objective: Objective,
+    grids: Mapping[Place, PlaneGrid],
+    joint: list[Solution],
+    options: SolverOptions,
+    other_colours: Image | None,
+    done: list[Solution] | None,
+) -> list[Solution]:
+    """Estimate opacity from the planes, then reconstruct the light again behind it with the same penalty weight.
+
+    Where that explains the images no better, the planes of joint stay, which may be done already.
+
+    Likelihood and penalty stay the same, too, so that the lower of both objectives explains the images better.
+    The plane written is `α f`: where a plane is transparent it has no light of its own. The certificate is that of f.
+    """
+    first = joint[0].record
+    options = replace(options, penalty_weight=first.penalty_weight or 0.0)
+    try:
+        occluded = factory.of_scene(grids, [opacity(solution.plane) for solution in joint])
+    except GeometryMismatch:
+        unchanged = done or with_prior(objective, joint, options, other_colours=other_colours)
+        return _without_occlusion(unchanged, "a plane would be hidden from all views")
+    behind = replace(objective, posed=replace(objective.posed, operator=occluded))
+    better = solve_pmlem(behind, options)
+    objectives = better[0].record.objective, first.objective
+    assert objectives[0] is not None
+    assert objectives[1] is not None
+    if objectives[0] >= objectives[1]:
+        unchanged = done or with_prior(objective, joint, options, other_colours=other_colours)
+        return _without_occlusion(unchanged, "it explains the images no better")
+    return [
+        _of_opaque_part(solution, first)
+        for solution in with_prior(behind, better, options, other_colours=other_colours)
+    ]
+
+
+def _of_opaque_part(solution: Solution, first: SolveRecord) -> Solution:
+    """Return a plane as `α f` with α beside it, its weight recorded as chosen in the first run."""
+    alpha = opacity(solution.plane)
+    plane = alpha * solution.plane
+    record = structs.replace(
+        solution.record,
+        penalty_weight_chosen=first.penalty_weight_chosen,
+        penalty_weight_curve=first.penalty_weight_curve,
+        passes_before=first.passes_before,
+        mean_e=mean_e(plane),
+        occlusion=True,
+    )
+    return Solution(plane, record, solution.sidecars | {"opacity": alpha})
+
+
+def _without_occlusion(joint: list[Solution], reason: str) -> list[Solution]:
+    """Return the planes unchanged, and inform the user."""
+    inform(f"occlusion is left out: {reason}; the planes are those of joint")
+    return [
+        replace(solution, record=structs.replace(solution.record, occlusion=False, occlusion_left_out=reason))
+        for solution in joint
+    ]

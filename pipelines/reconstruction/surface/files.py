@@ -31,7 +31,7 @@ from faintfield.pipelines.formats.results.surface import (
     SurfaceRecord,
 )
 from faintfield.pipelines.formats.units import LightUnit, StatedUnits, units_of
-from faintfield.pipelines.reconstruction.depth.map_pictures import map_picture, robust_limits
+from faintfield.pipelines.reconstruction.depth.depth_map import map_picture, robust_limits
 from faintfield.pipelines.reconstruction.surface.parallax import FRAME_MS, render_parallax, viewpoints
 from faintfield.recon.operator.grid import PlaneGrid
 

@@ -27,6 +27,7 @@ from faintfield.pipelines.formats.results.surface import (
 )
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.formats.sets.stated import in_units, light_per_e, unit_of_maps
+from faintfield.pipelines.reconstruction.accuracy import write_depth_errors
 from faintfield.pipelines.reconstruction.channels import (
     SHARE_OF_DISK,
     ChannelLayout,
@@ -34,11 +35,10 @@ from faintfield.pipelines.reconstruction.channels import (
     keeping_frames,
     load_channel,
 )
-from faintfield.pipelines.reconstruction.depth.accuracy import write_depth_errors
 from faintfield.pipelines.reconstruction.depth.autofocus import imported_range_px
-from faintfield.pipelines.reconstruction.depth.luminance import default_bins
 from faintfield.pipelines.reconstruction.depth.search import (
     check_views,
+    default_bins,
     depths_of_set,
     enlarged,
     in_unit,
@@ -46,9 +46,8 @@ from faintfield.pipelines.reconstruction.depth.search import (
     naming_range,
 )
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
-from faintfield.pipelines.reconstruction.planes.penalised import Objective, solve_then_sigma
+from faintfield.pipelines.reconstruction.planes.penalised import Objective, Solution, mean_e, solve_then_sigma
 from faintfield.pipelines.reconstruction.planes.prior import with_prior
-from faintfield.pipelines.reconstruction.planes.solutions import Solution, mean_e
 from faintfield.pipelines.reconstruction.surface.files import SurfaceMaps, write_surface
 from faintfield.pipelines.reconstruction.surface.parallax import aperture_of
 from faintfield.pipelines.reconstruction.surface.request import SurfaceRequest
@@ -105,7 +104,7 @@ def reconstruct_surface(
         return kept.surface
     layouts = channel_layouts(elemental_set)
     grid = plane_grid(elemental_set, 1.0)
-    needed_bytes = _needed_bytes(grid.shape, len(layouts), proposal=request.settings.proposal)
+    needed_bytes = _needed_bytes(grid.shape, len(layouts), proposal=request.solver.proposal)
     require_room(out, int(needed_bytes / (1 - SHARE_OF_DISK)))  # decoded frames take the rest
     range_mm = limits_mm(elemental_set, request.depth_range_mm)
     find_range = request.depth_range_mm is None and imported_range_px(elemental_set) is None
@@ -170,12 +169,12 @@ def _light(
     factory = OperatorFactory(elemental_set, layout, images)
     operator = factory.of_surface(inverse_depth, plane_grid(elemental_set, 1.0))
     _name_blind_views(elemental_set, operator, len(layout.lattices))
-    objective = Objective.of(SceneProblem(operator, images), request.settings)
-    solution, sigma = solve_then_sigma(objective, request.settings)
-    if request.filtered:
+    objective = Objective.of(SceneProblem(operator, images), request.solver)
+    solution, sigma = solve_then_sigma(objective, request.solver)
+    if request.solver.prior is None:
         solution = replace(solution, plane=refined(operator, images, solution.plane))
     else:
-        (solution,) = with_prior(objective, [solution], request.settings)
+        (solution,) = with_prior(objective, [solution], request.solver)
     visibility = _visibility(operator, layout)
     del images, factory, operator, objective
     return replace(solution, sidecars=solution.sidecars | {"sigma": sigma(), "visibility": visibility})

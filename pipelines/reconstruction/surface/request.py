@@ -1,4 +1,4 @@
-"""Request for a surface."""
+"""Requests for a surface: options are checked as they enter, and resolved for a set."""
 
 import re
 from dataclasses import dataclass, field, replace
@@ -6,13 +6,13 @@ from typing import Literal
 
 from msgspec import UNSET
 
+from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.errors import WrongUsage
 from faintfield.pipelines.formats.results.records import Poses
 from faintfield.pipelines.formats.results.surface import SurfaceOptions
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.options import Options
-from faintfield.pipelines.reconstruction.planes.solutions import Settings
-from faintfield.pipelines.reconstruction.request import check_prior, settings_of
+from faintfield.pipelines.reconstruction.request import check_prior
 
 # Folder of the surface among the results of a session.
 SURFACE_FOLDER = "surface"
@@ -25,70 +25,41 @@ _FARTHEST_MM = 1e9
 
 @dataclass(frozen=True)
 class SurfaceRequest:
-    """A surface to reconstruct.
+    """A surface to reconstruct: its range of depths, nearest first, which is found in the views if None.
 
-    Attributes
-    ----------
-    depth_range_mm : (float, float), optional
-        Nearest and farthest depth; found in the views if None.
-    unit : str
-        Unit of the depths in its files: mm, or px of disparity from node to node.
-    settings : Settings
-        How its light is solved.
-    filtered : bool
-        Add the detail that the penalty removed, by a filter; otherwise the picture is that of the prior alone.
+    `unit` is that of the depths in its files: mm, or px of disparity from node to node.
     """
 
     depth_range_mm: tuple[float, float] | None = None
     unit: Literal["mm", "px"] = "mm"
-    settings: Settings = field(default_factory=Settings)
-    filtered: bool = True
+    solver: SolverOptions = field(default_factory=SolverOptions)
 
     def options(self, poses: Poses) -> SurfaceOptions:
         """Return the options that the results record."""
-        weight = self.settings.penalty_weight
+        effective = {
+            "uncertainty": UNSET,
+            "prior": UNSET if self.solver.prior is None else self.solver.prior,
+            "proposal": self.solver.proposal or UNSET,
+        }
         return SurfaceOptions(
-            depth_range_mm=self.depth_range_mm,
-            unit=self.unit,
-            penalty_weight="auto" if weight is None else weight,
-            penalty=self.settings.penalty,
-            likelihood=self.settings.likelihood,
-            prior=UNSET if self.filtered else self.settings.prior,
-            proposal=self.settings.proposal or UNSET,
-            passes=self.settings.passes,
-            poses=poses,
+            depth_range_mm=self.depth_range_mm, unit=self.unit, **vars(self.solver) | effective, poses=poses
         )
 
 
 @dataclass(frozen=True)
 class SurfaceSelection:
-    """The range of a surface as the options give it, before the set is known.
-
-    Attributes
-    ----------
-    range_mm, range_px : (float, float), optional
-        Depths, nearest first; disparities.
-    settings, filtered : Settings, bool
-        As in `SurfaceRequest`.
-    """
+    """The range of a surface in mm or px as the options give it, before the set is known."""
 
     range_mm: tuple[float, float] | None
     range_px: tuple[float, float] | None
-    settings: Settings
-    filtered: bool
+    solver: SolverOptions
 
     def resolve(self, elemental_set: ElementalSet) -> SurfaceRequest:
-        """Return the request for a set, whose disparities become depths.
-
-        Raises
-        ------
-        BadValue
-            A disparity has no depth.
-        """
+        """Return the request for a set, whose disparities become depths (BadValue: one has none)."""
         if self.range_px is None:
-            return SurfaceRequest(self.range_mm, "mm", self.settings, self.filtered)
+            return SurfaceRequest(self.range_mm, "mm", self.solver)
         near_mm, far_mm = sorted(elemental_set.depth_of_disparity(disparity_px) for disparity_px in self.range_px)
-        return SurfaceRequest((near_mm, far_mm), "px", self.settings, self.filtered)
+        return SurfaceRequest((near_mm, far_mm), "px", self.solver)
 
 
 def select_surface(options: Options) -> SurfaceSelection | None:
@@ -113,9 +84,9 @@ def select_surface(options: Options) -> SurfaceSelection | None:
             f"--depth-range-mm {depth_range_mm}: depths are positive, and at most {_FARTHEST_MM:.0f} mm; give "
             "NEAR:FAR, such as 400:1500"
         )
-    settings = replace(settings_of(options), uncertainty=False)  # of planes: a surface has its own always
-    check_prior(["pmlem"], settings)
-    return SurfaceSelection(range_mm, range_px, settings, filtered=options.prior is None)
+    solver = replace(options.solver, uncertainty=False)  # of planes: a surface has its own always
+    check_prior(["pmlem"], solver)
+    return SurfaceSelection(range_mm, range_px, solver)
 
 
 def _ends(option: str, text: str, example: str) -> tuple[float, float]:

@@ -6,6 +6,7 @@ from unittest import mock
 
 import pytest
 
+from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.launcher import app
 from faintfield.pipelines.reconstruction.options import Options
 from faintfield.pipelines.reconstruction.request import select_planes
@@ -53,16 +54,16 @@ def test_options_that_exclude_each_other_are_refused(recorded_session: Path, fai
 
 
 def test_planes_solved_together_are_made_once(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    quick = Options(depth_mm=[500.0, 700.0], pitch_mm=16.0, prior="tv", penalty_weight=0.1, passes=3)
-    asked = replace(quick, joint=True, uncertainty=True)
+    solver = SolverOptions(prior="tv", penalty_weight=0.1, passes=3, uncertainty=True)
+    asked = Options(depth_mm=[500.0, 700.0], pitch_mm=16.0, joint=True, solver=solver)
     assert steps_run(session, asked) == ["reconstruct"]
     record = read_record(session / "reconstructions")
     assert {plane["method"] for plane in record["planes"]} == {"joint"}
     assert all((session / "reconstructions" / plane["sigma_file"]).is_file() for plane in record["planes"])
     assert steps_run(session, asked) == []
-    monkeypatch.setattr("faintfield.pipelines.reconstruction.planes.tasks.solve_together", _FAIL)
+    monkeypatch.setattr("faintfield.pipelines.reconstruction.planes.sweep.solve_together", _FAIL)
     with pytest.raises(NothingInFocus, match="begun"):
-        steps_run(session, replace(asked, uncertainty=False, likelihood="poisson"))
+        steps_run(session, replace(asked, solver=replace(solver, uncertainty=False, likelihood="poisson")))
 
 
 def test_depths_are_searched_only_once(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -78,7 +79,7 @@ def test_depths_are_searched_only_once(session: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr("faintfield.pipelines.reconstruction.request.best_focus", _FAIL)
     assert steps_run(session, asked) == []
     assert steps_run(session, replace(_FAST, depth=["auto"])) == []
-    for other in (replace(asked, sweep_mm="450:900:3"), replace(asked, passes=7)):
+    for other in (replace(asked, sweep_mm="450:900:3"), replace(asked, solver=SolverOptions(passes=7))):
         with pytest.raises(NothingInFocus, match="begun"):
             steps_run(session, other)
 
@@ -110,16 +111,16 @@ def test_depth_map_of_disparities_is_made_once(seen: Searches, session: Path) ->
 
 
 def test_prior_applies_to_planes_and_surface() -> None:
-    given = Options(depth_mm=[500.0], surface=True, prior="patches", uncertainty=True)
+    given = Options(depth_mm=[500.0], surface=True, solver=SolverOptions(prior="patches", uncertainty=True))
     surface = select_surface(given)
     assert surface is not None
-    assert (surface.settings.prior, surface.filtered, surface.settings.uncertainty) == ("patches", False, False)
+    assert (surface.solver.prior, surface.solver.uncertainty) == ("patches", False)
     planes = select_planes(given)
-    assert (planes.settings.prior, planes.settings.uncertainty) == ("patches", True)
+    assert (planes.solver.prior, planes.solver.uncertainty) == ("patches", True)
     by_default = Options(depth_mm=[500.0], surface=True)
     surface = select_surface(by_default)
     assert surface is not None
-    assert (surface.settings.prior, surface.filtered) == ("tv", True)
-    assert select_planes(by_default).settings.prior == "auto"
-    assert select_planes(Options(depth_mm=[500.0], method=["mlem"])).settings.prior == "tv"
-    assert select_planes(Options(sweep_mm="480:520:2")).settings.prior == "tv"
+    assert surface.solver.prior is None
+    assert select_planes(by_default).solver.prior == "auto"
+    assert select_planes(Options(depth_mm=[500.0], method=["mlem"])).solver.prior == "tv"
+    assert select_planes(Options(sweep_mm="480:520:2")).solver.prior == "tv"

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import tifffile
 
+from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.commands.capture import verify
 from faintfield.pipelines.commands.reconstruction import reconstruct
 from faintfield.pipelines.reconstruction.options import Options
@@ -17,7 +18,7 @@ from faintfield.recon.errors import NothingInFocus
 from tests.pipelines.sessions import steps_run
 from tests.pipelines.surfaces import FOUND_MM, Searches
 
-ASKED = Options(surface=True, depth_range_mm="400:900", penalty_weight=0.5, passes=2)
+ASKED = Options(surface=True, depth_range_mm="400:900", solver=SolverOptions(penalty_weight=0.5, passes=2))
 WITH_PLANE = replace(ASKED, depth_mm=[700.0], method=["backprojection"], pitch_mm=16.0)
 OTHER_PLANE = replace(WITH_PLANE, depth_mm=[500.0])
 OTHER_RANGE = replace(ASKED, depth_range_mm="400:1000")

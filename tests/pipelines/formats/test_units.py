@@ -1,5 +1,6 @@
 """Units: records named and converted by those of their set, and none that nobody gave in anything that is written."""
 
+import dataclasses
 import html
 import json
 import re
@@ -72,7 +73,7 @@ def test_records_are_read_as_written_in_any_units(
 
 def test_key_of_a_user_is_kept() -> None:
     record = msgspec.json.decode((GOLDEN / "plane_pmlem.json").read_bytes(), type=PlaneFileRecord)
-    options = msgspec.structs.replace(record.options, plane_pose={"depth": [0.0] * 6, "mean": [1.0] * 6})
+    options = dataclasses.replace(record.options, plane_pose={"depth": [0.0] * 6, "mean": [1.0] * 6})
     units = StatedUnits("relative", "relative")
     odd = msgspec.structs.replace(record, options=options, units=units, inputs={"mean_e": "0" * 64})
     assert record_of(json_of(odd), PlaneFileRecord) == odd

@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.errors import MissingFile
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.results.geometry import CameraPoses, LensRecord, NodeRecord
@@ -18,7 +19,6 @@ from faintfield.pipelines.live.planes_scene import LiveScene, bins_of, live_scen
 from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
 from faintfield.pipelines.reconstruction.planes.penalised import Objective, certified
-from faintfield.pipelines.reconstruction.planes.solutions import Settings
 from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.solver.initialization import back_projection, universal_penalty_weight
 from faintfield.rig.cameras.settings import FolderSettings
@@ -96,9 +96,9 @@ def test_frames_in_turn_give_planes_of_the_session(session: Path, bins: int) -> 
         assert planes.picture(0, "pmlem") is not None
         rounds += 1
     assert 1 < rounds < 15 if interrupted else rounds == 1
-    objective = Objective.of(SceneProblem(operator, images), Settings())
+    objective = Objective.of(SceneProblem(operator, images), SolverOptions())
     weight = universal_penalty_weight(operator, objective.posed.images, objective.start)
-    record, solved = certified(objective, objective.start, weight, objective.posed.dual(), Settings())
+    record, solved = certified(objective, objective.start, weight, objective.posed.dual(), SolverOptions())
     assert record.certificate is not None
     assert record.certificate.reached
     refined = planes.picture(0, "pmlem")

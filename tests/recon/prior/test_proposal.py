@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import LinearConstraint, minimize
 
+from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.reconstruction.planes.penalised import Objective
-from faintfield.pipelines.reconstruction.planes.solutions import Settings
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.prior.evidence import Evidence, Misfit, evidence_of_planes, misfits
 from faintfield.recon.prior.proposal import Scores, best_mixture, propose, scores
@@ -37,7 +37,7 @@ def mean_of_nine(picture: Image) -> Image:
 def test_edges_beyond_noise_are_those_of_the_plane(light: float) -> None:
     plane = np.float32(light) * pieces(32)
     operator, images = dark_views(pieces(32), 2)
-    problem = Objective.of(SceneProblem(operator, images), Settings()).posed
+    problem = Objective.of(SceneProblem(operator, images), SolverOptions()).posed
     (evidence,) = evidence_of_planes(operator, images, plane)
     unseen = np.zeros(plane.shape, bool)
     unseen[:3] = True

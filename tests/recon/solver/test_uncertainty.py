@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from faintfield.pipelines.arguments import PriorName, SolverOptions
 from faintfield.pipelines.reconstruction.planes.penalised import Objective, certified, solve_pmlem
-from faintfield.pipelines.reconstruction.planes.solutions import PriorName, Settings
 from faintfield.pipelines.reconstruction.planes.solve import solve
 from faintfield.recon.likelihood.images import Image, blurred
 from faintfield.recon.prior.collaborative import patch_candidates
@@ -118,29 +118,29 @@ def test_intervals_cover_the_truth_on_objects(truth: Image, prior: PriorName) ->
     shares = []
     for seed in range(1 if prior == "patches" else 2):
         operator, images = dark_views(truth, seed)
-        solution = solve(operator, images, "pmlem", Settings(uncertainty=True, prior=prior))
+        solution = solve(operator, images, "pmlem", SolverOptions(uncertainty=True, prior=prior))
         shares.append(np.mean((np.abs(solution.plane - truth) <= 1.645 * solution.sidecars["sigma"])[8:-8, 8:-8]))
     assert 0.85 <= np.mean(shares) <= 0.96
 
 
 def test_plane_about_proposal_answers_as_to_other_data() -> None:
     operator, images = dark_views(pieces(48), 3)
-    objective = Objective.of(SceneProblem(operator, images), Settings())
-    (pilot,) = solve_pmlem(objective, Settings())
+    objective = Objective.of(SceneProblem(operator, images), SolverOptions())
+    (pilot,) = solve_pmlem(objective, SolverOptions())
     weight = pilot.record.penalty_weight or 0.0
     (evidence,) = evidence_of_planes(operator, images, pilot.plane)
     (proposal,) = propose(objective.posed, pilot.plane, [evidence], weight, patch_candidates)
 
     def about(posed: SceneProblem, proposed: Image) -> Image:
         dual = replace(posed.dual(), proposal=proposed)
-        return certified(replace(objective, posed=posed), objective.start, weight, dual, Settings())[1]
+        return certified(replace(objective, posed=posed), objective.start, weight, dual, SolverOptions())[1]
 
     plane = about(objective.posed, proposal.picture)
     deviation = np.sqrt(images.background_e + images.read_variance_e2)
     noise = np.random.default_rng(5).normal(0, deviation, images.electrons.shape)
     noisy = replace(objective.posed.images, electrons=(images.electrons + 0.5 * noise).astype(np.float32))
     others = replace(objective.posed, images=noisy)
-    (other_pilot,) = solve_pmlem(replace(objective, posed=others), Settings(penalty_weight=weight))
+    (other_pilot,) = solve_pmlem(replace(objective, posed=others), SolverOptions(penalty_weight=weight))
     (other_evidence,) = evidence_of_planes(operator, noisy, other_pilot.plane)
     really = about(others, proposal.again(other_evidence._replace(noise=evidence.noise), other_pilot.plane)) - plane
 

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.depth.autofocus import best_focus, searched_range_mm
-from faintfield.pipelines.reconstruction.depth.comparison import BinnedViews, binned_views
-from faintfield.pipelines.reconstruction.depth.significance import _shuffles, check_places
+from faintfield.pipelines.reconstruction.depth.comparison import BinnedViews, _shuffles, binned_views, check_places
 from faintfield.recon.errors import NothingInFocus
 from tests.calib.light_fields import Layer, light_field, with_noise
 from tests.pipelines.by_hand import View, write_set

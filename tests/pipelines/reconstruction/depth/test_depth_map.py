@@ -22,7 +22,7 @@ from faintfield.pipelines.formats.sets.ground_truth import (
     read_truth,
     texture_and_region,
 )
-from faintfield.pipelines.reconstruction.depth.accuracy import write_depth_errors
+from faintfield.pipelines.reconstruction.accuracy import write_depth_errors
 from faintfield.pipelines.reconstruction.depth.autofocus import searched_range_mm
 from faintfield.pipelines.reconstruction.depth.comparison import binned_views
 from faintfield.recon.depth.focus import SURE

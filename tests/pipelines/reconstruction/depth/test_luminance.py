@@ -7,7 +7,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from faintfield.pipelines.formats.sets.elemental_set import load_set
-from faintfield.pipelines.reconstruction.depth.luminance import default_bins, luminance
+from faintfield.pipelines.reconstruction.depth.search import default_bins, luminance
 from faintfield.recon.surface.pinhole_views import UNKNOWN
 from tests.pipelines.by_hand import write_fitted_noise
 from tests.pipelines.conftest import Edit, SetMaker

@@ -11,6 +11,7 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
+from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.formats.sets.elemental_set import load_set
@@ -19,7 +20,6 @@ from faintfield.pipelines.reconstruction.depth.comparison import BETWEEN_PIXELS
 from faintfield.pipelines.reconstruction.depth.search import between_pixels, enlarged
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
 from faintfield.pipelines.reconstruction.planes.penalised import Objective, solve_then_sigma
-from faintfield.pipelines.reconstruction.planes.solutions import Settings
 from faintfield.pipelines.reconstruction.planes.solve import solve
 from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.surface.pinhole_views import UNKNOWN
@@ -150,7 +150,7 @@ def test_deviation_without_images_is_that_of_plane(simulated_scene: Path) -> Non
     (layout,) = channel_layouts(elemental_set)
     images = load_channel(elemental_set, layout)
     operator = OperatorFactory(elemental_set, layout, images).at(500.0, plane_grid(elemental_set, 500.0))
-    settings = Settings(penalty_weight=0.5, passes=5)
+    settings = SolverOptions(penalty_weight=0.5, passes=5)
     solution, sigma = solve_then_sigma(Objective.of(SceneProblem(operator, images), settings), settings)
     expected = solve(operator, images, "pmlem", replace(settings, uncertainty=True))
     np.testing.assert_array_equal(solution.plane, expected.plane)

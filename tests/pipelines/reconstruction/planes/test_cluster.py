@@ -10,13 +10,13 @@ from typing import Any
 
 import pytest
 
+from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.formats.files import UNFINISHED
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.plane_poses import Place
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
 from faintfield.pipelines.reconstruction.planes.cluster import make_runner
-from faintfield.pipelines.reconstruction.planes.solutions import Settings
-from faintfield.pipelines.reconstruction.planes.tasks import PlaneTask
+from faintfield.pipelines.reconstruction.planes.sweep import PlaneTask
 from faintfield.pipelines.reconstruction.request import Request
 from faintfield.pipelines.reconstruction.run import reconstruct_set
 from tests.pipelines.conftest import Command, Edit, assert_refused
@@ -46,7 +46,7 @@ def _kill_one_that_works(cluster: Any) -> None:
 @pytest.mark.deep
 def test_worker_killed_in_sweep_costs_one_plane(cluster: Any, simulated_scene: Path, tmp_path: Path) -> None:
     elemental_set = load_set(simulated_scene)
-    request = Request(DEPTHS_MM, ["pmlem"], Settings(penalty_weight=1.0, passes=3, prior="tv"), with_focus=True)
+    request = Request(DEPTHS_MM, ["pmlem"], SolverOptions(penalty_weight=1.0, passes=3, prior="tv"), with_focus=True)
     reconstruct_set(elemental_set, tmp_path / "local", request)
     runner = make_runner(None, cluster.scheduler_address)
     done: list[Place] = []

@@ -40,6 +40,6 @@ def test_occlusion_keeps_penalty_and_lowers_objective(scene: Path, tmp_path: Pat
 def test_what_memory_has_no_room_for_is_refused(
     scene: Path, tmp_path: Path, faintfield: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("faintfield.pipelines.reconstruction.planes.joint.available_bytes", lambda: 100_000)
+    monkeypatch.setattr("faintfield.pipelines.reconstruction.planes.solve.available_bytes", lambda: 100_000)
     ended = faintfield("reconstruct", scene, *BOTH, "--occlusion", "--out", tmp_path / "out")
     assert_refused(ended, "MemoryShort", "planes found together need")

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.reconstruction.planes import learned_prior
 from faintfield.pipelines.reconstruction.planes.learned_prior import learned_estimate, network_input, outside_range
-from faintfield.pipelines.reconstruction.planes.solutions import Settings
 from faintfield.pipelines.reconstruction.planes.solve import solve
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.prior.collaborative import Patches, collaborative_wiener
@@ -45,7 +45,7 @@ def known_of(light_e: Image, seed: int, views: int = 25, read_noise_e: float = 3
     light = operator.forward(light_e.astype(np.float32))
     electrons = random.poisson(light) + random.normal(0, read_noise_e, light.shape)
     images = ElementalImages(electrons.astype(np.float32), 0.0, read_noise_e**2)
-    plane = solve(operator, images, "pmlem", Settings(penalty_weight=0.9 * views**0.5 / read_noise_e)).plane
+    plane = solve(operator, images, "pmlem", SolverOptions(penalty_weight=0.9 * views**0.5 / read_noise_e)).plane
     noise = noise_of_back_projection(operator, images, plane)
     pilot, picture = operator.adjoint_of_forward(plane) / operator.coverage(), back_projection(operator, images)
     patches = collaborative_wiener(picture, pilot, noise, Patches(8, 4, 16, 64), workers=1)

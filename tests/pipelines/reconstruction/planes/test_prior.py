@@ -8,16 +8,15 @@ import numpy as np
 import pytest
 import tifffile
 
+from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
 from faintfield.pipelines.reconstruction.channels import ChannelLayout, channel_layouts, load_channel
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
 from faintfield.pipelines.reconstruction.planes import prior as prior_module
-from faintfield.pipelines.reconstruction.planes import sweep, tasks
-from faintfield.pipelines.reconstruction.planes.joint import solve_together
+from faintfield.pipelines.reconstruction.planes import sweep
 from faintfield.pipelines.reconstruction.planes.penalised import Objective, solve_pmlem
 from faintfield.pipelines.reconstruction.planes.prior import with_prior
-from faintfield.pipelines.reconstruction.planes.solutions import Settings
-from faintfield.pipelines.reconstruction.planes.solve import solve
+from faintfield.pipelines.reconstruction.planes.solve import solve, solve_together
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.prior.collaborative import patch_candidates
@@ -167,7 +166,7 @@ def colour_plane(colour_set: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     return out, read
 
 
-def _by_hand(folder: Path, depth_mm: float, settings: Settings) -> list[Image]:
+def _by_hand(folder: Path, depth_mm: float, settings: SolverOptions) -> list[Image]:
     """Each colour of a plane by the prior, with the sum of the other colours by total variation."""
     elemental_set = load_set(folder)
     objectives, first = [], []
@@ -196,7 +195,7 @@ def test_each_colour_begins_with_sum_of_others(
 
     monkeypatch.setattr("faintfield.pipelines.reconstruction.planes.prior.patch_candidates", watched)
     plane = tifffile.imread(colour_plane[0] / "plane_00500.0.tiff")
-    expected = _by_hand(colour_set, 500.0, Settings(2.0, 2, prior="patches"))
+    expected = _by_hand(colour_set, 500.0, SolverOptions(penalty_weight=2.0, passes=2, prior="patches"))
     np.testing.assert_allclose(np.moveaxis(plane, -1, 0), expected, atol=1e-4)
     records = read_record(colour_plane[0])["planes"]
     assert [record["channel"] for record in records] == ["red", "green", "blue"]
@@ -226,7 +225,7 @@ def test_joint_planes_begin_with_other_colours(
             begun.append({place: (pilot.solution.plane, pilot.other_colours) for place, pilot in pilots.items()})
         return found
 
-    monkeypatch.setattr(tasks, "solve_together", watched)
+    monkeypatch.setattr(sweep, "solve_together", watched)
     both = (*NEAR, "--depth-mm", 700, "--joint")
     done("reconstruct", colour_set, *both, *QUICK, *PATCHES, "--out", tmp_path)
     assert len(light) == len(begun) == 3
@@ -251,7 +250,7 @@ def test_interrupted_colour_plane_is_completed_alike(
             raise GeometryMismatch("made up; wait")
         return solve(*arguments)
 
-    monkeypatch.setattr(tasks, "solve", failing)
+    monkeypatch.setattr(sweep, "solve", failing)
     assert faintfield(*words).returncode == 1
     assert {path.suffix for path in (tmp_path / ".parts").iterdir()} == {".float32", ".json"}
     assert faintfield(*words).returncode == 0

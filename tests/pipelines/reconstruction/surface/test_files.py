@@ -15,7 +15,7 @@ from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.results.surface import SURFACE_FILE, surfaces_below
 from faintfield.pipelines.formats.results.verification import records_of, verify_results
-from faintfield.pipelines.reconstruction.depth.map_pictures import robust_limits
+from faintfield.pipelines.reconstruction.depth.depth_map import robust_limits
 from faintfield.pipelines.reconstruction.surface.files import write_surface
 from tests.pipelines.by_hand import write_by_hand
 from tests.pipelines.forms import flip_last_bit, read_record
