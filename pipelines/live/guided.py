@@ -23,8 +23,7 @@ from faintfield.rig.capture.survey import Survey, survey
 from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import CameraError, CaptureStopped
 from faintfield.rig.plan import CapturePlan
-from faintfield.rig.session.changes import adopt_settings, check_same_rig
-from faintfield.rig.session.resume import open_session
+from faintfield.rig.session.resume import adopt_settings, check_same_rig, open_session
 from faintfield.rig.session.session import FrozenPlan, has_session, is_sealed, read_plan
 from faintfield.rig.settings import RigSettings
 from faintfield.rig.stages.protocol import StageSettings

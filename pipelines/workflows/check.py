@@ -11,7 +11,7 @@ from faintfield.pipelines.formats.rig_file import read_rig, read_stage_settings,
 from faintfield.pipelines.live.guided import changed_settings, needed_bytes, survey_lines
 from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import open_rig
-from faintfield.rig.session.changes import check_same_rig, find_changes, present_settings
+from faintfield.rig.session.resume import check_same_rig, find_changes, present_settings
 from faintfield.rig.session.session import has_session, is_sealed, read_plan
 from faintfield.rig.settings import RigSettings
 

@@ -37,7 +37,7 @@ from faintfield.pipelines.reconstruction.surface.request import SURFACE_FOLDER, 
 from faintfield.pipelines.workflows.geometry import measure_stage
 from faintfield.pipelines.workflows.noise import measure_sensor
 from faintfield.pipelines.workflows.reconstruct import open_set, reconstruct_and_report, surface_and_report
-from faintfield.rig.session.changes import present_settings
+from faintfield.rig.session.resume import present_settings
 from faintfield.rig.session.session import PLAN, has_session, taken_frames
 
 # The calibrated session, and the folder of its results.

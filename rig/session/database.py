@@ -9,7 +9,7 @@ import os
 import sqlite3
 import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from functools import cache, partial
 from pathlib import Path
 
@@ -72,24 +72,13 @@ _REMEDIES = {
 
 
 def create_database(path: Path) -> None:
-    """Write an empty journal, whole or not at all.
-
-    Raises
-    ------
-    SessionCorrupt
-        There are remains of an earlier journal.
-    SessionUnwritable
-        It cannot be written.
-    """
+    """Write an empty journal, whole or not at all; raises `SessionCorrupt` if there are remains of an earlier one."""
     for remains in _companions(path):
         if os.path.lexists(remains):
             raise SessionCorrupt(f"{path}: is missing but {remains.name} is not; restore the journal from a copy")
-    empty = sqlite3.connect(":memory:")
-    try:
+    with closing(sqlite3.connect(":memory:")) as empty:
         empty.executescript(SCHEMAS[FORMAT])
         content = bytearray(empty.serialize())
-    finally:
-        empty.close()
     content[18:20] = _WAL_VERSIONS
     write_new(path, content)
 
@@ -97,12 +86,7 @@ def create_database(path: Path) -> None:
 def connect(path: Path, *, read_only: bool) -> sqlite3.Connection:
     """Open the database of a journal; `check_database` has to follow.
 
-    Raises
-    ------
-    SessionCorrupt
-        It is missing, not a file of its own, or larger than any journal.
-    SessionUnreadable, SessionUnwritable
-        The system does not let it be opened.
+    Raises `SessionCorrupt` if it is missing, not a file of its own, or larger than any journal.
     """
     wal, shared_memory, rollback = _companions(path)
     with translate_read_errors(path) if read_only else translate_errors(path):
@@ -113,8 +97,7 @@ def connect(path: Path, *, read_only: bool) -> sqlite3.Connection:
         # In WAL mode SQLite writes none, and what it reads there can make it delete any file
         if os.path.lexists(rollback):
             raise SessionCorrupt(f"{rollback}: is not written by a capture; move it away")
-        size = path.stat().st_size + (wal.stat().st_size if wal.exists() else 0)
-        if size > MAX_JOURNAL_BYTES:
+        if (size := _size(path)) > MAX_JOURNAL_BYTES:
             raise SessionCorrupt(f"{path}: holds {size} bytes, at most {MAX_JOURNAL_BYTES}; restore it from a copy")
         with path.open("rb") as opened:
             header = opened.read(20)
@@ -137,14 +120,9 @@ def connect(path: Path, *, read_only: bool) -> sqlite3.Connection:
 def check_database(db: sqlite3.Connection, path: Path) -> int:
     """Check the schema, the pages, the types and the references of a journal, and return its format.
 
-    Raises
-    ------
-    SessionCorrupt
-        A check failed.
+    Raises `SessionCorrupt` if a check fails.
     """
-    wal = _companions(path)[0]
-    size = path.stat().st_size + (wal.stat().st_size if wal.exists() else 0)
-    budget = iter(range(_STEPS // 1000 + _STEPS_PER_BYTE * size // 1000))
+    budget = iter(range(_STEPS // 1000 + _STEPS_PER_BYTE * _size(path) // 1000))
     db.set_progress_handler(lambda: next(budget, None) is None, 1000)
     try:
         db.execute("PRAGMA cell_size_check = ON")
@@ -192,15 +170,17 @@ def _companions(path: Path) -> tuple[Path, Path, Path]:
     return wal, index, rollback
 
 
+def _size(path: Path) -> int:
+    wal = _companions(path)[0]
+    return path.stat().st_size + (wal.stat().st_size if wal.exists() else 0)
+
+
 def _schema(db: sqlite3.Connection) -> list[tuple[str, ...]]:
     return db.execute("SELECT type, name, tbl_name, sql FROM sqlite_schema ORDER BY type, name").fetchmany(100)
 
 
 @cache
 def _schema_of(text: str) -> list[tuple[str, ...]]:
-    db = sqlite3.connect(":memory:")
-    try:
+    with closing(sqlite3.connect(":memory:")) as db:
         db.executescript(text)
         return _schema(db)
-    finally:
-        db.close()

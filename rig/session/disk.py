@@ -36,12 +36,7 @@ def write_new(path: Path, content: bytes | bytearray | memoryview) -> None:
     """Write `content` to a new file that survives a power cut.
 
     The bytes are written to `path` with the suffix `.part` and flushed; then the file is renamed and its folder is
-    flushed.
-
-    Raises
-    ------
-    SessionUnwritable
-        The file exists or cannot be written; no partial file is left behind.
+    flushed. Raises `SessionUnwritable` if the file exists or cannot be written; no partial file is left behind.
     """
     part = path.with_name(path.name + PART)
     with translate_errors(path):
@@ -89,12 +84,7 @@ def encode_exposure(exposure: Exposure) -> bytes | memoryview:
 def list_names(folder: Path) -> list[str]:
     """Return the names in a folder of a session, sorted; there are none before it is created.
 
-    Raises
-    ------
-    SessionCorrupt
-        It is no folder, or a link, which could lead out of the session.
-    SessionUnreadable
-        It cannot be listed.
+    Raises `SessionCorrupt` if it is no folder, or a link, and `SessionUnreadable` if it cannot be listed.
     """
     with translate_read_errors(folder):
         require_kind(folder, stat.S_ISDIR, "folder")
@@ -102,13 +92,7 @@ def list_names(folder: Path) -> list[str]:
 
 
 def require_kind(path: Path, is_kind: Callable[[int], bool], kind: str) -> None:
-    """Refuse a link, pipe, device, … where a session has a file or folder of its own; there may be nothing yet.
-
-    Raises
-    ------
-    SessionCorrupt
-        Something else is there.
-    """
+    """Raise `SessionCorrupt` for a link, pipe, … where a session has a file or folder of its own, or nothing yet."""
     try:
         mode = os.lstat(path).st_mode
     except FileNotFoundError:
@@ -121,14 +105,8 @@ def require_kind(path: Path, is_kind: Callable[[int], bool], kind: str) -> None:
 def lock_session(folder: Path, *, shared: bool = False) -> Iterator[None]:
     """Hold the lock on a session, exclusive or shared with other readers; it ends with the process at the latest.
 
-    Raises
-    ------
-    SessionBusy
-        Another capture holds the session.
-    SessionCorrupt
-        The lock is not a regular file.
-    SessionUnwritable, SessionUnreadable
-        It cannot be locked.
+    Raises `SessionBusy` if another capture holds it, `SessionCorrupt` if it is not a regular file, and
+    `SessionUnwritable` or, if shared, `SessionUnreadable` if it cannot be locked.
     """
     path = folder / "lock"
     translated = translate_read_errors if shared else translate_errors

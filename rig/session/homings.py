@@ -16,10 +16,7 @@ MIN_CHECKS = 6
 
 
 class Homed(Struct, frozen=True):
-    """Detail of an event `homed`: positions from exposure `first_intent` on may differ from those before.
-
-    Groups are numbered from 1 on.
-    """
+    """Detail of an event `homed`: a group, numbered from 1 on, begins with the exposure `first_intent`."""
 
     group: int
     first_intent: int
@@ -32,10 +29,7 @@ class DriftCheck(Struct, frozen=True):
 
 
 class HomingGroups(Struct, frozen=True):
-    """The homing groups of a session.
-
-    Within a group, positions repeat as well as the drive does; between groups they may differ by as much as the
-    switches do.
+    """The homing groups of a session; between groups, positions may differ by as much as the switches do.
 
     Parameters
     ----------
@@ -88,12 +82,6 @@ def homing_groups(journal: Journal) -> HomingGroups:
 
 
 def read_homing_groups(folder: Path) -> HomingGroups:
-    """Return the homing groups of the session in `folder`.
-
-    Raises
-    ------
-    SessionCorrupt
-        Plan or journal cannot be read.
-    """
+    """Return the homing groups of the session in `folder`; raises as `read_plan` and `Journal` do."""
     with open_journal(folder, read_plan(folder), read_only=True) as journal:
         return homing_groups(journal)

@@ -49,18 +49,8 @@ _MAX_PENDING_TRAFFIC = 2000
 class FrameRecord(Struct, frozen=True):
     """Entry of the journal about a frame, without its file.
 
-    Parameters
-    ----------
-    position_mm : Point
-        Position that the stage reported before the exposure.
-    exposure_s : float
-        Exposure time.
-    camera : dict
-        Metadata from the camera.
-    checks : dict of str to float
-        Measured values, see `rig.capture.checks.Findings`.
-    warnings : tuple of str
-        Warnings about the frame.
+    It has the position that the stage reported before the exposure, metadata from the camera, and the values and
+    warnings of `rig.capture.checks.Findings`.
     """
 
     position_mm: Point
@@ -79,20 +69,8 @@ class FrameRecord(Struct, frozen=True):
 class CommittedFrame(Struct, frozen=True):
     """A frame that was taken and is on disk.
 
-    Parameters
-    ----------
-    intent : int
-        Number of the exposure within the session.
-    frame : int
-        Index of the frame in the plan.
-    file : str
-        Name of the file within `frames/`.
-    sha256, bytes : str, int
-        Hash and size of the file.
-    record : FrameRecord
-        Position, camera metadata, checks.
-    void : str, optional
-        Why the frame is void; its file stays.
+    `intent` is the number of the exposure within the session, `frame` the index in the plan, `file` the name within
+    `frames/`, and `void` why the frame is void although its file stays.
     """
 
     intent: int
@@ -133,24 +111,12 @@ class Sealed(Struct, frozen=True):
 
 
 class Journal:
-    """An open journal, which is also the `TrafficLog` of the stage.
-
-    Parameters
-    ----------
-    path, create : Path, bool
-        The SQLite file, which is created if it is missing and `create` is set.
-    read_only : bool
-        Open without a lock and without writing, so that a write-protected medium can be read.
-
-    Attributes
-    ----------
-    format : int
-        Format of the journal.
+    """An open journal, which is also the `TrafficLog` of the stage; `read_only` opens it on a write-protected medium.
 
     Raises
     ------
     SessionCorrupt
-        The journal is missing, damaged or not what a capture wrote.
+        The journal is damaged, not what a capture wrote, or missing, unless it is to be created.
     SessionUnreadable, SessionUnwritable
         The system does not let it be opened.
     """
@@ -186,8 +152,7 @@ class Journal:
         """Write pending traffic, and close."""
         try:
             if self._traffic:
-                with self._transaction():
-                    pass
+                self._write_traffic()
         finally:
             self._db.close()
 
@@ -195,8 +160,11 @@ class Journal:
         """Record serial traffic, which reaches the disk with the next entry."""
         self._traffic.append((at_s, direction, data))
         if len(self._traffic) >= _MAX_PENDING_TRAFFIC:
-            with self._transaction():
-                pass
+            self._write_traffic()
+
+    def _write_traffic(self) -> None:
+        with self._transaction():
+            pass
 
     def event(self, kind: str, *, frame: int | None = None, **detail: object) -> None:
         """Record an event."""
@@ -234,10 +202,10 @@ class Journal:
                 CommittedFrame(intent, frame, file, sha256, size, msgspec.json.decode(record, type=FrameRecord), void)
                 for intent, frame, file, sha256, size, record, void in self._read(_CommittedRow, _COMMITTED)
             ]
-        for frame in frames:
-            if not is_plain_name(frame.file):
+        for name in (frame.file for frame in frames):
+            if not is_plain_name(name):
                 raise SessionCorrupt(
-                    f"{self.path}: {frame.file!r:.60} is no name of a frame; restore the journal from a copy"
+                    f"{self.path}: {name!r:.60} is no name of a frame; restore the journal from a copy"
                 )
         return frames
 

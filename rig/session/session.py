@@ -21,7 +21,6 @@ from faintfield.rig.settings import RigSettings
 
 PLAN, JOURNAL, FRAMES, SUMS, ASIDE = "plan.json", "journal.sqlite", "frames", "SHA256SUMS", "set_aside"
 
-
 # Size in bytes of the plan of MAX_FRAMES stops, and more.
 _MAX_PLAN_BYTES = 32_000_000
 
@@ -52,8 +51,6 @@ class Session:
 
     Attributes
     ----------
-    folder, frozen, journal : Path, FrozenPlan, Journal
-        Folder of the session, content of its plan.json, and its open journal.
     frames : tuple of PlannedFrame
         All frames of the plan, in order.
     rig : RigSettings
@@ -106,7 +103,7 @@ class Session:
         if not is_plain_name(name):
             raise SessionUnwritable(f"{exposure.suffix!r:.60} is no suffix of a file; correct what the camera gives")
         path = self.folder / FRAMES / name
-        # Hash the bytes in memory, while they are written: `verify` then finds errors of the disk.
+        # Hash the bytes in memory, while they are written: `verify` then finds errors of the disk
         with ThreadPoolExecutor(1) as hashing:
             digest = hashing.submit(hashlib.sha256, content)
             write_new(path, content)
@@ -157,12 +154,7 @@ def is_sealed(folder: Path) -> bool:
 def read_plan(folder: Path) -> FrozenPlan:
     """Read the plan of the session in `folder`.
 
-    Raises
-    ------
-    SessionCorrupt
-        The plan is missing or is none.
-    SessionUnreadable
-        The system does not let it be read.
+    Raises `SessionCorrupt` if it is missing or none, `SessionUnreadable` if the system does not let it be read.
     """
     return read_plan_and_hash(folder)[0]
 
@@ -200,13 +192,7 @@ def find_wild_number(content: object, place: str = "plan") -> str | None:
 
 
 def open_journal(folder: Path, frozen: FrozenPlan, *, create: bool = False, read_only: bool = False) -> Journal:
-    """Open the journal of the session in `folder`, which has to be of the format of its plan.
-
-    Raises
-    ------
-    SessionCorrupt, SessionUnreadable, SessionUnwritable
-        See `Journal`.
-    """
+    """Open the journal of the session in `folder`, which has to be of the format of its plan; raises as `Journal`."""
     journal = Journal(folder / JOURNAL, create=create, read_only=read_only)
     if journal.format != frozen.format:
         journal.close()
@@ -238,13 +224,7 @@ def exposure_name(frame: PlannedFrame, intent: int) -> str:
 def valid_frames(
     folder: Path, frames: Sequence[PlannedFrame], committed: Iterable[CommittedFrame]
 ) -> dict[int, CommittedFrame]:
-    """Return the valid frames by their index in the plan.
-
-    Raises
-    ------
-    SessionCorrupt
-        An entry of the journal disagrees with the plan.
-    """
+    """Return the valid frames by their index in the plan; raises `SessionCorrupt` if an entry disagrees with it."""
     entries = list(committed)
     for problem in disagreements(frames, entries):
         raise SessionCorrupt(f"{folder / JOURNAL}: {problem}; restore the journal from a copy")
@@ -259,18 +239,12 @@ def has_session(folder: Path) -> bool:
 def taken_frames(folder: Path) -> list[tuple[PlannedFrame, CommittedFrame, Path]]:
     """Return the valid frames of a session in the order of the plan, each with its journal entry and its file.
 
-    Raises
-    ------
-    SessionCorrupt
-        Plan or journal cannot be read.
+    Raises `SessionCorrupt` or `SessionUnreadable` if plan or journal cannot be read.
     """
     frozen = read_plan(folder)
     frames = planned_frames(frozen.plan)
     with open_journal(folder, frozen, read_only=True) as journal:
         valid = valid_frames(folder, frames, journal.committed())
     list_names(folder / FRAMES)  # refuses a link that leads elsewhere
-    return [
-        (frame, valid[frame.number], folder / FRAMES / valid[frame.number].file)
-        for frame in frames
-        if frame.number in valid
-    ]
+    present = [(frame, valid[frame.number]) for frame in frames if frame.number in valid]
+    return [(frame, committed, folder / FRAMES / committed.file) for frame, committed in present]

@@ -40,14 +40,11 @@ class Verdict(Struct, frozen=True):
     interrupted : tuple of str
         Files in `frames/` of exposures that were cut short. This is ordinary: the next capture sets them aside and
         takes their frames.
-    planned, present : int
-        Number of frames in the plan, and of those whose file is present and unchanged.
-    missing : tuple of str
-        Names of the frames still to be taken, without those left out on purpose.
-    left_out : tuple of str
-        Names of the frames that the operator left out.
-    superseded : int
-        Number of files replaced by a later take of the same frame.
+    planned, present, superseded : int
+        Number of frames in the plan, of those whose file is present and unchanged, and of files replaced by a later
+        take of the same frame.
+    missing, left_out : tuple of str
+        Names of the frames still to be taken, and of those that the operator left out.
     suspect : tuple of str
         Names of frames that were kept although the next check of the stage failed, or the stage was homed before it.
     sealed : bool
@@ -68,14 +65,8 @@ class Verdict(Struct, frozen=True):
 def verify(folder: Path, progress: Callable[[Iterable[Path]], Iterable[Path]] = iter) -> Verdict:
     """Verify the session in `folder`; `progress` wraps the iteration over the files that are read, to draw a bar.
 
-    Raises
-    ------
-    SessionBusy
-        A capture is under way.
-    SessionCorrupt
-        Plan or journal are missing, damaged or not what a capture wrote.
-    SessionUnreadable
-        The system does not let the lock, the plan, the journal or the folder of the frames be read.
+    Raises `SessionBusy` if a capture is under way, `SessionCorrupt` if plan or journal are missing, damaged or not what
+    a capture wrote, and `SessionUnreadable` if the system does not let lock, plan, journal or frames be read.
     """
     with lock_session(folder, shared=True) if os.path.lexists(folder / "lock") else nullcontext():
         frozen, plan_sha256 = read_plan_and_hash(folder)

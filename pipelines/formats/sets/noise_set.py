@@ -16,7 +16,7 @@ from faintfield.pipelines.formats.reading import is_file
 from faintfield.pipelines.formats.results.noise import NoiseFrame, TemperatureRange
 from faintfield.pipelines.formats.toml_files import inside, read_toml, write_toml
 from faintfield.pipelines.formats.units import MAX_EXPOSURE_S, MAX_PERIOD_PX, sound_mosaic
-from faintfield.rig.session.changes import present_settings
+from faintfield.rig.session.resume import present_settings
 from faintfield.rig.session.session import PLAN, has_session, taken_frames
 
 FILE_NAME = "noise.toml"

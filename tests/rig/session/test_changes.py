@@ -9,8 +9,7 @@ import pytest
 from faintfield.rig.cameras.settings import FolderSettings, GPhoto2Settings, SimulatedSettings
 from faintfield.rig.errors import PlanRefused
 from faintfield.rig.plan import CapturePlan
-from faintfield.rig.session.changes import adopt_settings, check_same_rig, find_changes, present_settings
-from faintfield.rig.session.resume import open_session
+from faintfield.rig.session.resume import adopt_settings, check_same_rig, find_changes, open_session, present_settings
 from faintfield.rig.session.session import FrozenPlan, taken_frames
 from faintfield.rig.session.verify import verify
 from faintfield.rig.settings import CheckSettings, RigSettings
