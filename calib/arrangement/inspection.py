@@ -6,19 +6,19 @@ from typing import Literal
 
 import numpy as np
 
-from faintfield.calib.arrangement.axes import SURE, Axes, find_axes
 from faintfield.calib.arrangement.matching import (
     MIN_BLOCKS,
+    SURE,
+    Axes,
     Correlations,
     block_disparities,
     correlate,
     disparity_range,
+    find_axes,
 )
-from faintfield.calib.arrangement.neighbours import NeighbourFits, compare_neighbours
-from faintfield.calib.arrangement.nodes import Node, Orientation, central_nodes, neighbour_counts
+from faintfield.calib.arrangement.neighbours import NeighbourFits, OrderTest, check_order, compare_neighbours
 from faintfield.calib.arrangement.occlusion import far_side_z
-from faintfield.calib.arrangement.order import OrderTest, check_order
-from faintfield.calib.arrangement.pictures import GridPictures
+from faintfield.calib.arrangement.views import GridPictures, Node, Orientation, central_nodes, neighbour_counts
 
 # Smallest side of pictures that can be matched, px.
 MIN_SIDE_PX = 32
@@ -58,9 +58,8 @@ class GridInspection:
     orientation : Orientation
         Row and column from the numbers, x to the right and y down.
     failure : {"small", "single", "even", "apart", "dark"}, optional
-        The reason why the views do not show one scene beyond doubt, and nothing else is known: the pictures are too
-        small to be compared; there is one only; all pixels of each are alike; no picture has a neighbour; or nothing in
-        common rises above noise.
+        The reason why the views do not show one scene beyond doubt, and nothing else is known: too small pictures; only
+        one; all pixels of each alike; no neighbours; or nothing in common above noise.
     axes : Axes
         Significance of the match and the axes, and the mean correlation of blocks.
     side_z : float
@@ -131,7 +130,7 @@ def inspect_grid(
     coarse, coarse_axes = _match_coarsely(nodes, pictures)
     if coarse_axes.match_z < SURE:
         return GridInspection(prescribed or Orientation(), "dark", axes=coarse_axes)
-    coarse_px = max(map(abs, _range(coarse, coarse_axes) or (0.0, 0.0))) + 1.0
+    coarse_px = max(map(abs, disparity_range(coarse, coarse_axes) or (0.0, 0.0))) + 1.0
     fine_px = coarse_px * pictures.coarse_scale / pictures.fine_scale
     fine, distance = _match_finely(nodes, pictures, fine_px)
     axes = max(find_axes(fine), coarse_axes, key=lambda axes: axes.certainty)
@@ -142,31 +141,22 @@ def inspect_grid(
     no_sign_px = _NO_SIGN_PX / pictures.fine_scale
     arranged = Axes(orientation.transpose, orientation.opposed)
     ratio = pitch_ratio(fine, replace(arranged, ratio=axes.ratio), no_sign_px)
-    least_px, largest_px = _range(fine, replace(arranged, ratio=ratio)) or (-fine_px, fine_px)
+    least_px, largest_px = disparity_range(fine, replace(arranged, ratio=ratio)) or (-fine_px, fine_px)
     if orientation.flip_rows if orientation.transpose else orientation.flip_columns:
         least_px, largest_px = -largest_px, -least_px
     step_px = _STEP_PX / distance
     views = dict(zip(orientation.apply(nodes), pictures.brightness, strict=True))
-    side_z = far_side_z(
-        views,
-        central_nodes(list(views), _EDGE_VIEWS, distance),
-        np.arange(least_px - step_px, largest_px + 1.5 * step_px, step_px),
-        distance=distance,
-        ratio=ratio,
-    )
+    edge_nodes = central_nodes(list(views), _EDGE_VIEWS, distance)
+    shifts_px = np.arange(least_px - step_px, largest_px + 1.5 * step_px, step_px)
+    side_z = far_side_z(views, edge_nodes, shifts_px, distance=distance, ratio=ratio)
     turn, direction, undecided = _direction(opposed, side_z, (least_px, largest_px), no_sign_px)
     if prescribed is not None:
         turn, direction, undecided = False, "names", False
-    if turn:
+    elif turn:
         orientation, side_z, least_px, largest_px = orientation.turned(), -side_z, -largest_px, -least_px
-    fits = compare_neighbours(
-        dict(zip(orientation.apply(nodes), pictures.fine, strict=True)), (least_px, largest_px), ratio
-    )
-    fitting = {
-        node: picture
-        for index, (node, picture) in enumerate(zip(nodes, pictures.coarse, strict=True))
-        if index not in fits.odd
-    }
+    arranged_views = dict(zip(orientation.apply(nodes), pictures.fine, strict=True))
+    fits = compare_neighbours(arranged_views, (least_px, largest_px), ratio)
+    fitting = {nodes[index]: pictures.coarse[index] for index in range(len(nodes)) if index not in fits.odd}
     return GridInspection(
         orientation,
         axes=axes,
@@ -182,7 +172,6 @@ def inspect_grid(
 
 
 def _failure_at_sight(nodes: Sequence[Node], pictures: GridPictures) -> Failure | None:
-    """Return why pictures cannot be compared, None if they can."""
     if len(nodes) < 2:
         return "single"
     if not any(np.ptp(picture) for picture in pictures.brightness):
@@ -193,7 +182,6 @@ def _failure_at_sight(nodes: Sequence[Node], pictures: GridPictures) -> Failure 
 
 
 def _contradict(prescribed: Orientation, axes: Axes, side_z: float) -> bool:
-    """Return whether the pictures deny a prescribed orientation."""
     return (
         side_z < -_MIN_SIDE_Z
         or (axes.transposed_z > SURE and axes.transposed != prescribed.transpose)
@@ -226,13 +214,6 @@ def _match_finely(nodes: Sequence[Node], pictures: GridPictures, largest_px: flo
     views = dict(zip(nodes, pictures.fine, strict=True))
     chosen = central_nodes(nodes, _FEW, distance, fill=False)
     return correlate(views, chosen, shifts_px, distance), distance
-
-
-def _range(correlations: Correlations, axes: Axes) -> tuple[float, float] | None:
-    """Return the range of disparities along both numbers together."""
-    shifts_px = correlations.shifts_px
-    along, chance = (axes.combine(tables, shifts_px) for tables in (correlations.along, correlations.chance))
-    return disparity_range(along, chance, shifts_px)
 
 
 def pitch_ratio(correlations: Correlations, axes: Axes, no_sign_px: float) -> float:

@@ -1,8 +1,10 @@
-"""Neighbouring views compared in pairs: turns, scales and shifts between views, and views that fit no neighbour."""
+"""Neighbouring views compared: turns, shifts, views that fit no neighbour, and a test of the order of names."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from functools import cache
+from itertools import product
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -10,9 +12,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from faintfield.calib.arrangement.matching import parabola_peak
-from faintfield.calib.arrangement.nodes import Node, neighbour
-from faintfield.calib.arrangement.pictures import Picture
+from faintfield.calib.arrangement.matching import Array, Axes, Table, correlate_blocks, parabola_peak
+from faintfield.calib.arrangement.views import Node, Picture, neighbour, spread
 
 # Side of a matched block, blocks along the longer side of a picture, and the search across the expected movement, px.
 _BLOCK_PX, _BLOCKS, _ACROSS_PX = 28, 7, 5
@@ -28,6 +29,21 @@ _CHANCE_BLOCKS = 8
 
 # Rounds of reweighting, in which pairs and blocks that disagree lose their weight.
 _ROUNDS = 8
+
+# Views whose order is tested, other pictures that may take the places of their neighbours, and exchanges that are
+# tried; their seed, so that a set always gets the same answer.
+_VIEWS, _OTHERS, _EXCHANGES, _SEED = 9, 12, 40, 0
+
+# Scores of both halves of the blocks must agree by this correlation, in so many standard errors: then pictures, not
+# noise, make them differ.
+_MIN_REPEATABILITY, _MIN_REPEATABILITY_Z = 0.6, 3.0
+
+# Share of the exchanges that must make the match worse, over that correlation: in light fields nearly all do unless
+# noise decides, in random order half of them.
+_WORSE_SHARE = 0.85
+
+# Exchanges that differ which that correlation needs: four views in a square have too few.
+_LEAST = 10
 
 
 @dataclass(frozen=True)
@@ -45,9 +61,9 @@ class NeighbourFits:
     """
 
     odd: list[int] = field(default_factory=list)
-    turn_rad: NDArray[np.float64] = field(default_factory=lambda: np.zeros(1))
-    magnification: NDArray[np.float64] = field(default_factory=lambda: np.ones(1))
-    shift_px: NDArray[np.float64] = field(default_factory=lambda: np.zeros((1, 2)))
+    turn_rad: Array = field(default_factory=lambda: np.zeros(1))
+    magnification: Array = field(default_factory=lambda: np.ones(1))
+    shift_px: Array = field(default_factory=lambda: np.zeros((1, 2)))
 
     @property
     def shift_rms_px(self) -> float:
@@ -82,20 +98,17 @@ def compare_neighbours(pictures: Mapping[Node, Picture], range_px: tuple[float, 
     """
     places = {node: index for index, node in enumerate(pictures)}
     pairs = []
-    for node, view in pictures.items():
-        for axis, unit in ((0, 1.0), (1, 1.0 / ratio)):
-            for steps in range(1, _MOST_STEPS + 1):
-                other = neighbour(node, 1 - axis, steps)
-                if other in pictures:
-                    limits_px = steps * unit * range_px[0], steps * unit * range_px[1]
-                    fit = compare_pair(view, pictures[other], axis, limits_px)
-                    pairs += [(places[node], places[other], axis, *fit)] if fit is not None else []
-                    break
+    for node, (axis, unit) in product(pictures, ((0, 1.0), (1, 1.0 / ratio))):
+        ahead = ((steps, neighbour(node, 1 - axis, steps)) for steps in range(1, _MOST_STEPS + 1))
+        steps, other = next((pair for pair in ahead if pair[1] in pictures), (0, node))
+        limits_px = steps * unit * range_px[0], steps * unit * range_px[1]
+        if steps and (fit := compare_pair(pictures[node], pictures[other], axis, limits_px)) is not None:
+            pairs.append((places[node], places[other], axis, *fit))
     table = np.array(pairs).reshape(-1, 3 + len(PairFit._fields))
     good, odd = _find_odd(len(pictures), table)
     _, _, axes, _, _, offset_px, turn_rad, magnification = table.T
 
-    def per_view(values: NDArray[np.float64], chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
+    def per_view(values: Array, chosen: NDArray[np.bool_]) -> Array:
         """Return a value (view,) for each view from the differences of pairs; the median is zero."""
         first, second = table[chosen, :2].astype(int).T
         views = np.arange(len(pictures))
@@ -116,25 +129,24 @@ def compare_pair(view: Picture, other: Picture, axis: int, range_px: tuple[float
     turned = np.ascontiguousarray(other[::-1, ::-1])
     matches: list[tuple[float, float, float, float]] = []
     chance: list[float] = []
-    height, width = view.shape
     step = max((max(view.shape) - _BLOCK_PX) // _BLOCKS, _BLOCK_PX // 2)
-    for top in range((height - _BLOCK_PX) % step // 2, height - _BLOCK_PX + 1, step):
-        for left in range((width - _BLOCK_PX) % step // 2, width - _BLOCK_PX + 1, step):
-            block = view[top : top + _BLOCK_PX, left : left + _BLOCK_PX]
-            rows = slice(max(top - _ACROSS_PX, 0), top + _BLOCK_PX + _ACROSS_PX)
-            columns = slice(max(left + least, 0), max(left + _BLOCK_PX + largest, 0))
-            searched = other[rows, columns]
-            if block.std() < 1e-3 or min(searched.shape) < _BLOCK_PX:
-                continue
-            if len(matches) % _CHANCE_BLOCKS == 0:
-                chance.append(float(cv2.matchTemplate(turned[rows, columns], block, cv2.TM_CCOEFF_NORMED).max()))
-            response = cv2.matchTemplate(searched, block, cv2.TM_CCOEFF_NORMED)
-            row, column = np.unravel_index(int(np.argmax(response)), response.shape)
-            offset = float(rows.start - top + row)
-            if 0 < row < len(response) - 1:
-                offset += float(parabola_peak(*response[row - 1 : row + 2, column]))
-            centre = left + (_BLOCK_PX - width) / 2, top + (_BLOCK_PX - height) / 2
-            matches.append((float(response[row, column]), offset, *centre))
+    corners = [range((side - _BLOCK_PX) % step // 2, side - _BLOCK_PX + 1, step) for side in view.shape]
+    for top, left in product(*corners):
+        block = view[top : top + _BLOCK_PX, left : left + _BLOCK_PX]
+        rows = slice(max(top - _ACROSS_PX, 0), top + _BLOCK_PX + _ACROSS_PX)
+        columns = slice(max(left + least, 0), max(left + _BLOCK_PX + largest, 0))
+        searched = other[rows, columns]
+        if block.std() < 1e-3 or min(searched.shape) < _BLOCK_PX:
+            continue
+        if len(matches) % _CHANCE_BLOCKS == 0:
+            chance.append(float(cv2.matchTemplate(turned[rows, columns], block, cv2.TM_CCOEFF_NORMED).max()))
+        response = cv2.matchTemplate(searched, block, cv2.TM_CCOEFF_NORMED)
+        row, column = np.unravel_index(int(np.argmax(response)), response.shape)
+        offset = float(rows.start - top + row)
+        if 0 < row < len(response) - 1:
+            offset += float(parabola_peak(*response[row - 1 : row + 2, column]))
+        centre = left + (_BLOCK_PX - view.shape[1]) / 2, top + (_BLOCK_PX - view.shape[0]) / 2
+        matches.append((float(response[row, column]), offset, *centre))
     if len(matches) < 3:
         return None
     score, offset_px, along_px, across_px = np.array(matches).T
@@ -144,9 +156,7 @@ def compare_pair(view: Picture, other: Picture, axis: int, range_px: tuple[float
     return PairFit(float(np.median(score)), float(np.median(chance)), constant, turn, magnification)
 
 
-def _fit_robustly(
-    design: NDArray[np.float64], value: NDArray[np.float64], weight: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _fit_robustly(design: Array, value: Array, weight: Array) -> Array:
     """Return the least absolute deviations solution, by reweighted least squares; of least norm where free."""
     weights = weight
     solution = np.zeros(design.shape[1])
@@ -162,7 +172,7 @@ def _fit_robustly(
     return solution
 
 
-def _find_odd(count: int, pairs: NDArray[np.float64]) -> tuple[NDArray[np.bool_], list[int]]:
+def _find_odd(count: int, pairs: Array) -> tuple[NDArray[np.bool_], list[int]]:
     """Return a mask of the pairs that fit, and the views that are not linked with most others by such pairs."""
     good, odd = np.zeros(len(pairs), bool), list[int]()
     ends, score, chance = pairs[:, :2].astype(int), pairs[:, 3], pairs[:, 4]
@@ -174,3 +184,109 @@ def _find_odd(count: int, pairs: NDArray[np.float64]) -> tuple[NDArray[np.bool_]
         odd = [int(view) for view in np.unique(ends) if part[view] != largest]
         good &= part[ends[:, 0]] == largest
     return good, odd
+
+
+@dataclass(frozen=True)
+class OrderTest:
+    """Test of the names by exchanging neighbours for other pictures.
+
+    Attributes
+    ----------
+    verdict : {"fits", "denied", "open", "few"}
+        The neighbours fit better than others; no better, although pictures differ in how they fit; all pictures fit
+        equally well, as copies and too dark ones do; there are too few to exchange any.
+    share : float
+        Share of the exchanges that make the match worse, along the number for which it is least.
+    """
+
+    verdict: Literal["fits", "denied", "open", "few"] = "open"
+    share: float = 1.0
+
+
+def check_order(pictures: Mapping[Node, Picture], axes: Axes, largest_px: float) -> OrderTest:
+    """Exchange the neighbours of views for other pictures, along each number by itself.
+
+    In a light field the blocks of a view are found in all its neighbours at one disparity, and in no other pictures
+    that take their places. Copies fit in every place; pictures in random order fit as badly in their own.
+
+    Parameters
+    ----------
+    pictures : mapping of node to array (row, column)
+        Coarse pictures by the numbers of their names, without their brightness.
+    axes : Axes
+        Movement of points along both numbers.
+    largest_px : float
+        Largest disparity.
+    """
+    generator = np.random.default_rng(_SEED)
+    reach = int(np.ceil(largest_px))
+    shifts_px = np.arange(-reach, reach + 1.0)
+    trials = [
+        trial
+        for node in spread(list(pictures), _VIEWS)
+        for trial in _exchange(pictures, node, axes, shifts_px, generator)
+    ]
+    shares, verdict = [], OrderTest("few")
+    for number in (0, 1):
+        worse = [np.mean(scores.sum(axis=1) < own) for along, own, scores in trials if along == number]
+        deviations = [scores - scores.mean(axis=0) for along, _, scores in trials if along == number]
+        free = sum(len(scores) - 1 for scores in deviations)
+        if free >= _LEAST:
+            verdict = OrderTest("open")
+            repeats = _repeatability(np.concatenate(deviations), free)
+            shares += [(float(np.mean(worse)), repeats)] if repeats else []
+    if not shares:
+        return verdict
+    fits = all(share > _WORSE_SHARE * repeats for share, repeats in shares)
+    return OrderTest("fits" if fits else "denied", min(share for share, _ in shares))
+
+
+def _repeatability(deviations: Array, free: int) -> float:
+    """Return the correlation of the scores (exchange, half) of both halves of the blocks, 0 if it may be chance."""
+    first, second = deviations.T
+    power = float(np.sqrt((first**2).sum() * (second**2).sum()))
+    correlation = min(float((first * second).sum()) / power, 1 - 1e-9) if power else 0.0
+    sure = correlation > _MIN_REPEATABILITY and np.arctanh(correlation) * np.sqrt(free - 1) > _MIN_REPEATABILITY_Z
+    return correlation if sure else 0.0
+
+
+def _exchange(
+    pictures: Mapping[Node, Picture], node: Node, axes: Axes, shifts_px: Array, generator: np.random.Generator
+) -> Iterator[tuple[int, float, Array]]:
+    """Exchange the neighbours of a view along each number for other pictures.
+
+    Yield the number, the score of the neighbours, and the scores (exchange, half) of other pictures in their places:
+    mean correlations of blocks at their best disparity, for both halves of the blocks.
+    """
+
+    @cache
+    def table(other: Node, axis: int, unit: float) -> Table:
+        return correlate_blocks(pictures[node], pictures[other], unit * shifts_px, axis)
+
+    def score(chosen: Mapping[tuple[int, int], Node]) -> Array:
+        tables = []
+        for (number, sign), other in chosen.items():
+            axis, scale = axes.movement(number)
+            tables.append(table(other, axis, abs(scale))[:, :: 1 if sign * scale > 0 else -1])
+        best = np.mean(tables, axis=0).max(axis=1)
+        return np.array([best[::2].mean(), best[1::2].mean()], np.float64)
+
+    sides = {(number, sign): neighbour(node, number, sign) for number in (0, 1) for sign in (-1, 1)}
+    named = {place: other for place, other in sides.items() if other in pictures}
+    # A block is found anywhere in a single picture
+    if len(named) < 2:
+        return
+    others = [other for other in pictures if other != node and other not in named.values()]
+    pool = [*named.values(), *(others[index] for index in generator.permutation(len(others))[:_OTHERS])]
+    own = float(score(named).sum())
+    for number in (0, 1):
+        places = [place for place in named if place[0] == number]
+        draws = {
+            tuple(pool[index] for index in generator.permutation(len(pool))[: len(places)]): None
+            for _ in range(_EXCHANGES if places else 0)
+        }
+        # Neighbours exchanged for one another are the mirrored order
+        own_places = {named[place] for place in places}
+        scores = [score(named | dict(zip(places, draw, strict=True))) for draw in draws if set(draw) != own_places]
+        if scores:
+            yield number, own, np.array(scores)

@@ -12,9 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.calib.arrangement.matching import displace
-from faintfield.calib.arrangement.nodes import Node, neighbour
-from faintfield.calib.arrangement.pictures import Picture
+from faintfield.calib.arrangement.matching import Array, Floats, displace
+from faintfield.calib.arrangement.views import Node, Picture, neighbour
 
 # Half of the window in px in which an edge is looked for, and on either side of which disparities are compared.
 _REACH_PX = 7
@@ -38,16 +37,9 @@ type Errors = NDArray[np.float32]
 
 
 def far_side_z(
-    pictures: Mapping[Node, Picture],
-    nodes: Sequence[Node],
-    shifts_px: NDArray[np.floating],
-    *,
-    distance: int,
-    ratio: float,
+    pictures: Mapping[Node, Picture], nodes: Sequence[Node], shifts_px: Floats, *, distance: int, ratio: float
 ) -> float:
-    """Test which sign of disparity is far.
-
-    Return the standard errors by which what is hidden lies where the disparity is larger, negative where it is smaller.
+    """Return the standard errors by which what is hidden lies where the disparity is larger, negative if smaller.
 
     Parameters
     ----------
@@ -88,7 +80,7 @@ def far_side_z(
     return float(samples.mean() / samples.std(ddof=1) * np.sqrt(len(samples)))
 
 
-def _errors(view: Picture, other: Picture, shifts_px: NDArray[np.floating], axis: int) -> Errors:
+def _errors(view: Picture, other: Picture, shifts_px: Floats, axis: int) -> Errors:
     """Return the errors (shift, row, column) of another view, displaced along an axis."""
     return np.stack([np.minimum(np.abs(view - displace(other, shift, axis)), _LARGEST_ERROR) for shift in shifts_px])
 
@@ -104,9 +96,7 @@ def _blur(errors: Errors, width: int, height: int) -> Errors:
     return np.stack([cv2.blur(layer, (width, height)) for layer in np.ascontiguousarray(errors)])
 
 
-def _edges(
-    before: Errors, after: Errors, index: NDArray[np.intp], shifts_px: NDArray[np.floating]
-) -> NDArray[np.float64]:
+def _edges(before: Errors, after: Errors, index: NDArray[np.intp], shifts_px: Floats) -> Array:
     """Return row, column, value and weight (edge, 4) of the edges along the rows of a picture.
 
     The value is by how much more is hidden on the side of larger disparity. The weight is how clearly there is an edge:

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintfield.calib.errors import MissingMrcal
 from faintfield.calib.geometry.initialization import initialize
 from faintfield.calib.geometry.observations import Observations
-from faintfield.calib.mrcal_loader import load_mrcal
 
 LENS_MODELS = {"pinhole": "LENSMODEL_PINHOLE", **{f"opencv{n}": f"LENSMODEL_OPENCV{n}" for n in (4, 5, 8)}}
 
@@ -20,6 +20,18 @@ LENS_MODELS = {"pinhole": "LENSMODEL_PINHOLE", **{f"opencv{n}": f"LENSMODEL_OPEN
 # the largest entry of a step, in mrcal's scaled state, that ends them.
 _MAX_POLISHING_STEPS = 5
 _POLISHING_TOLERANCE = 1e-11
+
+
+def load_mrcal() -> Any:
+    """Return the module mrcal, which takes half a second to load and is not always installed (MissingMrcal)."""
+    try:
+        import mrcal
+    except ImportError as failure:
+        raise MissingMrcal(
+            f"mrcal cannot be imported ({failure}), and geometry and camera models need it; "
+            "run: pip install --no-deps mrcal numpysane"
+        ) from failure
+    return mrcal
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from faintfield.calib.errors import NotIdentifiable
-from faintfield.calib.geometry.bundle import Bundle
+from faintfield.calib.geometry.bundle import Bundle, load_mrcal
 from faintfield.calib.geometry.observations import Observations
 from faintfield.calib.geometry.rig_geometry import Repeatability
-from faintfield.calib.mrcal_loader import load_mrcal
 
 # Eigenvalues of K below this multiple of the largest are left out: the fit absorbs those directions of the gantry's
 # errors, so that the residuals contain nothing of them.

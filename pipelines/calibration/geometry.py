@@ -20,9 +20,9 @@ from faintfield.calib.geometry import (
     rms_over_views,
     transfer_sigma_at,
 )
+from faintfield.calib.geometry.bundle import load_mrcal
 from faintfield.calib.geometry.homings import HomingShift
 from faintfield.calib.geometry.stage import StageReport, approach_directions, stage_report
-from faintfield.calib.mrcal_loader import load_mrcal
 from faintfield.calib.noise.strips import read_ahead, usable_cores
 from faintfield.pipelines.console import inform, progress, working
 from faintfield.pipelines.formats.exchange.mrcal import camera_model_text

@@ -4,12 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from faintfield.calib.arrangement.axes import Axes
 from faintfield.calib.arrangement.inspection import GridInspection, inspect_grid, pitch_ratio
-from faintfield.calib.arrangement.matching import Correlations
+from faintfield.calib.arrangement.matching import Axes, Correlations
 from faintfield.calib.arrangement.neighbours import compare_pair
-from faintfield.calib.arrangement.nodes import Orientation
-from faintfield.calib.arrangement.pictures import prepare_pictures
+from faintfield.calib.arrangement.views import Orientation, prepare_pictures
 from tests.calib.light_fields import CARDS, Layer, Views, light_field, with_noise
 
 # Added to all disparities: some cards then move with the camera, others against it; or all with it.

@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from faintfield.calib.arrangement.axes import SURE
 from faintfield.calib.arrangement.inspection import MIN_SIDE_PX, GridInspection, inspect_grid
-from faintfield.calib.arrangement.nodes import Node, Orientation
-from faintfield.calib.arrangement.pictures import prepare_pictures
+from faintfield.calib.arrangement.matching import SURE
+from faintfield.calib.arrangement.views import Node, Orientation, prepare_pictures
 from faintfield.pipelines.console import console, inform, visible
 from faintfield.pipelines.errors import AmbiguousOrder, CameraTurned, CopiedPicture, NotOneScene, ShuffledPictures
 from faintfield.pipelines.formats.exchange.image_grid import ImageGrid

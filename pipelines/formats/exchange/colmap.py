@@ -6,6 +6,7 @@ are this project's. Poses are `x_cam = R(q) x_world + t` with q = (w, x, y, z), 
 
 import io
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -21,14 +22,12 @@ from faintfield.pipelines.formats.exchange.imported_set import (
     ImportedSet,
     PosedImage,
     PosedModel,
+    export_posed,
     import_posed,
-    lens_of_each_view,
 )
 from faintfield.pipelines.formats.exchange.options import ImportOptions
-from faintfield.pipelines.formats.files import write_whole, writing_folder
+from faintfield.pipelines.formats.files import write_whole
 from faintfield.pipelines.formats.reading import is_file, read_content
-from faintfield.pipelines.formats.sets.session_set import load_set_or_session
-from faintfield.pipelines.formats.sets.stated import stated_length
 from faintfield.pipelines.formats.toml_files import inside
 
 # Name and number of parameters of a camera model, by COLMAP's number.
@@ -94,34 +93,23 @@ def read_model(folder: Path) -> ColmapModel:
 
 def import_model(src: Path, out: Path, options: ImportOptions) -> ImportedSet:
     """Make an elemental set of a model and its images."""
-    return import_posed(out, read_posed_images(src, options.images or src), options, "import colmap")
+    model, files, folder = read_model(src), list(model_files(src)), options.images or src
+    images = [
+        PosedImage(inside(folder, image.name, f"{files[1]}: name"), model.lenses[image.camera], image.rt_cam_world)
+        for image in model.images
+    ]
+    return import_posed(out, PosedModel(files, images), options, "import colmap")
 
 
 def export_model(set_path: Path, out: Path, *, binary: bool, overwrite: bool) -> ExportedSet:
     """Write the lens and poses of a set or session as a model without points."""
-    elemental_set = load_set_or_session(set_path)
-    lenses = lens_of_each_view(elemental_set)
-    cameras = {lens: number for number, lens in enumerate(dict.fromkeys(lenses), start=1)}
-    views = zip(elemental_set.settings.view, lenses, elemental_set.poses_rt_cam_ref, strict=True)
-    model = ColmapModel(
-        {number: lens for lens, number in cameras.items()},
-        [ColmapImage(view.image, cameras[lens], pose) for view, lens, pose in views],
-    )
-    unit = stated_length(elemental_set, "mm")
-    with writing_folder(out, replace_only=MODEL_FILES if overwrite else ()) as folder:
-        write_model(folder, model, binary=binary)
-    return ExportedSet(str(out), len(model.images), unit)
 
+    def write(folder: Path, views: list[PosedImage]) -> None:
+        cameras = {lens: number for number, lens in enumerate(dict.fromkeys(view.lens for view in views), start=1)}
+        images = [ColmapImage(str(view.path), cameras[view.lens], view.rt_cam_world) for view in views]
+        write_model(folder, ColmapModel({number: lens for lens, number in cameras.items()}, images), binary=binary)
 
-def read_posed_images(folder: Path, images: Path) -> PosedModel:
-    """Return the images of a model, which are in the folder `images`, with their lenses and poses."""
-    model = read_model(folder)
-    files = list(model_files(folder))
-    posed = [
-        PosedImage(inside(images, image.name, f"{files[1]}: name"), model.lenses[image.camera], image.rt_cam_world)
-        for image in model.images
-    ]
-    return PosedModel(files, posed)
+    return export_posed(set_path, out, "mm", MODEL_FILES if overwrite else (), write)
 
 
 def model_files(folder: Path) -> tuple[Path, Path]:
@@ -137,32 +125,28 @@ def model_files(folder: Path) -> tuple[Path, Path]:
 
 def write_model(folder: Path, model: ColmapModel, *, binary: bool) -> None:
     """Write cameras, images and an empty list of points, in text or binary."""
-    images = [(number, image, _quaternion(image)) for number, image in enumerate(model.images, start=1)]
-    if not binary:
-        spaced = [image.name for image in model.images if len(image.name.split()) > 1]
-        if spaced:
-            raise BadValue(f"'{spaced[0]}': has a space, where COLMAP ends a name in a text model; use --binary")
-        lines = [
-            f"{n} {name} {w} {h} {' '.join(map(repr, p))}" for n, name, w, h, p in map(_camera, model.lenses.items())
-        ]
-        write_whole(folder / "cameras.txt", "\n".join(lines) + "\n")
-        lines = []
-        for number, image, quaternion in images:
-            numbers = " ".join(map(repr, [*quaternion, *image.rt_cam_world[3:].tolist()]))
-            lines += [f"{number} {numbers} {image.camera} {image.name}", ""]
-        write_whole(folder / "images.txt", "\n".join(lines) + "\n")
-        write_whole(folder / "points3D.txt", "")
+    cameras = [(number, *_camera(lens)) for number, lens in model.lenses.items()]
+    images = [(number, image, _pose_numbers(image)) for number, image in enumerate(model.images, start=1)]
+    if binary:
+        content = struct.pack("<Q", len(cameras))
+        for number, name, width, height, parameters in cameras:
+            content += struct.pack(f"<iiQQ{len(parameters)}d", number, _NUMBERS[name], width, height, *parameters)
+        write_whole(folder / "cameras.bin", content)
+        content = struct.pack("<Q", len(images))
+        for number, image, pose in images:
+            content += struct.pack("<i7di", number, *pose, image.camera)
+            content += image.name.encode() + b"\0" + struct.pack("<Q", 0)
+        write_whole(folder / "images.bin", content)
+        write_whole(folder / "points3D.bin", struct.pack("<Q", 0))
         return
-    content = struct.pack("<Q", len(model.lenses))
-    for number, name, width, height, parameters in map(_camera, model.lenses.items()):
-        content += struct.pack(f"<iiQQ{len(parameters)}d", number, _NUMBERS[name], width, height, *parameters)
-    write_whole(folder / "cameras.bin", content)
-    content = struct.pack("<Q", len(images))
-    for number, image, quaternion in images:
-        content += struct.pack("<i7di", number, *quaternion, *image.rt_cam_world[3:], image.camera)
-        content += image.name.encode() + b"\0" + struct.pack("<Q", 0)
-    write_whole(folder / "images.bin", content)
-    write_whole(folder / "points3D.bin", struct.pack("<Q", 0))
+    spaced = [image.name for image in model.images if len(image.name.split()) > 1]
+    if spaced:
+        raise BadValue(f"'{spaced[0]}': has a space, where COLMAP ends a name in a text model; use --binary")
+    lines = [f"{number} {name} {w} {h} {' '.join(map(repr, numbers))}\n" for number, name, w, h, numbers in cameras]
+    write_whole(folder / "cameras.txt", "".join(lines))
+    lines = [f"{number} {' '.join(map(repr, pose))} {i.camera} {i.name}\n\n" for number, i, pose in images]
+    write_whole(folder / "images.txt", "".join(lines))
+    write_whole(folder / "points3D.txt", "")
 
 
 def _lens(model: str, width: int, height: int, numbers: list[float]) -> Lens:
@@ -175,23 +159,22 @@ def _lens(model: str, width: int, height: int, numbers: list[float]) -> Lens:
     return Lens((width, height), fx_px, fy_px, cx_px - _HALF_PX, cy_px - _HALF_PX, tuple(distortion))
 
 
-def _camera(numbered: tuple[int, Lens]) -> tuple[int, str, int, int, list[float]]:
-    """Return a lens as a camera of COLMAP: number, model, width, height, parameters."""
-    number, lens = numbered
+def _camera(lens: Lens) -> tuple[str, int, int, list[float]]:
+    """Return a lens as a camera of COLMAP: model, width, height, parameters."""
     distortion = [*lens.distortion, *[0.0] * (8 - len(lens.distortion))]
     core = [lens.fx_px, lens.fy_px, lens.cx_px + _HALF_PX, lens.cy_px + _HALF_PX]
     name = "FULL_OPENCV" if any(distortion[4:]) else "OPENCV" if any(distortion) else "PINHOLE"
-    return number, name, *lens.size_px, [*core, *distortion][: _MODELS[_NUMBERS[name]][1]]
+    return name, *lens.size_px, [*core, *distortion][: _MODELS[_NUMBERS[name]][1]]
 
 
-def _pose(quaternion: tuple[float, ...], translation: tuple[float, ...]) -> NDArray[np.float64]:
-    w, x, y, z = quaternion
+def _pose(numbers: Sequence[float]) -> NDArray[np.float64]:
+    w, x, y, z, *translation = numbers
     return np.append(Rotation.from_quat([x, y, z, w]).as_rotvec(), translation)
 
 
-def _quaternion(image: ColmapImage) -> list[float]:
+def _pose_numbers(image: ColmapImage) -> list[float]:
     x, y, z, w = Rotation.from_rotvec(image.rt_cam_world[:3]).as_quat().tolist()
-    return [w, x, y, z]
+    return [w, x, y, z, *image.rt_cam_world[3:].tolist()]
 
 
 def _model_name(path: Path, model: str | int) -> str:
@@ -226,8 +209,7 @@ def _images_text(path: Path) -> list[ColmapImage]:
             _, *numbers, camera, name = line.split(maxsplit=9)
             if len(numbers) != 7:
                 raise ValueError(f"an image has {len(numbers)} numbers of its pose, 7 are expected")
-            values = tuple(float(text) for text in numbers)
-            images.append(ColmapImage(name, int(camera), _pose(values[:4], values[4:])))
+            images.append(ColmapImage(name, int(camera), _pose([float(text) for text in numbers])))
     return images
 
 
@@ -254,7 +236,7 @@ def _images_binary(path: Path) -> list[ColmapImage]:
         points = int(_take(file, "Q")[0])
         if file.seek(points * struct.calcsize("<ddq"), io.SEEK_CUR) > len(content):
             raise ValueError(f"{name} states {points} points, more than the file holds")
-        images.append(ColmapImage(name, int(camera), _pose(tuple(numbers[:4]), tuple(numbers[4:]))))
+        images.append(ColmapImage(name, int(camera), _pose(numbers)))
     return images
 
 

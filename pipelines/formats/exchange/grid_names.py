@@ -1,12 +1,30 @@
-"""Places on a grid from the names of pictures: rows, columns, running numbers and measured positions."""
+"""Pictures of a folder that are views, and their places on a grid by names: rows, columns, numbers and positions."""
 
 import math
 import re
+from collections import Counter
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
-from faintfield.pipelines.errors import BadValue
+from faintfield.pipelines.errors import BadValue, MissingFile
+from faintfield.pipelines.formats.frames import IMAGE_SUFFIXES
+from faintfield.pipelines.formats.reading import is_file, is_folder
+from faintfield.pipelines.formats.toml_files import inside
+
+# Words in the names of files that go along with views, and are none.
+_COMPANION = re.compile(
+    r"(?<![a-z])(masks?|depths?|disp|disparity|disparities|thumbs?|thumbnails?|previews?|normals?|labels?|segmentation"
+    r"|objectids?|oid|gt|truth|contact|centerview|flow|confidence)(?![a-z])",
+    re.IGNORECASE,
+)
+
+# Files that nobody takes for pictures; others are named with their kind.
+_NO_PICTURES = {".txt", ".md", ".json", ".toml", ".csv", ".cfg", ".xml", ".yaml", ".yml", ".html", ".pdf", ".py", ".m"}
+
+# Suffixes of one kind of file.
+_ALIKE = {".tiff": ".tif", ".jpeg": ".jpg", ".pnm": ".ppm", ".pgm": ".ppm"}
 
 # Largest row, column, running number or position: times and serial numbers are larger.
 _MAX_NUMBER = 1e9
@@ -21,24 +39,100 @@ _NUMBER = r"[-+]?[0-9]+(?:\.[0-9]*)?(?:[eE][-+]?[0-9]+)?"
 _FIELDS = {"name": ".*?", "row": _WHOLE, "column": _WHOLE, "index": _WHOLE, "x": _NUMBER, "y": _NUMBER}
 _FIELD = re.compile(r"\{([a-z]*)(?::([1-9]))?\}|(\*)")
 
-# Names that say which number is which. A row or column is named by a letter or a word of its own: r3_c12, row3_col12.
+# First the archives of Stanford: row, column, and the camera's position, first along the rows' axis, then along the
+# columns'; then a row or column named by a letter or a word of its own: r3_c12, row3_col12.
 _ROW, _COLUMN = r"(?<![a-z])r(?:ow)?[_-]?", r"(?<![a-z])c(?:ol(?:umn)?)?[_-]?"
-_LETTERED = [
-    re.compile(rf"{_ROW}(?P<row>{_WHOLE})[_-]?{_COLUMN}(?P<column>{_WHOLE})", re.IGNORECASE),
-    re.compile(rf"{_COLUMN}(?P<column>{_WHOLE})[_-]?{_ROW}(?P<row>{_WHOLE})", re.IGNORECASE),
-    re.compile(rf"(?<![a-z])x_?(?P<column>{_WHOLE})[_-]?y_?(?P<row>{_WHOLE})", re.IGNORECASE),
-    re.compile(rf"(?<![a-z])y_?(?P<row>{_WHOLE})[_-]?x_?(?P<column>{_WHOLE})", re.IGNORECASE),
+_HABITS = [
+    re.compile(expression, re.IGNORECASE)
+    for expression in (
+        rf"^.*?(?P<row>{_WHOLE})[_-](?P<column>{_WHOLE})_(?P<y>{_DECIMAL})_(?P<x>{_DECIMAL})_*$",
+        rf"^.*?(?P<y>{_DECIMAL})_(?P<x>{_DECIMAL})_*$",
+        rf"{_ROW}(?P<row>{_WHOLE})[_-]?{_COLUMN}(?P<column>{_WHOLE})",
+        rf"{_COLUMN}(?P<column>{_WHOLE})[_-]?{_ROW}(?P<row>{_WHOLE})",
+        rf"(?<![a-z])x_?(?P<column>{_WHOLE})[_-]?y_?(?P<row>{_WHOLE})",
+        rf"(?<![a-z])y_?(?P<row>{_WHOLE})[_-]?x_?(?P<column>{_WHOLE})",
+    )
 ]
-
-# The archives of Stanford: row, column, and the camera's position, first along the rows' axis, then along the columns'.
-_WITH_POSITIONS = [
-    re.compile(rf"^.*?(?P<row>{_WHOLE})[_-](?P<column>{_WHOLE})_(?P<y>{_DECIMAL})_(?P<x>{_DECIMAL})_*$"),
-    re.compile(rf"^.*?(?P<y>{_DECIMAL})_(?P<x>{_DECIMAL})_*$"),
-]
-
 
 # Numbers of all names by field: row, column, index, x and y; a field that names do not state is missing.
 type Places = dict[str, list[float]]
+
+
+def pictures_in(folder: Path, *, every: bool = False) -> tuple[list[Path], list[str]]:
+    """Return the pictures of a folder, as people count, and a remark on each kind of file that is left out.
+
+    Left out are files that are not read and, unless `every` picture is meant, masks, depth maps and thumbnails by their
+    names, and a few pictures of another kind than most.
+
+    Raises
+    ------
+    MissingFile
+        There is no such folder, or it holds no picture that is read; the kinds that it holds are named.
+    BadValue
+        It holds pictures of several kinds under the same names.
+    """
+    if not is_folder(folder):
+        raise MissingFile(f"{folder}: no such folder; name the folder that holds the pictures")
+    entries = sorted(folder.iterdir(), key=lambda path: by_number(path.name))
+    files = [path for path in entries if not path.name.startswith(".") and is_file(path)]
+    pictures = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES]
+    if not pictures:
+        folders = [path for path in entries if is_folder(path)]
+        if folders and not files:
+            raise MissingFile(
+                f"{folder}: holds folders only, such as {folders[0].name}; name the one with the pictures"
+            )
+        raise MissingFile(
+            f"{folder}: holds {_count_kinds(files) or 'nothing'}; convert pictures to PNG or TIFF (read are "
+            f"{', '.join(sorted(IMAGE_SUFFIXES))}), or name the folder that holds them"
+        )
+    unread = [path for path in files if path.suffix.lower() not in IMAGE_SUFFIXES | _NO_PICTURES]
+    remarks = [f"left out: {_count_kinds(unread)}, which are not read"] if unread else []
+    if every:
+        return pictures, remarks
+    masks = [path for path in pictures if _COMPANION.search(path.stem)]
+    pictures = _leave_out(pictures, masks, remarks, "by their names no views")
+    kinds = {path: _ALIKE.get(path.suffix.lower(), path.suffix.lower()) for path in pictures}
+    kind, count = Counter(kinds.values()).most_common(1)[0]
+    common = [path for path in pictures if kinds[path] == kind]
+    rest = [path for path in pictures if kinds[path] != kind]
+    if named_alike := {path.stem for path in common} & {path.stem for path in rest}:
+        raise BadValue(
+            f"{folder}: holds pictures of several kinds ({_count_kinds(pictures)}), with {min(named_alike)} in two of "
+            "them; leave one kind in the folder"
+        )
+    # Pictures of another kind whose names differ in their numbers only are views, too
+    forms = {re.sub(_WHOLE, "0", path.stem) for path in common}
+    foreign = [path for path in rest if re.sub(_WHOLE, "0", path.stem) not in forms]
+    return _leave_out(pictures, foreign, remarks, f"of another kind than the {count} {kind} files"), remarks
+
+
+def _count_kinds(paths: Sequence[Path]) -> str:
+    """Return the number of files of each kind, most first: "256 .gif files, 1 .txt file"."""
+    kinds = Counter(path.suffix.lower() for path in paths).most_common(4)
+    return ", ".join(f"{n} {kind} file{'s' * (n > 1)}" if kind else f"{n} without a suffix" for kind, n in kinds)
+
+
+def _leave_out(paths: list[Path], unwanted: Sequence[Path], remarks: list[str], reason: str) -> list[Path]:
+    """Return the paths without some, and say so; all of them if no smaller number would be left than is left out."""
+    if not 0 < 2 * len(unwanted) <= len(paths):
+        return paths
+    remarks.append(f"left out: {len(unwanted)} of {len(paths)} pictures, {reason} ({unwanted[0].name})")
+    return [path for path in paths if path not in unwanted]
+
+
+def picture_named(folder: Path, name: str, key: str) -> Path:
+    """Return the picture of a name that another file states, with or without its suffix; it may be missing.
+
+    Raises
+    ------
+    BadValue
+        The name leads out of the folder.
+    """
+    path = inside(folder, name, key)
+    suffixes = sorted(IMAGE_SUFFIXES) if path.name and not is_file(path) else []
+    candidates = (path.with_name(path.name + suffix) for suffix in suffixes)
+    return next((file for file in candidates if is_file(inside(folder, str(file.relative_to(folder)), key))), path)
 
 
 def by_number(name: str) -> list[tuple[int, str]]:
@@ -48,16 +142,10 @@ def by_number(name: str) -> list[tuple[int, str]]:
 
 
 def places_by_pattern(pattern: str, names: Sequence[str]) -> Places:
-    """Return the numbers of names by a pattern such as "{name}_{row}_{column}_{y}_{x}.png".
+    """Return the numbers of file names by a pattern such as "{name}_{row}_{column}_{y}_{x}.png".
 
-    Parameters
-    ----------
-    pattern : str
-        Fields are `name` (anything), `row`, `column` and `index` (whole numbers, of a fixed number of digits as in
-        `{row:2}`), `x` and `y` (the camera's position, any numbers); `*` stands for anything. The suffix may be left
-        out.
-    names : sequence of str
-        Names of the files.
+    Fields are `name` (anything), `row`, `column` and `index` (whole numbers, of a fixed number of digits as in
+    `{row:2}`), `x` and `y` (the camera's position); `*` stands for anything. The suffix may be left out.
 
     Raises
     ------
@@ -101,11 +189,10 @@ def _expression(pattern: str) -> re.Pattern[str]:
 
 
 def places_by_habit(names: Sequence[str]) -> Places:
-    """Return the numbers of names by the habits of archives and cameras.
+    """Return the numbers of names by the habits of archives and cameras, see docs/archives.md.
 
-    In this order: row, column and position as in `out_00_01_-381.909_1124.376_.png`; a position alone; letters or words
-    for row and column; the two numbers that vary from name to name; one number that varies, which is an index. A number
-    is never split into digits.
+    In this order: row, column and position; a position alone; letters or words for row and column; the two numbers that
+    vary from name to name; one number that varies, which is an index. A number is never split into digits.
 
     Raises
     ------
@@ -113,7 +200,7 @@ def places_by_habit(names: Sequence[str]) -> Places:
         Names say no place, or numbers that may be rows and columns as well as running ones.
     """
     stems = [name.rpartition(".")[0] or name for name in names]
-    for expression in (*_WITH_POSITIONS, *_LETTERED):
+    for expression in _HABITS:
         matches = [match for stem in stems if (match := expression.search(stem))]
         if len(matches) == len(names):
             return _places(names, [match.groupdict() for match in matches])

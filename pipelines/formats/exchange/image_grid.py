@@ -9,12 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.calib.arrangement.nodes import Node
+from faintfield.calib.arrangement.views import Node
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.errors import BadValue, MissingFile
-from faintfield.pipelines.formats.exchange.grid_names import Places, places_by_habit, places_by_pattern
+from faintfield.pipelines.formats.exchange.grid_names import Places, pictures_in, places_by_habit, places_by_pattern
 from faintfield.pipelines.formats.exchange.imported_set import PosedImage
-from faintfield.pipelines.formats.exchange.picture_folder import pictures_in
 from faintfield.rig.plan import centre_node, grid_nodes
 
 # Largest ratio of missing pictures to those found; beyond it, the numbers in the names are not rows and columns.
@@ -53,6 +52,10 @@ class ImageGrid:
         Names tell no more than an order, which may run by row or by column, and back and forth.
     guessed : bool
         That the grid is a square follows from the number of pictures only.
+    sources : list of Path
+        Files of the user that hold the pictures.
+    dn_per_value : float, optional
+        Factor by which float values became whole numbers; None for other pictures.
     """
 
     paths: dict[Node, Path]
@@ -60,6 +63,8 @@ class ImageGrid:
     remarks: list[str] = field(default_factory=list)
     ordered: bool = False
     guessed: bool = False
+    sources: list[Path] = field(default_factory=list)
+    dn_per_value: float | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -90,18 +95,9 @@ class ImageGrid:
     def posed(self, lens: Lens, pitch_mm: float, disparity_px: float, ratio: float = 1.0) -> list[PosedImage]:
         """Return the pictures at measured poses where positions were measured, else at nominal ones.
 
-        Parameters
-        ----------
-        lens : Lens
-            The camera's lens.
-        pitch_mm : float
-            Distance between neighbouring nodes: the mean distance between columns, if positions were measured.
-        disparity_px : float
-            For pictures aligned on a plane: how far that plane moved from node to node before it was aligned.
-            Aligning has moved the principal points by as much.
-        ratio : float
-            Pitch along columns over pitch along rows, if positions were not measured; `pitch_mm` and `disparity_px`
-            are those along rows.
+        `pitch_mm` is the distance between columns, their mean if positions were measured; else that between rows, and
+        `ratio` the pitch along columns over that along rows. Aligning pictures on a plane has moved their principal
+        points by as much as the plane moved from node to node, `disparity_px`.
         """
         places = self.measured or {(row, column): (ratio * column, float(row)) for row, column in self.paths}
         right_0, down_0 = places[list(self.paths)[self.centre]]
@@ -124,17 +120,9 @@ def find_grid(
 ) -> ImageGrid:
     """Return the pictures of a folder by node.
 
-    Parameters
-    ----------
-    folder : Path
-        Folder of the pictures.
-    rows, columns : int, optional
-        Size of the grid; the pictures are then taken in the order of their names. When both are None, names tell, see
-        `grid_names`.
-    pattern : str, optional
-        Pattern of the names, such as "{name}_{row}_{column}_{y}_{x}.png".
-    running : (int, int), optional
-        Rows and columns of the grid, for names with running numbers, if a file beside the pictures states them.
+    With the size of the grid, `rows` and `columns`, pictures are taken in the order of their names; else names tell,
+    by a pattern or by habit, see `grid_names`. `running` is the size for names with running numbers, if a file beside
+    the pictures states it.
 
     Raises
     ------
@@ -152,9 +140,10 @@ def find_grid(
                 f"{folder}: holds {len(paths)} pictures, a grid of {rows} x {columns} needs {rows * columns}; "
                 "correct --rows and --columns, or add the missing ones" + "".join(f" ({text})" for text in remarks)
             )
-        return ImageGrid(dict(zip(grid_nodes(rows, columns), paths, strict=True)), remarks=remarks, ordered=True)
+        grid_paths = dict(zip(grid_nodes(rows, columns), paths, strict=True))
+        return ImageGrid(grid_paths, remarks=remarks, ordered=True, sources=paths)
     if pattern is None and len(paths) == 1:
-        return ImageGrid({(0, 0): paths[0]}, remarks=remarks)
+        return ImageGrid({(0, 0): paths[0]}, remarks=remarks, sources=paths)
     if running is None and pattern is not None and rows and columns:
         running = rows, columns
     try:
@@ -174,7 +163,7 @@ def find_grid(
         remarks.append(f"names state positions ({names[0]}): the cameras are placed by them")
     by_index = places.keys() == {"index"}
     grid_paths = dict(sorted(zip(nodes, paths, strict=True)))
-    grid = ImageGrid(grid_paths, measured, remarks, ordered=by_index, guessed=by_index and running is None)
+    grid = ImageGrid(grid_paths, measured, remarks, by_index, by_index and running is None, list(grid_paths.values()))
     _check_size(folder, grid, rows, columns)
     return grid
 
@@ -188,24 +177,23 @@ def _count_from_zero(nodes: Sequence[Node]) -> list[Node]:
 
 def _check_size(folder: Path, grid: ImageGrid, rows: int | None, columns: int | None) -> None:
     """Refuse a grid of which half is missing, or of another size than stated."""
-    size = grid.size
-    missing = size[0] * size[1] - len(grid.paths)
-    if missing > _MAX_MISSING_RATIO * len(grid.paths):
+    (row_count, column_count), count, first = grid.size, len(grid.paths), next(iter(grid.paths.values())).name
+    missing = row_count * column_count - count
+    if missing > _MAX_MISSING_RATIO * count:
         raise BadValue(
-            f"{folder}: numbers in names like {next(iter(grid.paths.values())).name} would make a grid of {size[0]} x "
-            f"{size[1]} of {len(grid.paths)} pictures, so they are not row and column; give --rows and --columns to "
-            "take files in order, or --pattern"
+            f"{folder}: numbers in names like {first} would make a grid of {row_count} x {column_count} of {count} "
+            "pictures, so they are not row and column; give --rows and --columns to take files in order, or --pattern"
         )
-    if missing >= len(grid.paths):
-        row, column = next((r, c) for r in range(size[0]) for c in range(size[1]) if (r, c) not in grid.paths)
+    if missing >= count:
+        row, column = next(node for node in np.ndindex(grid.size) if node not in grid.paths)
         raise MissingFile(
-            f"{folder}: the view in row {row} and column {column}, counted from 0, is missing, "
-            f"{missing} of {size[0] * size[1]} in all; add it, or give --rows and --columns, or --pattern, if numbers "
-            f"in names like {next(iter(grid.paths.values())).name} are not row and column"
+            f"{folder}: the view in row {row} and column {column}, counted from 0, is missing, {missing} of "
+            f"{missing + count} in all; add it, or give --rows and --columns, or --pattern, if numbers in names like "
+            f"{first} are not row and column"
         )
-    if (rows or size[0], columns or size[1]) != size:
+    if (rows or row_count, columns or column_count) != grid.size:
         raise BadValue(
-            f"{folder}: --pattern makes a grid of {size[0]} x {size[1]}, --rows and --columns say otherwise; "
+            f"{folder}: --pattern makes a grid of {row_count} x {column_count}, --rows and --columns say otherwise; "
             "give one of them, or correct them"
         )
 
@@ -213,12 +201,7 @@ def _check_size(folder: Path, grid: ImageGrid, rows: int | None, columns: int | 
 def nodes_of(places: Places, size: tuple[int, int] | None = None) -> tuple[list[Node], str]:
     """Return row and column of each picture, and a sentence on how they follow, empty where the names say them.
 
-    Parameters
-    ----------
-    places : dict of str to list of float
-        Numbers of the names.
-    size : (int, int), optional
-        Rows and columns for running numbers, if known; otherwise a square number of pictures makes a square.
+    Running numbers make a grid of `size`, or a square if that is not known.
 
     Raises
     ------
@@ -236,14 +219,16 @@ def nodes_of(places: Places, size: tuple[int, int] | None = None) -> tuple[list[
     first, last, count = min(indices), max(indices), len(indices)
     side = math.isqrt(count)
     rows, columns = size or (side, side)
-    if len(set(indices)) != count:
-        double = next(index for index in indices if indices.count(index) > 1)
+    double, times = Counter(indices).most_common(1)[0]
+    if times > 1:
         raise BadValue(
             f"two pictures have the number {double}; keep one of them, or give --pattern, or --rows and --columns"
         )
     if rows * columns != count or last - first != count - 1:
-        gaps = sorted(set(range(first, last + 1)) - set(indices))[:1] if last - first < 2 * count else []
-        lacks = f" without {gaps[0]}" if gaps else ""
+        lacking = (
+            min(set(range(first, first + count)) - set(indices), default=None) if last - first < 2 * count else None
+        )
+        lacks = "" if lacking is None else f" without {lacking}"
         raise BadValue(
             f"names count {count} pictures by one number, from {first} to {last}{lacks}, which is no square grid "
             "and no row and column; give --rows and --columns to take files in order, or --pattern"
@@ -257,15 +242,14 @@ def _lines(values: NDArray[np.float64], gap: float) -> list[int]:
     order = np.argsort(values)
     numbers = np.empty(len(values), int)
     numbers[order] = np.append(0, np.cumsum(np.diff(values[order]) > gap))
-    return [int(number) for number in numbers]
+    return numbers.tolist()
 
 
 def measured_steps(positions: Mapping[Node, tuple[float, float]]) -> dict[Node, Steps]:
     """Return measured positions (x, y) of cameras in steps of the grid's columns, right and down.
 
-    The unit and the directions of the positions are not known, so these are taken from the nodes: right is where
-    columns grow, down where rows grow, and the mean distance between columns is 1. The distance between rows follows in
-    that unit. Where there is one row, or one column, the direction across it is not known and deviations are dropped.
+    Unit and directions of the positions are not known and follow from the nodes: right is where columns grow, down
+    where rows grow, and the mean distance between columns is 1. Deviations across a single row or column are dropped.
 
     Raises
     ------

@@ -10,14 +10,23 @@ from typing import Any
 import cv2
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
+from faintfield.calib.homography import rotation_matrix
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.errors import BadValue, MissingFile, WrongBitDepth, WrongSize
-from faintfield.pipelines.formats.exchange.imported_noise import NoiseOrigin, Pictures, StatedNoise, complete_noise
-from faintfield.pipelines.formats.exchange.options import ImportOptions
-from faintfield.pipelines.formats.exchange.tone import Tone, asked_tone, tone_of, without_curve
+from faintfield.pipelines.formats.exchange.imported_light import (
+    NoiseOrigin,
+    Pictures,
+    Tone,
+    complete_noise,
+    light_unit,
+    tone_of,
+    without_curve,
+)
+from faintfield.pipelines.formats.exchange.options import GridOptions, ImportOptions
 from faintfield.pipelines.formats.files import sha256, write_json, writing_folder
 from faintfield.pipelines.formats.frames import RAW_SUFFIXES, Frame, exif_exposure_s, read_frame
 from faintfield.pipelines.formats.image_files import write_frame
@@ -31,8 +40,12 @@ from faintfield.pipelines.formats.sets.elemental_file import (
     View,
     write_set,
 )
-from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
+from faintfield.pipelines.formats.sets.session_set import load_set_or_session
+from faintfield.pipelines.formats.sets.stated import stated_length
 from faintfield.pipelines.formats.units import MAX_ANGLE_RAD, MAX_LENGTH_MM, Units
+
+# Largest error of the columns of a rotation in length and right angles, as rounded numbers have it.
+_ROTATION_TOLERANCE = 1e-2
 
 # Files whose compression changes values, and with them the noise.
 _LOSSY_SUFFIXES = {".jpg", ".jpeg"}
@@ -40,7 +53,7 @@ _LOSSY_SUFFIXES = {".jpg", ".jpeg"}
 
 @dataclass(frozen=True)
 class PosedImage:
-    """An image, its lens, and the camera's pose in a world of any origin, (6,), Rodrigues rad and mm."""
+    """An image, its lens, and the camera's pose (6,) in a world of any origin, Rodrigues rad and any unit."""
 
     path: Path
     lens: Lens
@@ -80,9 +93,7 @@ class ExportedSet(msgspec.Struct, frozen=True):
 
 
 def import_posed(out: Path, model: PosedModel, options: ImportOptions, command: str) -> ImportedSet:
-    """Make an elemental set of the images of a model.
-
-    Without a length of its unit, poses are relative. Light is in DN, or relative of pictures of 8 bits.
+    """Make an elemental set of the images of a model; without the length of its unit, poses are relative.
 
     Raises
     ------
@@ -91,45 +102,58 @@ def import_posed(out: Path, model: PosedModel, options: ImportOptions, command: 
     """
     if not model.images:
         raise BadValue(f"{model.files[-1]}: names no image; export a model of the images")
-    mm_per_unit = options.mm_per_unit
-    _check_images(model.images, mm_per_unit or 1.0)
-    scale = np.repeat([1.0, mm_per_unit or 1.0], 3)
+    scale = np.repeat([1.0, options.mm_per_unit or 1.0], 3)
     images = [
         replace(image, rt_cam_world=image.rt_cam_world * scale, node=node)
         for image, node in zip(model.images, _nodes(model.images), strict=True)
     ]
+    for image, stated in zip(images, model.images, strict=True):
+        _check_image(image, stated)
     index = _reference(images, options.reference)
     write_imported_set(
         out,
+        options,
         images,
         reference=index,
-        noise=StatedNoise(),
-        exposure_s=options.exposure_s,
-        tone=asked_tone(linear=options.linear, srgb=options.srgb),
         command=command,
-        options={name: getattr(options, name) for name in ("mm_per_unit", "reference", "exposure_s")},
+        recorded={name: getattr(options, name) for name in ("mm_per_unit", "reference", "exposure_s")},
         models=model.files,
-        units=None if mm_per_unit else Units(depth="relative"),
-        overwrite=options.overwrite,
+        units=Units() if options.mm_per_unit else Units(depth="relative"),
     )
     width, height = images[index].lens.size_px
     inform(f"{out}: {len(images)} views of {width} x {height} px")
     return ImportedSet(str(out), len(images), images[index].path.name)
 
 
-def _check_images(images: Sequence[PosedImage], mm_per_unit: float) -> None:
-    """Refuse images that are missing, and poses that are not finite or too large."""
-    limits = np.repeat([MAX_ANGLE_RAD, MAX_LENGTH_MM / mm_per_unit], 3)
-    for image in images:
-        if not is_file(image.path):
-            raise MissingFile(
-                f"{image.path}: has a pose but is missing; put it there, or name its folder with --images"
-            )
-        if not (np.abs(image.rt_cam_world) <= limits).all():
-            raise BadValue(
-                f"{image.path}: its pose {image.rt_cam_world.tolist()} is not finite, or beyond {MAX_ANGLE_RAD:g} rad "
-                f"or {MAX_LENGTH_MM:g} mm; calibrate again, or remove it"
-            )
+def export_posed(
+    set_path: Path, out: Path, unit: str, held: Sequence[str], write: Callable[[Path, list[PosedImage]], None]
+) -> ExportedSet:
+    """Write lens and poses of a set or session into a folder, by `write` from the folder and the views.
+
+    Lengths are in `unit`, or relative. An earlier export, a folder with files of the patterns `held` only, is replaced.
+    """
+    elemental_set = load_set_or_session(set_path)
+    points_px = elemental_set.principal_points_px().tolist()
+    parts = zip(elemental_set.settings.view, points_px, elemental_set.poses_rt_cam_ref, strict=True)
+    views = [
+        PosedImage(Path(view.image), replace(elemental_set.lens, cx_px=cx_px, cy_px=cy_px), pose)
+        for view, (cx_px, cy_px), pose in parts
+    ]
+    unit = stated_length(elemental_set, unit)
+    with writing_folder(out, replace_only=held) as folder:
+        write(folder, views)
+    return ExportedSet(str(out), len(views), unit)
+
+
+def _check_image(image: PosedImage, stated: PosedImage) -> None:
+    """Refuse an image that is missing, and a pose that is not finite or too large, in the words of the model."""
+    if not is_file(image.path):
+        raise MissingFile(f"{image.path}: has a pose but is missing; put it there, or name its folder with --images")
+    if not (np.abs(image.rt_cam_world) <= np.repeat([MAX_ANGLE_RAD, MAX_LENGTH_MM], 3)).all():
+        raise BadValue(
+            f"{image.path}: its pose {stated.rt_cam_world.tolist()} is not finite, or beyond {MAX_ANGLE_RAD:g} rad "
+            f"or {MAX_LENGTH_MM:g} mm; calibrate again, or remove it"
+        )
 
 
 def _reference(images: Sequence[PosedImage], name: str | None) -> int:
@@ -139,7 +163,7 @@ def _reference(images: Sequence[PosedImage], name: str | None) -> int:
         if not found:
             raise BadValue(f"--reference {name}: is none of the {len(images)} images with a pose; name one of them")
         return found[0]
-    centres = np.array([-cv2.Rodrigues(i.rt_cam_world[:3])[0].T @ i.rt_cam_world[3:] for i in images])
+    centres = np.array([-rotation_matrix(i.rt_cam_world).T @ i.rt_cam_world[3:] for i in images])
     return int(np.argmin(np.linalg.norm(centres - centres.mean(axis=0), axis=1)))
 
 
@@ -152,39 +176,33 @@ def _nodes(images: Sequence[PosedImage]) -> Sequence[tuple[int, int] | None]:
 
 def write_imported_set(
     out: Path,
+    options: ImportOptions | GridOptions,
     images: Sequence[PosedImage],
     *,
     reference: int,
-    noise: StatedNoise,
-    exposure_s: float | None,
-    tone: Tone | None = None,
     command: str,
-    options: dict[str, Any],
+    recorded: dict[str, Any],
+    units: Units,
     models: Sequence[Path] = (),
-    sources: Sequence[Path] | None = None,
-    units: Units | None = None,
+    sources: Sequence[Path] = (),
     arrangement: Arrangement | None = None,
     also: Callable[[Path], None] | None = None,
-    overwrite: bool,
 ) -> None:
     """Copy images into an elemental set whose reference frame is the camera of one of them.
+
+    What the options do not state of the sensor is estimated from the views, or assumed and said so.
 
     Parameters
     ----------
     reference : int
         Index of the image whose camera is the reference.
-    noise : StatedNoise
-        What is stated of the sensor; what is not is estimated from the views, or assumed and said so.
-    exposure_s : float, optional
-        Exposure of each image; by default what the first one states, and not known if it states none.
-    tone : {"linear", "srgb"}, optional
-        The tone curve of the images; by default that of sRGB for 8-bit images, and none for others.
-    units : Units, optional
-        What depths are stated in; light is stated in what noise and tone allow.
-    models : sequence of Path
-        Files that lens and poses were read from, for the record; no file that is read is overwritten.
-    sources : sequence of Path, optional
-        Files that the images were unpacked from, for the record; the images' own by default.
+    command, recorded : str, dict
+        The command and its options, for the record.
+    units : Units
+        Units of depths; light is stated in what noise and tone allow.
+    models, sources : sequence of Path
+        Files that lens and poses were read from, and those that the images were unpacked from, the images' own by
+        default: for the record, and none of them is overwritten.
     arrangement : Arrangement, optional
         What was found in the pictures of a grid.
     also : callable, optional
@@ -198,37 +216,39 @@ def write_imported_set(
     WrongSize, WrongBitDepth
         The images are not alike, or not of the size of their lens.
     """
-    lens = images[reference].lens
-    first = read_picture(images[0].path)
-    _check_lenses([image.lens for image in images], images[0].path, first)
-    exposure_s = exposure_s or first.exposure_s or exif_exposure_s(images[0].path)
-    noise.check_exposure(images[0].path, exposure_s)
-    tone = tone_of(images[0].path, first, tone)
-    inputs = [*models, *([image.path for image in images] if sources is None else sources)]
-    with writing_folder(out, replace_if=FILE_NAME if overwrite else None, reads=inputs) as folder:
+    lens, path = images[reference].lens, images[0].path
+    first = read_picture(path)
+    _check_lenses([image.lens for image in images], path, first)
+    exposure_s = options.exposure_s or first.exposure_s or exif_exposure_s(path)
+    stated = options if isinstance(options, GridOptions) else GridOptions()
+    if exposure_s is None and stated.dark_current_e_per_s:
+        raise BadValue(
+            f"{path}: states no exposure, without which {stated.dark_current_e_per_s:g} dark electrons per second mean "
+            "nothing; give --exposure-s"
+        )
+    tone = tone_of(path, first, options)
+    inputs = [*models, *(sources or [image.path for image in images])]
+    with writing_folder(out, replace_if=FILE_NAME if options.overwrite else None, reads=inputs) as folder:
         views = [
             _view(_copy(image.path, folder, first, tone), image, images[reference])
             for image in progress(images, "copying pictures")
         ]
         lossy = inputs[-1].suffix.lower() in _LOSSY_SUFFIXES
-        pictures = Pictures(folder, views, first, tone, lossy)
-        complete, origin = complete_noise(noise, pictures)
-        camera = Camera(lens.size_px, lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, lens.distortion)
+        complete, origin = complete_noise(stated, Pictures(folder, views, first, tone, lossy))
         settings = ElementalSetFile(
             format=1,
             exposure_s=exposure_s,
             reference_view=reference,
-            units=msgspec.structs.replace(units or Units(), light=noise.light_unit(tone)),
+            units=msgspec.structs.replace(units, light=light_unit(stated, tone)),
             arrangement=arrangement,
-            camera=camera,
+            camera=Camera(lens.size_px, lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, lens.distortion),
             noise=complete,
             view=views,
         )
         write_set(folder, settings)
         if also is not None:
             also(folder)
-        hashes = {path.name: sha256(path) for path in inputs}
-        made = msgspec.to_builtins(provenance(command, options, hashes))
+        made = msgspec.to_builtins(provenance(command, recorded, {path.name: sha256(path) for path in inputs}))
         write_json(folder / "provenance.json", ImportProvenance(**made, tone=tone, noise=origin))
 
 
@@ -244,9 +264,29 @@ def read_picture(path: Path, expected_px: tuple[int, int] | None = None) -> Fram
 
 def relative(rt_cam_world: NDArray[np.float64], rt_ref_world: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return rt_cam_ref (6,): a camera's pose relative to another's."""
-    cam, ref = (np.asarray(cv2.Rodrigues(np.asarray(rt[:3], np.float64))[0]) for rt in (rt_cam_world, rt_ref_world))
+    cam, ref = (rotation_matrix(rt) for rt in (rt_cam_world, rt_ref_world))
     rotation = cam @ ref.T
     return np.append(cv2.Rodrigues(rotation)[0].ravel(), rt_cam_world[3:] - rotation @ rt_ref_world[3:])
+
+
+def pose_of(rotation: ArrayLike, centre: ArrayLike) -> NDArray[np.float64]:
+    """Return the pose rt_cam_world (6,) of a camera at a place (3,) in the world, in the unit of that place.
+
+    The columns of the rotation (3, 3) are the camera's x (right), y (down) and z (forward) in the world.
+
+    Raises
+    ------
+    ValueError
+        The matrix is no rotation: it is not finite, stretches, or mirrors.
+    """
+    matrix = np.asarray(rotation, np.float64)
+    # Elements beyond 2 are refused before their squares, which may overflow
+    if not (np.abs(matrix) <= 2).all() or not np.allclose(matrix.T @ matrix, np.eye(3), atol=_ROTATION_TOLERANCE):
+        raise ValueError("its rotation is not finite, or has columns that are not of length 1 and at right angles")
+    if np.linalg.det(matrix) < 0:
+        raise ValueError("its rotation mirrors the world")
+    to_camera = Rotation.from_matrix(matrix).inv()
+    return np.append(to_camera.as_rotvec(), -to_camera.apply(np.asarray(centre, np.float64)))
 
 
 def _check_lenses(lenses: Sequence[Lens], path: Path, first: Frame) -> None:
@@ -296,11 +336,3 @@ def _copy(path: Path, folder: Path, first: Frame, tone: Tone) -> str:
         light = without_curve(pixels, first.saturation_dn) if tone == "srgb" else pixels.astype(np.uint16)
         write_frame(folder / name, light)
     return name
-
-
-def lens_of_each_view(elemental_set: ElementalSet) -> list[Lens]:
-    """Return the lens of each view: the camera's, with the principal point of the view."""
-    return [
-        replace(elemental_set.lens, cx_px=cx_px, cy_px=cy_px)
-        for cx_px, cy_px in elemental_set.principal_points_px().tolist()
-    ]

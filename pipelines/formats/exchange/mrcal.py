@@ -11,23 +11,21 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
+from faintfield.calib.geometry.bundle import load_mrcal
 from faintfield.calib.lens import Lens
-from faintfield.calib.mrcal_loader import load_mrcal
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.exchange.imported_set import (
     ExportedSet,
     ImportedSet,
     PosedImage,
     PosedModel,
+    export_posed,
     import_posed,
-    lens_of_each_view,
 )
 from faintfield.pipelines.formats.exchange.options import ImportOptions
-from faintfield.pipelines.formats.files import write_whole, writing_folder
+from faintfield.pipelines.formats.files import write_whole
 from faintfield.pipelines.formats.frames import IMAGE_SUFFIXES
 from faintfield.pipelines.formats.reading import is_file, read_content
-from faintfield.pipelines.formats.sets.session_set import load_set_or_session
-from faintfield.pipelines.formats.sets.stated import stated_length
 
 SUFFIX = ".cameramodel"
 
@@ -67,27 +65,15 @@ class _CameraModel(msgspec.Struct, frozen=True):
         return self.rt_cam_ref if self.rt_cam_ref is not None else self.extrinsics
 
 
-def lens_model_of(lens: Lens) -> str:
-    """Return the smallest lens model that holds the distortion of a lens."""
-    return next(name for name, (_, count) in _LENS_MODELS.items() if count >= len(lens.distortion))
-
-
 def camera_model_text(lens: Lens, lens_model: str, rt_cam_ref: ArrayLike) -> str:
-    """Return a camera as the text of a .cameramodel file.
+    """Return a camera of pose (6,), Rodrigues rad and mm, as the text of a .cameramodel file.
 
-    Parameters
-    ----------
-    lens : Lens
-        Its distortion is filled with zeros to the length that the model has.
-    lens_model : str
-        "pinhole", "opencv4", "opencv5" or "opencv8".
-    rt_cam_ref : array (6,)
-        Rodrigues rad and mm.
+    The distortion is filled with zeros to the length that the lens model has: "pinhole", "opencv4", "opencv5" or
+    "opencv8".
     """
     name, count = _LENS_MODELS[lens_model]
-    distortion = [*lens.distortion, *[0.0] * (count - len(lens.distortion))]
     model = load_mrcal().cameramodel(
-        intrinsics=(name, np.array([lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, *distortion])),
+        intrinsics=(name, np.array([*lens.parameters, *[0.0] * (count - len(lens.distortion))])),
         imagersize=np.array(lens.size_px, np.int32),
         rt_cam_ref=np.array(rt_cam_ref, np.float64) * [1, 1, 1, 1e-3, 1e-3, 1e-3],
     )
@@ -104,30 +90,21 @@ def import_camera_models(src: Path, out: Path, options: ImportOptions) -> Import
 
 def export_camera_models(set_path: Path, out: Path, *, overwrite: bool) -> ExportedSet:
     """Write the lens and poses of a set or session, a model for each view."""
-    elemental_set = load_set_or_session(set_path)
-    lenses = lens_of_each_view(elemental_set)
-    models: dict[str, str] = {}
-    for view, lens, pose in zip(elemental_set.settings.view, lenses, elemental_set.poses_rt_cam_ref, strict=True):
-        name = Path(view.image).with_suffix(SUFFIX).name
-        if name in models:
-            raise BadValue(f"{set_path}: {view.image} would become {name} like another view; rename its image")
-        models[name] = camera_model_text(lens, lens_model_of(lens), pose)
-    unit = stated_length(elemental_set, "m")
-    with writing_folder(out, replace_only=[f"*{SUFFIX}"] if overwrite else ()) as folder:
-        for name, text in models.items():
-            write_whole(folder / name, text)
-    return ExportedSet(str(out), len(models), unit)
+
+    def write(folder: Path, views: list[PosedImage]) -> None:
+        for view in views:
+            file = folder / view.path.with_suffix(SUFFIX).name
+            if file.exists():
+                raise BadValue(f"{set_path}: {view.path} would become {file.name} like another view; rename its image")
+            # The smallest model that holds the distortion
+            model = next(name for name, (_, count) in _LENS_MODELS.items() if count >= len(view.lens.distortion))
+            write_whole(file, camera_model_text(view.lens, model, view.rt_cam_world))
+
+    return export_posed(set_path, out, "m", [f"*{SUFFIX}"] if overwrite else (), write)
 
 
 def read_camera_models(folder: Path, images: Path) -> PosedModel:
-    """Return the images of the camera models in a folder, each with its lens and pose.
-
-    Parameters
-    ----------
-    folder : Path
-        Holds one .cameramodel file per image.
-    images : Path
-        Holds an image of the same name for each.
+    """Return the images of the .cameramodel files in a folder, one of the same name for each in the folder `images`.
 
     Raises
     ------
@@ -148,17 +125,21 @@ def _read(path: Path, images: Path) -> PosedImage:
         raise BadValue(
             f"{path}: its lens is {model.lensmodel}; convert it with mrcal-convert-lensmodel to one of {list(known)}"
         )
-    fx_px, fy_px, cx_px, cy_px, *distortion = model.intrinsics
-    if len(distortion) != known[model.lensmodel]:
+    count = len(model.intrinsics) - 4
+    if count != known[model.lensmodel]:
         raise BadValue(
-            f"{path}: states {len(distortion)} coefficients of distortion, {model.lensmodel} has "
-            f"{known[model.lensmodel]}; write it with mrcal again"
+            f"{path}: states {count} coefficients of distortion, {model.lensmodel} has {known[model.lensmodel]}; "
+            "write it with mrcal again"
         )
     try:
-        lens = Lens(model.imagersize, fx_px, fy_px, cx_px, cy_px, tuple(distortion))
+        lens = Lens.from_parameters(model.imagersize, np.array(model.intrinsics))
     except ValueError as failure:
         raise BadValue(f"{path}: {failure}; calibrate again") from failure
-    return PosedImage(_image_of(path, images), lens, np.array(model.pose))
+    candidates = (images / f"{path.stem}{suffix}" for suffix in sorted(IMAGE_SUFFIXES))
+    image = next(filter(is_file, candidates), None)
+    if image is None:
+        raise MissingFile(f"{images}: holds no image named {path.stem}; put it there, or name its folder with --images")
+    return PosedImage(image, lens, np.array(model.pose))
 
 
 def _literal(path: Path) -> _CameraModel:
@@ -177,12 +158,3 @@ def _literal(path: Path) -> _CameraModel:
         raise BadValue(
             f"{path}: is not a camera model that can be read ({reason}); write it with mrcal again"
         ) from failure
-
-
-def _image_of(path: Path, folder: Path) -> Path:
-    """Return the image that has the name of a camera model."""
-    for suffix in sorted(IMAGE_SUFFIXES):
-        image = folder / f"{path.stem}{suffix}"
-        if is_file(image):
-            return image
-    raise MissingFile(f"{folder}: holds no image named {path.stem}; put it there, or name its folder with --images")

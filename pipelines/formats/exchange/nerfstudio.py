@@ -11,25 +11,24 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.errors import BadValue, MissingFile
-from faintfield.pipelines.formats.exchange.camera_to_world import rt_cam_world, turn_and_centre
+from faintfield.pipelines.formats.exchange.grid_names import picture_named
 from faintfield.pipelines.formats.exchange.imported_set import (
     ExportedSet,
     ImportedSet,
     PosedImage,
     PosedModel,
+    export_posed,
     import_posed,
-    lens_of_each_view,
+    pose_of,
 )
 from faintfield.pipelines.formats.exchange.options import ImportOptions
-from faintfield.pipelines.formats.exchange.picture_folder import picture_named
-from faintfield.pipelines.formats.files import write_json, writing_folder
+from faintfield.pipelines.formats.files import write_json
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.reading import is_file, is_folder, read_json
-from faintfield.pipelines.formats.sets.session_set import load_set_or_session
-from faintfield.pipelines.formats.sets.stated import stated_length
 
 FILE_NAME = "transforms.json"
 
@@ -86,24 +85,20 @@ def import_transforms(src: Path, out: Path, options: ImportOptions) -> ImportedS
 
 
 def export_transforms(set_path: Path, out: Path, *, overwrite: bool) -> ExportedSet:
-    """Write the lens and poses of a set or session as a `transforms.json`."""
-    elemental_set = load_set_or_session(set_path)
-    names = [view.image for view in elemental_set.settings.view]
-    unit = stated_length(elemental_set, "mm")
-    with writing_folder(out, replace_only=[FILE_NAME] if overwrite else ()) as folder:
-        write_transforms(folder, names, lens_of_each_view(elemental_set), elemental_set.poses_rt_cam_ref)
-    return ExportedSet(str(out), len(names), unit)
+    """Write the lens and poses of a set or session as a `transforms.json` of images that are to lie beside it.
+
+    Raises
+    ------
+    BadValue
+        The distortion has terms for which nerfstudio has no names.
+    """
+    return export_posed(set_path, out, "mm", [FILE_NAME] if overwrite else (), _write_transforms)
 
 
 def read_transforms(src: Path, images: Path | None = None) -> PosedModel:
-    """Return the images of a `transforms.json` with their lenses and poses, in its own unit.
+    """Return the images of a `transforms.json`, or of the folder that holds one, with lenses and poses in its unit.
 
-    Parameters
-    ----------
-    src : Path
-        The file, or its folder.
-    images : Path, optional
-        Folder from which the names of images count; that of the file by default.
+    Names of images count from the folder `images`, by default from that of the file.
 
     Raises
     ------
@@ -126,7 +121,7 @@ def read_transforms(src: Path, images: Path | None = None) -> PosedModel:
         try:
             lens = _lens(content, frame, image, sizes)
             matrix = np.array(frame.transform_matrix)[:3]
-            pose = rt_cam_world(matrix[:, :3] @ _FLIP, matrix[:, 3])
+            pose = pose_of(matrix[:, :3] @ _FLIP, matrix[:, 3])
         except (ValueError, OverflowError) as failure:
             raise BadValue(f"{place} ({frame.file_path}): {failure}; {remedy}") from failure
         posed.append(PosedImage(image, lens, pose))
@@ -186,43 +181,30 @@ def _whole(number: float, name: str) -> int:
     return int(number)
 
 
-def write_transforms(folder: Path, names: list[str], lenses: list[Lens], poses: NDArray[np.float64]) -> None:
-    """Write a `transforms.json` of images that are to lie beside it.
-
-    Parameters
-    ----------
-    folder : Path
-        Where to write it.
-    names : list of str
-        File of each image.
-    lenses : list of Lens
-        Its lens; each frame states its own where they differ.
-    poses : array (view, 6)
-        From the world to each camera, Rodrigues rad and any unit.
-
-    Raises
-    ------
-    BadValue
-        The distortion has terms for which nerfstudio has no names.
-    """
+def _write_transforms(folder: Path, views: list[PosedImage]) -> None:
+    lenses = dict.fromkeys(view.lens for view in views)
+    shared = views[0].lens if len(lenses) == 1 else None
     if any(any(lens.distortion[5:]) for lens in lenses):
         raise BadValue(
-            f"{names[0]}: its lens has the distortion {list(lenses[0].distortion)}, of which transforms.json holds the "
-            "first five terms; calibrate with --lens opencv5, or export COLMAP"
+            f"{views[0].path}: its lens has the distortion {list(views[0].lens.distortion)}, of which transforms.json "
+            "holds the first five terms; calibrate with --lens opencv5, or export COLMAP"
         )
-    shared = lenses[0] if len(set(lenses)) == 1 else None
     frames = [
-        _Frame(file_path=name, transform_matrix=_matrix(pose), **({} if shared is not None else _stated(lens)))
-        for name, lens, pose in zip(names, lenses, poses, strict=True)
+        _Frame(
+            file_path=str(view.path),
+            transform_matrix=_matrix(view.rt_cam_world),
+            **({} if shared is not None else _stated(view.lens)),
+        )
+        for view in views
     ]
     whole = {"camera_model": _WRITTEN_MODEL} if shared is None else _stated(shared)
     write_json(folder / FILE_NAME, _Transforms(**whole, frames=frames))
 
 
-def _matrix(pose: NDArray[np.float64]) -> list[_Row]:
+def _matrix(rt_cam_world: NDArray[np.float64]) -> list[_Row]:
     """Return the matrix from a camera of OpenGL to the world."""
-    turn, centre = turn_and_centre(pose)
-    rows = np.column_stack([turn @ _FLIP, centre]).tolist()
+    to_world = Rotation.from_rotvec(rt_cam_world[:3]).inv()
+    rows = np.column_stack([to_world.as_matrix() @ _FLIP, -to_world.apply(rt_cam_world[3:])]).tolist()
     return [(a, b, c, d) for a, b, c, d in [*rows, [0.0, 0.0, 0.0, 1.0]]]
 
 

@@ -1,30 +1,49 @@
-"""An elemental set from pictures taken on a regular grid, in a folder or in one file: `faintfield import grid`."""
+"""An elemental set from pictures taken on a regular grid, in a folder or in one file: `faintfield import grid`.
 
-from dataclasses import asdict
+Views that lie in one file, a stack or a mosaic of views, or hold floats are unpacked beforehand.
+"""
+
+import math
+import shutil
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
+from tempfile import mkdtemp
+from typing import Any
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
-from faintfield.calib.arrangement.nodes import Orientation
+from faintfield.calib.arrangement.views import Orientation
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.console import inform
+from faintfield.pipelines.errors import BadValue, WrongBitDepth
 from faintfield.pipelines.formats.exchange.arranged_grid import arrange_grid
 from faintfield.pipelines.formats.exchange.hci import described_grid, write_true_depth
-from faintfield.pipelines.formats.exchange.imported_noise import StatedNoise
+from faintfield.pipelines.formats.exchange.image_grid import ImageGrid, find_grid
 from faintfield.pipelines.formats.exchange.imported_set import read_picture, write_imported_set
 from faintfield.pipelines.formats.exchange.options import GridOptions
-from faintfield.pipelines.formats.exchange.packed_views import unpack_views
-from faintfield.pipelines.formats.exchange.tone import asked_tone
+from faintfield.pipelines.formats.files import require_room
+from faintfield.pipelines.formats.frames import IMAGE_SUFFIXES, RAW_SUFFIXES, pages_in, read_frame
+from faintfield.pipelines.formats.image_files import write_frame
+from faintfield.pipelines.formats.reading import is_file
 from faintfield.pipelines.formats.sets.elemental_file import Arrangement
 from faintfield.pipelines.formats.units import Units
+from faintfield.rig.plan import grid_nodes
+
+# DN of the largest value of float pictures: below the end of 16 bits, so that no pixel counts as saturated.
+_LARGEST_DN = 65534.0
 
 # Without a pitch the unit of length is free: the plane on which the pictures are aligned gets this depth.
 _FREE_REFERENCE_DEPTH_MM = 1000.0
 
 # Disparity of infinitely far points beyond the largest one found: a share of the range, and a part of a pixel.
 _BEYOND_SHARE, _BEYOND_PX = 0.25, 0.1
+
+type _Views = Callable[[], Iterable[tuple[Path, NDArray[Any]]]]
 
 
 class ImportedGrid(msgspec.Struct, frozen=True):
@@ -48,16 +67,14 @@ def import_pictures(src: Path, out: Path, options: GridOptions) -> ImportedGrid:
     if described is not None:
         pitch_mm, fx_px, disparity_px = described.scale(pitch_mm, fx_px, disparity_px)
     stated = Orientation(options.transpose, options.flip_rows, options.flip_columns)
-    with unpack_views(
-        src, options.rows, options.columns, options.pattern, described.size if described else None
-    ) as views:
-        for remark in views.grid.remarks:
+    with _unpacked(src, options, described.size if described else None) as views:
+        for remark in views.remarks:
             inform(remark)
-        first = read_picture(next(iter(views.grid.paths.values())))
+        first = read_picture(next(iter(views.paths.values())))
         height, width = first.pixels_dn.shape[:2]
         white = float(first.saturation_dn or np.iinfo(first.pixels_dn.dtype).max)
         grid, arrangement = arrange_grid(
-            views.grid,
+            views,
             stated if stated != Orientation() else None,
             white=white if views.dn_per_value is None else np.inf,  # floats state no white
             size_px=(width, height),
@@ -67,25 +84,16 @@ def import_pictures(src: Path, out: Path, options: GridOptions) -> ImportedGrid:
         lens = Lens((width, height), fx_px, fx_px, (width - 1) / 2, (height - 1) / 2)
         write_imported_set(
             out,
+            options,
             grid.posed(lens, pitch_mm, at_infinity_px, arrangement.pitch_ratio),
             reference=grid.centre,
-            noise=StatedNoise(
-                options.gain_dn_per_e,
-                options.read_noise_e,
-                options.offset_dn,
-                options.dark_current_e_per_s,
-                options.quantum_efficiency,
-            ),
-            exposure_s=options.exposure_s,
-            tone=asked_tone(linear=options.linear, srgb=options.srgb),
             command="import grid",
-            options=recorded | {"dn_per_value": views.dn_per_value},
+            recorded=recorded | {"dn_per_value": grid.dn_per_value},
             models=[described.file] if described else [],
-            sources=views.sources,
+            sources=grid.sources,
             units=Units(depth="mm" if in_mm else "disparity_px" if len(grid.paths) > 1 else "relative"),
             arrangement=arrangement,
             also=partial(write_true_depth, described, grid) if described is not None and own_scale else None,
-            overwrite=options.overwrite,
         )
     inform(f"{out}: {grid.size[0]} x {grid.size[1]} views of {width} x {height} px")
     return ImportedGrid(str(out), *grid.size, lens.size_px, len(grid.paths), arrangement)
@@ -105,7 +113,7 @@ def _scale(
             "depths are stated as disparities in px: mm need --pitch-mm and --fx-px"
             + (", and --disparity-px as the pictures are aligned on a plane" if aligned else "")
         )
-    if pitch_mm is not None and fx_px is not None and (disparity_px or not arrangement.aligned):
+    if pitch_mm is not None and fx_px is not None and not aligned:
         return pitch_mm, focal_px, disparity_px, True
     if disparity_px:
         # The plane on which the pictures are aligned gets a depth of its own
@@ -116,3 +124,108 @@ def _scale(
         # Ranges are those along columns of nodes, the scale is that along rows
         at_infinity_px = max(largest + _BEYOND_SHARE * (largest - least) + _BEYOND_PX, 0.0) / arrangement.pitch_ratio
     return pitch_mm or 1.0, focal_px, at_infinity_px, False
+
+
+@contextmanager
+def _unpacked(src: Path, options: GridOptions, running: tuple[int, int] | None) -> Iterator[ImageGrid]:
+    """Yield the views of a folder, see `find_grid`, or of one file; those that were unpacked are gone afterwards.
+
+    A file is a TIFF with a picture for each view, row by row, or one picture of all views in equal tiles.
+    """
+    folder = Path(mkdtemp(prefix="faintfield-views-"))
+    try:
+        if is_file(src):
+            yield _write_views(*_divide_file(src, folder, options.rows, options.columns), folder)
+            return
+        grid = find_grid(src, options.rows, options.columns, options.pattern, running=running)
+        if read_frame(grid.sources[0]).pixels_dn.dtype.kind == "f":
+            grid = _write_views(grid, lambda: ((path, read_frame(path).pixels_dn) for path in grid.sources), folder)
+        yield grid
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _divide_file(src: Path, folder: Path, rows: int | None, columns: int | None) -> tuple[ImageGrid, _Views]:
+    """Return the grid of the views in one file, as files of their own that are not written yet, and these views."""
+    readable = IMAGE_SUFFIXES - RAW_SUFFIXES
+    if src.suffix.lower() not in readable:
+        raise BadValue(
+            f"{src}: is no file that views are unpacked from (these are {', '.join(sorted(readable))}); name a folder "
+            "of pictures, a TIFF with a picture for each view, or a picture that holds them in rows and columns"
+        )
+    count, remarks = pages_in(src), []
+    side = math.isqrt(count)
+    guessed = count > 1 and rows is None and columns is None and side**2 == count
+    if guessed:
+        rows, columns = side, side
+        remarks.append(f"{src.name} holds {count} pictures; they are taken as {side} x {side}, row by row")
+    if rows is None and columns is None:
+        holds = f"holds {count} pictures, which are no square grid" if count > 1 else "holds one picture"
+        raise BadValue(f"{src}: {holds}; give --rows and --columns of the views in it")
+    rows, columns = rows or 1, columns or 1
+    if count > 1 and count != rows * columns:
+        raise BadValue(
+            f"{src}: holds {count} pictures, a grid of {rows} x {columns} needs {rows * columns}; correct --rows and "
+            "--columns"
+        )
+    paths = {node: folder / f"{src.stem}_r{node[0]}_c{node[1]}.tiff" for node in grid_nodes(rows, columns)}
+    grid = ImageGrid(paths, remarks=remarks, guessed=guessed, sources=[src])
+    if count > 1:
+        return grid, lambda: ((path, read_frame(src, page=page).pixels_dn) for page, path in enumerate(paths.values()))
+    return grid, lambda: zip(paths.values(), _tiles(src, rows, columns), strict=True)
+
+
+def _tiles(src: Path, rows: int, columns: int) -> list[NDArray[Any]]:
+    """Return the equal tiles of a picture, row by row."""
+    picture = read_frame(src).pixels_dn
+    height, width = picture.shape[:2]
+    if height % rows or width % columns:
+        raise BadValue(
+            f"{src}: is {width} x {height} px, which {columns} columns and {rows} rows do not divide; correct --rows "
+            "and --columns, or crop the margins away"
+        )
+    return [tile for line in np.split(picture, rows) for tile in np.split(line, columns, axis=1)]
+
+
+def _write_views(grid: ImageGrid, views: _Views, folder: Path) -> ImageGrid:
+    """Write views as files of their own; floats become 16-bit numbers, linear, all by one factor."""
+    _, first = next(iter(views()))
+    require_room(folder, len(grid.paths) * 2 * first.size)
+    factor = _dn_per_value(views) if first.dtype.kind == "f" else None
+    paths = {}
+    for node, (path, pixels) in zip(grid.paths, views(), strict=True):
+        paths[node] = folder / f"{path.stem}.tiff"
+        whole = pixels if factor is None else np.rint(np.maximum(pixels, 0) * factor).astype(np.uint16)
+        write_frame(paths[node], whole)
+    words = [] if factor is None else [f"float values became 16-bit numbers, linear, {factor:.6g} DN for 1"]
+    return replace(grid, paths=paths, remarks=grid.remarks + words, dn_per_value=factor)
+
+
+def _dn_per_value(views: _Views) -> float:
+    """Return the factor by which float pictures become 16-bit ones.
+
+    Raises
+    ------
+    BadValue
+        A value is not finite, or below zero by more than rounding hides.
+    WrongBitDepth
+        A picture does not hold floats.
+    """
+    least, largest, darkest = 0.0, 0.0, Path()
+    for path, pixels in views():
+        if pixels.dtype.kind != "f":
+            raise WrongBitDepth(
+                f"{path}: holds {pixels.dtype} pixels, the first picture floats; export all of them alike"
+            )
+        if not np.isfinite(pixels).all():
+            raise BadValue(f"{path}: holds values that are not finite; replace them, or leave the picture out")
+        largest = max(largest, float(pixels.max()))
+        if pixels.min() < least:
+            least, darkest = float(pixels.min()), path
+    factor = _LARGEST_DN / largest if largest > 0 else 1.0
+    if least * factor < -0.5:
+        raise BadValue(
+            f"{darkest}: holds {least:g}, and the largest value of all pictures is {largest:g}; light is not negative: "
+            "add one number to all pictures, and state it by --offset-dn, in DN as the import scales them"
+        )
+    return factor

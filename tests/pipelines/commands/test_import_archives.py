@@ -12,7 +12,7 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
-from faintfield.calib.arrangement.nodes import Orientation
+from faintfield.calib.arrangement.views import Orientation
 from faintfield.pipelines.formats.exchange.image_grid import find_grid
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.sets.elemental_set import load_set

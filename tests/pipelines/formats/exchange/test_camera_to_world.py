@@ -13,10 +13,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from faintfield.calib.lens import Lens
 from faintfield.pipelines.errors import InputError
 from faintfield.pipelines.formats.exchange.nerfstudio import read_transforms
-from faintfield.pipelines.formats.exchange.pose_table import PoseTable
+from faintfield.pipelines.formats.exchange.pose_table import read_poses
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from tests.pipelines.conftest import Command, Edit, assert_refused
 
@@ -235,8 +234,8 @@ class TestPoseTables:
     ) -> None:
         path = self.table(tmp_path_factory.mktemp("table"), f"name,x,y,z\nb,{','.join(map(repr, place))}{junk}")
         try:
-            (image,) = PoseTable(path).posed(Lens((16, 12), 20.0, 20.0, 7.5, 5.5), path.parent).images
+            (pose,) = read_poses(path, path.parent)[0].values()
         except InputError:
             assert junk.strip() or not max(map(abs, place)) < 1e9
         else:
-            assert np.isfinite(image.rt_cam_world).all()
+            assert np.isfinite(pose).all()

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from faintfield.calib.arrangement.nodes import Node
+from faintfield.calib.arrangement.views import Node
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.exchange.grid_names import by_number, places_by_habit, places_by_pattern
 from faintfield.pipelines.formats.exchange.image_grid import measured_steps, nodes_of
