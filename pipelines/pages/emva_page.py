@@ -1,7 +1,6 @@
 """The page `emva1288_report.html`: the report of a sensor by EMVA 1288 release 4.0."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -9,8 +8,8 @@ from faintfield.calib.noise import Estimate
 from faintfield.calib.noise.likelihood.rounding import ROUNDING_DN2
 from faintfield.pipelines.calibration.noise_emva import EmvaMeasurement
 from faintfield.pipelines.formats.results.noise import STANDARD, NoiseRecord
-from faintfield.pipelines.pages.emva_plots import Drawing, drawings
-from faintfield.pipelines.pages.page import html_symbols, template
+from faintfield.pipelines.pages.emva_plots import drawings
+from faintfield.pipelines.pages.page import Row, fixed, html_symbols, template
 
 EMVA_PAGE = "emva1288_report.html"
 
@@ -56,63 +55,39 @@ _TABLE: dict[str, tuple[tuple[str, str, str, str, float], ...]] = {
     ),
 }
 
-# Ratios that are given in decibels and bits too.
+# Ratios are given in decibels and bits, too.
 _RATIOS = ("snr_max", "dynamic_range")
-
-
-@dataclass(frozen=True)
-class Line:
-    """A line of the table: symbol, words, value, interval, unit; or, in `why`, the reason for no value."""
-
-    symbol: str
-    words: str
-    value: str = ""
-    interval: str = ""
-    unit: str = ""
-    why: str = ""
-
-
-@dataclass(frozen=True)
-class Part:
-    """The part of the page about one phase of the mosaic."""
-
-    name: str
-    measured: EmvaMeasurement
-    groups: list[tuple[str, list[Line]]]
-    drawings: list[Drawing]
 
 
 def emva_page(name: str, record: NoiseRecord, measured: Sequence[EmvaMeasurement]) -> str:
     """Return the page about a sensor, with one part for each phase of its mosaic."""
-    parts = [Part(plane.name, plane, table_of(plane), drawings(plane)) for plane in measured]
+    parts = [
+        {"name": phase.name, "measured": phase, "groups": _table_of(phase), "drawings": list(drawings(phase))}
+        for phase in measured
+    ]
     return template("emva1288.html").render(name=name, record=record, parts=parts, standard=STANDARD, sub=html_symbols)
 
 
-def table_of(measured: EmvaMeasurement) -> list[tuple[str, list[Line]]]:
+def _table_of(measured: EmvaMeasurement) -> list[tuple[str, list[Row]]]:
     """Return the table in groups; a reason that holds for several quantities is given once."""
     known = {**measured.calibration.estimates, **measured.estimates}
-    known |= _in_other_units(known)
-    explained: dict[str, str] = {}
-    groups = []
-    for title, rows in _TABLE.items():
-        lines = [_line(known[key], row, factor, explained) for key, *row, factor in rows]
-        for key, symbol, words, _, _ in rows:
-            if key in _RATIOS and known[key].value is not None:
-                for unit, scale in (("dB", lambda ratio: 20 * np.log10(ratio)), ("bit", np.log2)):
-                    lines.append(_line(_mapped(known[key], scale), (symbol, words, unit), 1.0, explained))
-        groups.append((title, lines))
-    return groups
-
-
-def _in_other_units(known: Mapping[str, Estimate]) -> dict[str, Estimate]:
-    """Return 1/K, the dark noise with that of rounding, and DSNU in DN."""
     gain = known["gain_dn_per_e"].value or 0.0
-    return {
+    known |= {
         "gain_e_per_dn": _mapped(known["gain_dn_per_e"], lambda value: 1 / value),
         "dark_noise_dn": _mapped(known["read_noise_dn"], lambda noise_dn: np.sqrt(noise_dn**2 + ROUNDING_DN2)),
         # DSNU in electrons is that in DN over K, whose own error is not in its interval
         "dsnu_total_dn": _mapped(known["dsnu_total_e"], lambda electrons: electrons * gain),
     }
+    explained: dict[str, str] = {}
+    groups = []
+    for title, quantities in _TABLE.items():
+        rows = [_row(known[key], row, factor, explained) for key, *row, factor in quantities]
+        for key, symbol, words, _, _ in quantities:
+            if key in _RATIOS and known[key].value is not None:
+                for unit, scale in (("dB", lambda ratio: 20 * np.log10(ratio)), ("bit", np.log2)):
+                    rows.append(_row(_mapped(known[key], scale), (symbol, words, unit), 1.0, explained))
+        groups.append((title, rows))
+    return groups
 
 
 def _mapped(known: Estimate, function: Callable[[float], float]) -> Estimate:
@@ -123,26 +98,20 @@ def _mapped(known: Estimate, function: Callable[[float], float]) -> Estimate:
     return Estimate(float(function(known.value)), None, (ends[0], ends[1]) if ends else None)
 
 
-def _line(known: Estimate, row: Sequence[str], factor: float, explained: dict[str, str]) -> Line:
+def _row(known: Estimate, row: Sequence[str], factor: float, explained: dict[str, str]) -> Row:
     """Return a line of the table; `explained` holds the symbol that each reason was given for."""
     symbol, words, unit = row
     if known.value is None:
         why = known.why or "no reason stated"
         first = explained.setdefault(why, symbol)
-        return Line(symbol, words, why=why if first == symbol else f"as for {first}")
-    ends = None if known.ci95 is None else (known.ci95[0] * factor, known.ci95[1] * factor)
-    value, interval = rounded(known.value * factor, ends)
-    return Line(symbol, words, value, interval, unit)
-
-
-def rounded(value: float, ends: tuple[float, float] | None) -> tuple[str, str]:
-    """Return a value and its interval as text, with two digits of half the interval's width."""
-    if ends is None:
-        return f"{value:.4g}".replace("-", "−"), ""
-    half = (ends[1] - ends[0]) / 2
+        return Row(words, symbol=symbol, why=why if first == symbol else f"as for {first}")
+    value = known.value * factor
+    if known.ci95 is None:
+        return Row(words, f"{value:.4g}".replace("-", "−"), "", unit, symbol=symbol)
+    # Two digits of half the interval's width
+    low, high = known.ci95[0] * factor, known.ci95[1] * factor
+    half = (high - low) / 2
     scale = half if half > 0 else 1e-4 * abs(value) or 1.0
     digits = int(np.clip(1 - np.floor(np.log10(scale)), -8, 8))
-    low, middle, high = (
-        f"{round(number, digits):.{max(digits, 0)}f}".replace("-", "−") for number in (ends[0], value, ends[1])
-    )
-    return middle, f"{low} … {high}"
+    low_end, middle, high_end = (fixed(round(number, digits), digits) for number in (low, value, high))
+    return Row(words, middle, f"{low_end} … {high_end}", unit, symbol=symbol)

@@ -2,10 +2,13 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import LogLocator, MaxNLocator
 from numpy.typing import NDArray
+from scipy.special import erfc
 
 from faintfield.calib.noise.emva.nonuniformity import accumulated_histogram, high_pass, spectrogram
 from faintfield.calib.noise.emva.quantities import snr
@@ -13,9 +16,6 @@ from faintfield.calib.noise.likelihood.response import known_light
 from faintfield.calib.noise.likelihood.rounding import ROUNDING_DN2
 from faintfield.pipelines.calibration.noise_emva import EmvaMeasurement, MeanImage
 from faintfield.pipelines.pages.page import INK, blank_drawing, ink, math_symbols, svg
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 # Measured, model, and a second series; distinct without colour vision, and on black as on white.
 MEASURED, MODEL, SECOND = "#0072b2", "#d55e00", "#009e73"
@@ -25,29 +25,47 @@ _FINE_RANGE = 10.0
 
 _NO_FLATS = "there are no flats"
 
+# The caption of a drawing, and the function that draws it; or the reason why there is none.
+type _Plot = tuple[str, Callable[[Axes], None]] | str
 
-@dataclass(frozen=True)
-class Drawing:
+
+class Drawing(NamedTuple):
     """One drawing as SVG, or, in `missing`, the reason why there is none."""
 
     title: str
-    caption: str
+    caption: str = ""
     picture: str = ""
-    missing: str | None = None
+    missing: str = ""
 
 
-def drawings(measured: EmvaMeasurement) -> list[Drawing]:
-    """Return the drawings of one phase, in the order of the standard's report."""
-    flats = levels_of(measured, "flat")
-    by_light = [draw(measured, flats) for draw in (_photon_transfer, _sensitivity, _linearity, _snr)]
-    return [*by_light, _dark_signal(measured), *_image_drawings(measured)]
+def drawings(measured: EmvaMeasurement) -> Iterator[Drawing]:
+    """Yield the drawings of one phase, in the order of the standard's report."""
+    flats = _levels_of(measured, "flat")
+    plots: dict[str, _Plot] = {
+        "Photon transfer": _photon_transfer(measured, flats),
+        "Sensitivity": _sensitivity(measured, flats),
+        "Deviation from linearity": _linearity(measured, flats),
+        "Signal-to-noise ratio": _snr(measured, flats),
+        "Dark current": _dark_signal(measured),
+    }
+    images = ((measured.dark, "DSNU", "dsnu_total_e", "DN", 1.0), (measured.bright, "PRNU", "prnu_total", "%", 100.0))
+    for kind, plot in (("spectrograms", _spectrograms), ("accumulated histogram", _histogram)):
+        for image, quantity, name, unit, factor in images:
+            missing = measured.estimates[name].why or "there is no image"
+            plots[f"{quantity} {kind}"] = plot(measured, image, unit, factor) if image else missing
+    for title, plotted in plots.items():
+        yield Drawing(title, missing=plotted) if isinstance(plotted, str) else _drawn(title, *plotted)
 
 
-def _draw(title: str, caption: str, draw: "Callable[[Axes], None]") -> Drawing:
-    """Return a drawing of one pair of axes."""
-    figure, axes = blank_drawing(5.6, 3.4)
+def _drawn(title: str, caption: str, draw: Callable[[Axes], None]) -> Drawing:
+    figure, axes = blank_drawing(5.6, 3.4, None)
     draw(axes)
-    _reduce_ticks(axes)
+    # Logarithmic axes have few ticks, with plain numbers: ticks are what takes time in a drawing
+    axes.minorticks_off()
+    for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
+        if axis.get_scale() == "log":
+            axis.set_major_locator(MaxNLocator(6) if high < _FINE_RANGE * low else LogLocator())
+            axis.set_major_formatter("{x:g}")
     ink(axes)
     axes.set(xlabel=math_symbols(axes.get_xlabel()), ylabel=math_symbols(axes.get_ylabel()))
     if axes.get_legend_handles_labels()[0]:
@@ -57,19 +75,8 @@ def _draw(title: str, caption: str, draw: "Callable[[Axes], None]") -> Drawing:
     return Drawing(title, caption, svg(figure))
 
 
-def _reduce_ticks(axes: "Axes") -> None:
-    """Give logarithmic axes few ticks, with plain numbers: ticks are what takes time in a drawing."""
-    from matplotlib.ticker import LogLocator, MaxNLocator
-
-    axes.minorticks_off()
-    for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
-        if axis.get_scale() == "log":
-            axis.set_major_locator(MaxNLocator(6) if high < _FINE_RANGE * low else LogLocator())
-            axis.set_major_formatter("{x:g}")
-
-
 @dataclass(frozen=True)
-class Levels:
+class _Levels:
     """Mean and variance of the flats or darks of a measurement, arrays (series,), dark ones first by brightness.
 
     `signal_dn` is above the dark of zero exposure; `kept` marks the series within the range of the sensor.
@@ -83,7 +90,7 @@ class Levels:
     kept: NDArray[np.bool_]
 
 
-def levels_of(measured: EmvaMeasurement, kind: str) -> Levels:
+def _levels_of(measured: EmvaMeasurement, kind: str) -> _Levels:
     """Return the levels of all series of a kind; the variance of one that has a single frame is NaN."""
     series = sorted(
         (item for item in measured.series if item.conditions.kind == kind), key=lambda item: item.levels_dn.mean()
@@ -100,7 +107,7 @@ def levels_of(measured: EmvaMeasurement, kind: str) -> Levels:
             for item in series
         ]
     )
-    return Levels(
+    return _Levels(
         signal_dn=np.array([item.levels_dn.mean() - offset for item in series]),
         variance_dn2=variance,
         error_dn2=variance * np.sqrt(2 / freedom),
@@ -110,15 +117,14 @@ def levels_of(measured: EmvaMeasurement, kind: str) -> Levels:
     )
 
 
-def _photon_transfer(measured: EmvaMeasurement, flats: Levels) -> Drawing:
+def _photon_transfer(measured: EmvaMeasurement, flats: _Levels) -> _Plot:
     """Draw the variance less that of the dark against the signal, with the line of the gain."""
-    title = "Photon transfer"
     if not flats.signal_dn.size:
-        return Drawing(title, "", missing=_NO_FLATS)
+        return _NO_FLATS
     estimates = measured.calibration.estimates
     gain, read_dn = estimates["gain_dn_per_e"].value, estimates["read_noise_dn"].value or 0.0
 
-    def draw(axes: "Axes") -> None:
+    def draw(axes: Axes) -> None:
         series = (flats.kept, MEASURED, "o", "flats, ± 2 s.e."), (~flats.kept, SECOND, "x", "left out")
         for mask, colour, mark, label in series:
             if mask.any():
@@ -135,8 +141,7 @@ def _photon_transfer(measured: EmvaMeasurement, flats: Levels) -> Drawing:
         axes.set_xlim(left=0)
         axes.set_ylim(bottom=0)
 
-    caption = "Its slope at the origin is the gain K. The dark is that of zero exposure."
-    return _draw(title, caption, draw)
+    return "Its slope at the origin is the gain K. The dark is that of zero exposure.", draw
 
 
 def _charge_dn(measured: EmvaMeasurement, signal_dn: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -152,7 +157,7 @@ def _slope(measured: EmvaMeasurement, signal_dn: NDArray[np.float64]) -> NDArray
     return np.asarray(2 * step / np.maximum(grown, 1e-9))
 
 
-def _light(measured: EmvaMeasurement, flats: Levels) -> tuple[NDArray[np.float64], str, str] | None:
+def _light(measured: EmvaMeasurement, flats: _Levels) -> tuple[NDArray[np.float64], str, str] | None:
     """Return the light of the flats with its name and unit, None if it is not known up to one factor."""
     if flats.photons.size and np.isfinite(flats.photons).all():
         return flats.photons, "μ_p", "photons/pixel"
@@ -162,16 +167,14 @@ def _light(measured: EmvaMeasurement, flats: Levels) -> tuple[NDArray[np.float64
     return None
 
 
-def _sensitivity(measured: EmvaMeasurement, flats: Levels) -> Drawing:
-    title = "Sensitivity"
+def _sensitivity(measured: EmvaMeasurement, flats: _Levels) -> _Plot:
     light = _light(measured, flats)
     if light is None:
-        why = "neither photons nor several exposures of one light are stated" if flats.signal_dn.size else _NO_FLATS
-        return Drawing(title, "", missing=why)
+        return "neither photons nor several exposures of one light are stated" if flats.signal_dn.size else _NO_FLATS
     amount, name, unit = light
     slope = measured.estimates["responsivity_dn_per_photon"].value if unit != "s" else None
 
-    def draw(axes: "Axes") -> None:
+    def draw(axes: Axes) -> None:
         axes.plot(amount[flats.kept], flats.signal_dn[flats.kept], "o", ms=4, color=MEASURED, label="flats")
         if not flats.kept.all():
             axes.plot(amount[~flats.kept], flats.signal_dn[~flats.kept], "x", ms=5, color=SECOND, label="left out")
@@ -182,26 +185,26 @@ def _sensitivity(measured: EmvaMeasurement, flats: Levels) -> Drawing:
         axes.set_xlim(left=0)
         axes.set_ylim(bottom=0)
 
-    return _draw(title, "The slope at the origin is the responsivity R.", draw)
+    return "The slope at the origin is the responsivity R.", draw
 
 
-def _linearity(measured: EmvaMeasurement, flats: Levels) -> Drawing:
+def _linearity(measured: EmvaMeasurement, flats: _Levels) -> _Plot:
     """Draw the relative deviation of the signal from the straight line of EMVA 1288."""
-    title, light = "Deviation from linearity", _light(measured, flats)
+    light = _light(measured, flats)
     level = measured.calibration.saturation.level_dn
     if light is None or not flats.kept.any():
-        return Drawing(title, "", missing="the light of the flats is not known" if flats.signal_dn.size else _NO_FLATS)
+        return "the light of the flats is not known" if flats.signal_dn.size else _NO_FLATS
     offset = measured.calibration.estimates["offset_dn"].value or 0.0
     full = float(flats.signal_dn[flats.kept].max()) if level is None else level - offset
     current = measured.calibration.estimates["dark_signal_dn_per_s"].value or 0.0
     signal = flats.signal_dn - current * flats.exposure_s
     inside = flats.kept & (signal > 0.05 * full) & (signal < 0.95 * full)
     if inside.sum() < 3:
-        return Drawing(title, "", missing="fewer than 3 levels are within 5 to 95 % of saturation")
+        return "fewer than 3 levels are within 5 to 95 % of saturation"
     design = np.stack([np.ones(inside.sum()), light[0][inside]], axis=1)
     line = design @ np.linalg.lstsq(design / signal[inside, None], np.ones(inside.sum()))[0]
 
-    def draw(axes: "Axes") -> None:
+    def draw(axes: Axes) -> None:
         axes.axhline(0, color=MODEL, lw=1)
         axes.plot(light[0][inside], 100 * (signal[inside] / line - 1), "o-", ms=4, lw=0.8, color=MEASURED)
         axes.set(xlabel=f"{light[1]} ({light[2]})", ylabel="deviation (%)")
@@ -211,15 +214,14 @@ def _linearity(measured: EmvaMeasurement, flats: Levels) -> Drawing:
         "of relative deviations, within 5 to 95 % of saturation (of the brightest flat, if none is saturated). LE in "
         "the table is the mean of those of the fitted response, which has no errors of single levels."
     )
-    return _draw(title, caption, draw)
+    return caption, draw
 
 
-def _snr(measured: EmvaMeasurement, flats: Levels) -> Drawing:
+def _snr(measured: EmvaMeasurement, flats: _Levels) -> _Plot:
     """Draw the SNR against photons, or electrons where the photons are not known."""
-    title = "Signal-to-noise ratio"
     gain, noise = measured.calibration.estimates["gain_dn_per_e"], measured.estimates["dark_noise_e"]
     if gain.value is None or noise.value is None:
-        return Drawing(title, "", missing=gain.why)
+        return gain.why or noise.why or "no reason stated"
     k, sigma_e = gain.value, noise.value
     efficiency = measured.calibration.estimates["quantum_efficiency"].value
     name, per_e = ("μ_p (photons/pixel)", 1 / efficiency) if efficiency else ("μ_e (e⁻/pixel)", 1.0)
@@ -229,7 +231,7 @@ def _snr(measured: EmvaMeasurement, flats: Levels) -> Drawing:
     charge = _charge_dn(measured, signal) / k
     top = capacity or 2 * float(charge.max(initial=1e3))
 
-    def draw(axes: "Axes") -> None:
+    def draw(axes: Axes) -> None:
         grid = np.geomspace(0.5, top, 300)
         dsnu, prnu = (measured.estimates[key].value for key in ("dsnu_total_e", "prnu_total"))
         axes.plot(grid * per_e, snr(grid, k, sigma_e), color=MODEL, label="linear model")
@@ -250,42 +252,30 @@ def _snr(measured: EmvaMeasurement, flats: Levels) -> Drawing:
         axes.set(xscale="log", yscale="log", xlabel=name, ylabel="SNR")
         axes.set_ylim(bottom=0.3)
 
-    return _draw(title, "Where SNR = 1 is the absolute sensitivity threshold μ_p.min.", draw)
+    return "Where SNR = 1 is the absolute sensitivity threshold μ_p.min.", draw
 
 
-def _dark_signal(measured: EmvaMeasurement) -> Drawing:
-    title, darks = "Dark current", levels_of(measured, "dark")
+def _dark_signal(measured: EmvaMeasurement) -> _Plot:
+    darks = _levels_of(measured, "dark")
     if np.unique(darks.exposure_s).size < 2:
-        return Drawing(title, "", missing="all darks have one exposure")
+        return "all darks have one exposure"
     slope = measured.calibration.estimates["dark_signal_dn_per_s"].value
 
-    def draw(axes: "Axes") -> None:
+    def draw(axes: Axes) -> None:
         axes.plot(darks.exposure_s, darks.signal_dn, "o", ms=4, color=MEASURED, label="darks")
         if slope is not None:
             ends = np.array([0.0, darks.exposure_s.max()])
             axes.plot(ends, slope * ends, color=MODEL, label="K μ_I t")
         axes.set(xlabel="exposure (s)", ylabel="μ_y.dark − μ_y.dark(0) (DN)")
 
-    return _draw(title, "The slope over K is the dark current μ_I.", draw)
+    return "The slope over K is the dark current μ_I.", draw
 
 
-def _image_drawings(measured: EmvaMeasurement) -> Iterator[Drawing]:
-    """Yield the spectrograms and histograms of one phase of the mosaic."""
-    images = ((measured.dark, "DSNU", "dsnu_total_e", "DN", 1.0), (measured.bright, "PRNU", "prnu_total", "%", 100.0))
-    for kind, draw in (("spectrograms", _spectrograms), ("accumulated histogram", _histogram)):
-        for image, quantity, name, unit, factor in images:
-            title = f"{quantity} {kind}"
-            if image:
-                yield draw(measured, title, image, unit, factor)
-            else:
-                yield Drawing(title, "", missing=measured.estimates[name].why or "there is no image")
-
-
-def _spectrograms(measured: EmvaMeasurement, title: str, image: MeanImage, unit: str, factor: float) -> Drawing:
+def _spectrograms(measured: EmvaMeasurement, image: MeanImage, unit: str, factor: float) -> _Plot:
     """Draw the horizontal and the vertical spectrogram, as amplitudes."""
     spectra = [spectrogram(image.values, measured.used, axis) for axis in (1, 0)]
 
-    def draw(axes: "Axes") -> None:
+    def draw(axes: Axes) -> None:
         for spectrum, colour, label in zip(spectra, (MEASURED, SECOND), ("horizontal", "vertical"), strict=True):
             axes.semilogy(spectrum.frequency, factor * np.sqrt(spectrum.power), lw=0.9, color=colour, label=label)
         white = factor * float(np.sqrt(np.mean([spectrum.white for spectrum in spectra])))
@@ -296,17 +286,15 @@ def _spectrograms(measured: EmvaMeasurement, title: str, image: MeanImage, unit:
         low, high = axes.get_ylim()
         axes.set_ylim(low, high * (high / low) ** 0.5)  # room for the legend
 
-    return _draw(title, _caption(image) + " White noise is level at its standard deviation; a peak is a pattern.", draw)
+    return _caption(image) + " White noise is level at its standard deviation; a peak is a pattern.", draw
 
 
-def _histogram(measured: EmvaMeasurement, title: str, image: MeanImage, unit: str, factor: float) -> Drawing:
+def _histogram(measured: EmvaMeasurement, image: MeanImage, unit: str, factor: float) -> _Plot:
     """Draw one accumulated histogram, of all pixels: here outliers are what counts."""
-    from scipy.special import erfc
-
     every, is_flat = np.ones_like(measured.used), image.series.conditions.kind == "flat"
     histogram = accumulated_histogram(high_pass(image.values, every) if is_flat else image.values, every)
 
-    def draw(axes: "Axes") -> None:
+    def draw(axes: Axes) -> None:
         deviation = factor * histogram.deviation
         percent = 100 * erfc(histogram.deviation / (np.sqrt(2) * max(histogram.sigma, 1e-12)))
         axes.semilogy(deviation, histogram.percent, color=MEASURED, drawstyle="steps-pre", label="all pixels")
@@ -316,7 +304,7 @@ def _histogram(measured: EmvaMeasurement, title: str, image: MeanImage, unit: st
         axes.set_xlim(left=0)
 
     filtered = " Less its mean over 5 × 5 pixels." if is_flat else ""
-    return _draw(title, _caption(image) + filtered + " Unusable pixels are included: they are its tail.", draw)
+    return _caption(image) + filtered + " Unusable pixels are included: they are its tail.", draw
 
 
 def _caption(image: MeanImage) -> str:

@@ -1,15 +1,16 @@
 """The page of a measured geometry: tables of the stage and the lens, and drawings of the nodes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.calib.geometry import GeometrySettings
 from faintfield.pipelines.formats.results.geometry import GeometryRecord, LensRecord, StageFigure, StageRecord
-from faintfield.pipelines.pages.page import INK, blank_drawing, figure, ink, svg, template
+from faintfield.pipelines.pages.page import INK, Row, blank_drawing, figure, fixed, ink, svg, template
+
+if TYPE_CHECKING:
+    from faintfield.calib.geometry import GeometrySettings
 
 _FIGURES: tuple[tuple[str, str, str, float], ...] = (
     ("pitch_x_mm", "pitch along rows", "mm", 1.0),
@@ -39,22 +40,11 @@ _COARSE_RAD = 1e-4
 _MAX_WRITTEN = 121
 
 
-@dataclass(frozen=True)
-class Row:
-    """A line of a table: words, value, uncertainty, unit; or, in `why`, a remark or the reason for no value."""
-
-    words: str
-    value: str
-    sigma: str = ""
-    unit: str = ""
-    why: str = ""
-
-
-def geometry_page(geometry: GeometryRecord) -> str:
-    """Return geometry.html: the stage, the nodes and the lens of a measured geometry."""
+def geometry_page(geometry: GeometryRecord, limits: "GeometrySettings") -> str:
+    """Return geometry.html; `limits` are those that the geometry was accepted by."""
     return template("geometry.html").render(
         rows=stage_rows(geometry.stage),
-        holdout=holdout_rows(geometry),
+        holdout=holdout_rows(geometry, limits),
         lens=_lens_rows(geometry.lens),
         drawing=node_drawing(geometry),
         maps=sigma_maps(geometry),
@@ -63,17 +53,17 @@ def geometry_page(geometry: GeometryRecord) -> str:
 
 
 def stage_rows(stage: StageRecord) -> list[Row]:
-    """Return the table of the stage's figures."""
+    """Return the table of the stage."""
     return [_row(getattr(stage, name), words, unit, factor) for name, words, unit, factor in _FIGURES]
 
 
-def holdout_rows(geometry: GeometryRecord) -> list[Row]:
+def holdout_rows(geometry: GeometryRecord, limits: "GeometrySettings") -> list[Row]:
     """Return the table of boards left out of the fit: the ratio and what it adds, each beside its limit, or why not."""
     name = "residual of boards left out, over that of the fit"
-    ratio, limits = geometry.holdout_ratio, GeometrySettings()
+    ratio = geometry.holdout_ratio
     if ratio is None:
         why = "there is one only" if len(geometry.boards) < 2 else "some node would see no other board"
-        return [Row(name, "–", why=f"none can be left out: {why}")]
+        return [Row(name, why=f"none can be left out: {why}")]
     added_px = geometry.rms_inlier_px * np.sqrt(max(ratio**2 - 1, 0))
     limit = f"limit {limits.max_holdout_ratio:g}"
     if ratio > limits.max_holdout_ratio:
@@ -94,13 +84,11 @@ def _lens_rows(lens: LensRecord) -> list[Row]:
 
 
 def _row(estimate: StageFigure, name: str, unit: str, factor: float) -> Row:
-    """Return a line of the table, with as many digits as the uncertainty deserves."""
     if estimate.value is None or estimate.sigma is None:
-        return Row(name, "–", why=estimate.why or "")
+        return Row(name, why=estimate.why or "")
     sigma = estimate.sigma * factor
     digits = int(np.clip(1 - np.floor(np.log10(sigma)), 0, 7)) if sigma > 0 else 3
-    value = f"{estimate.value * factor:.{digits}f}".replace("-", "−")
-    return Row(name, value, f"± {sigma:.{digits}f}", unit)
+    return Row(name, fixed(estimate.value * factor, digits), f"± {sigma:.{digits}f}", unit)
 
 
 def node_drawing(geometry: GeometryRecord) -> str | None:
@@ -116,7 +104,7 @@ def node_drawing(geometry: GeometryRecord) -> str | None:
     real = nominal + factor * residuals[:, :2]
     across_mm = np.ptp(nominal, axis=0) + 2 * pitch
     height = float(np.clip(4.9 * across_mm[1] / across_mm[0], 2.2, 7)) + 0.9
-    figure, axes = blank_drawing(5.4, height, "constrained")
+    figure, axes = blank_drawing(5.4, height)
     axes.plot(*nominal.T, "+", color=INK, ms=10, mew=1, alpha=0.6, label="regular grid that fits best")
     limit = 1e3 * (float(np.abs(residuals[:, 2]).max()) or 1e-6)
     look: dict[str, Any] = {"cmap": "coolwarm", "vmin": -limit, "vmax": limit, "edgecolors": INK, "linewidths": 0.6}
@@ -137,18 +125,17 @@ def node_drawing(geometry: GeometryRecord) -> str | None:
 def sigma_maps(geometry: GeometryRecord) -> list[str]:
     """Return maps over the nodes of the standard deviation of position and of rotation, an SVG each."""
     nodes = [entry.node for entry in geometry.nodes]
-    sigma_um = [1e3 * entry.sigma_mm for entry in geometry.nodes]
     largest_rad = max(entry.sigma_rad for entry in geometry.nodes)
     per_rad, unit = (1e3, "mrad") if largest_rad >= _COARSE_RAD else (1e6, "µrad")
-    sigma_rotation = [per_rad * entry.sigma_rad for entry in geometry.nodes]
-    return [
-        _sigma_map(nodes, sigma_um, "σ of position, √ of the variances' sum (µm)"),
-        _sigma_map(nodes, sigma_rotation, f"σ of rotation, √ of the variances' sum ({unit})"),
-    ]
+    sigmas = {
+        "position, √ of the variances' sum (µm)": [1e3 * entry.sigma_mm for entry in geometry.nodes],
+        f"rotation, √ of the variances' sum ({unit})": [per_rad * entry.sigma_rad for entry in geometry.nodes],
+    }
+    return [_sigma_map(nodes, values, f"σ of {label}") for label, values in sigmas.items()]
 
 
 def _sigma_map(nodes: Sequence[tuple[int, int]], sigmas: Sequence[float], label: str) -> str:
-    figure, axes = blank_drawing(4.8, 4.0, "constrained")
+    figure, axes = blank_drawing(4.8, 4.0)
     places = np.array(nodes)
     (top, left), (rows, columns) = places.min(axis=0), np.ptp(places, axis=0) + 1
     values = np.full((rows, columns), np.nan)  # where there is no node
@@ -175,7 +162,7 @@ def _colour_bar(figure: Any, image: Any, axes: Any, label: str) -> None:
 
 
 def _magnification(residuals: NDArray[np.float64], pitch_mm: float) -> float:
-    """Return the factor by which deviations are magnified: a round number that keeps the largest within its cell."""
+    """Return a round factor that keeps the largest deviation within its cell."""
     largest = float(np.linalg.norm(residuals[:, :2], axis=1).max())
     if largest == 0:
         return 1.0

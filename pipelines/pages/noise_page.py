@@ -2,7 +2,7 @@
 
 import io
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -38,8 +38,7 @@ _PLOTS_PER_ROW = 3
 _MAX_SHOWN_PX = 2000
 
 
-@dataclass(frozen=True)
-class Plot:
+class _Plot(NamedTuple):
     """One plot of the page; `missing` is the reason for leaving it out, None where it has something to show."""
 
     title: str
@@ -49,12 +48,12 @@ class Plot:
 
 def draw_page(calibration: NoiseCalibration, title: str) -> bytes:
     """Return the page as a PNG: the plots, and below them the names of those left out, with the reason."""
-    plots = page_plots(calibration)
+    plots = _plots(calibration)
     shown = [plot for plot in plots if plot.missing is None]
     down = -(-len(shown) // _PLOTS_PER_ROW)
     figure = Figure(figsize=(15.5, 0.4 + 4.7 * down), layout="constrained")
     FigureCanvasAgg(figure)
-    # The grid is in half plots, so that a shorter last row can be centred.
+    # The grid is in half plots, so that a shorter last row can be centred
     grid = figure.add_gridspec(down, 2 * _PLOTS_PER_ROW)
     for index, plot in enumerate(shown):
         row, column = divmod(index, _PLOTS_PER_ROW)
@@ -72,28 +71,27 @@ def draw_page(calibration: NoiseCalibration, title: str) -> bytes:
     return page.getvalue()
 
 
-def page_plots(calibration: NoiseCalibration) -> tuple[Plot, ...]:
+def _plots(calibration: NoiseCalibration) -> tuple[_Plot, ...]:
     """Return every plot of the page, in order, those left out included."""
     maps = calibration.maps
     offset = calibration.estimates["offset_dn"].value or 0.0
     cut_off = " (moments as they are, cut off)" if calibration.likelihood.startswith("censored") else ""
     no_mass = None if calibration.histograms else "no gain, or values too wide apart"
     return (
-        Plot("Photon transfer" + cut_off, _photon_transfer),
-        Plot("Dark signal against exposure time", _dark_signal),
-        Plot("Results, 95 % intervals", _table),
+        _Plot("Photon transfer" + cut_off, _photon_transfer),
+        _Plot("Dark signal against exposure time", _dark_signal),
+        _Plot("Results, 95 % intervals", _table),
         _map("Offset less its mean (DSNU) [DN]", maps.offset_dn, maps.unusable, offset),
         _map("Dark current [e⁻/s]", maps.dark_current_e_per_s, maps.unusable),
         # Uniform if the model is complete.
         _map("Temporal variance, measured / model", calibration.variance_ratio, maps.unusable),
-        Plot("Dark values and the fitted mass function", _histograms, no_mass),
-        Plot("Spectrogram of the offset (DSNU)", _spectrogram, _why_empty(maps.offset_dn, maps.unusable)),
+        _Plot("Dark values and the fitted mass function", _histograms, no_mass),
+        _Plot("Spectrogram of the offset (DSNU)", _spectrogram, _why_empty(maps.offset_dn, maps.unusable)),
         _map("Relative response to light", maps.relative_response, maps.unusable),
     )
 
 
 def _photon_transfer(axes: Axes, calibration: NoiseCalibration) -> None:
-    """Draw variance against mean minus that of the dark, with the line of the model."""
     offset = calibration.estimates["offset_dn"].value or 0.0
     measured = [point for point in calibration.points if point.frames > 1]
     for kind, colour in (("dark", _SECOND), ("flat", _INK)):
@@ -115,7 +113,6 @@ def _photon_transfer(axes: Axes, calibration: NoiseCalibration) -> None:
 
 
 def _dark_signal(axes: Axes, calibration: NoiseCalibration) -> None:
-    """Draw the mean dark signal against exposure time, with the residuals of its line."""
     points = [point for point in calibration.points if point.kind == "dark"]
     t = _column(points, "exposure_s")
     axes.plot(t, _column(points, "mean_dn"), "o", ms=4, color=_SECOND, label="mean of a series")
@@ -147,7 +144,6 @@ def _table(axes: Axes, calibration: NoiseCalibration) -> None:
 
 
 def _value_and_interval(estimate: Estimate) -> tuple[str, str]:
-    """Return value and interval as text, rounded to the standard error."""
     if estimate.value is None or estimate.ci95 is None:
         return "—", "not identifiable"
     digits = int(np.clip(np.ceil(-np.log10(estimate.se)), 0, 6)) if estimate.se else 3
@@ -155,7 +151,7 @@ def _value_and_interval(estimate: Estimate) -> tuple[str, str]:
     return f"{estimate.value:.{digits}f}", f"{low:.{digits}f} … {high:.{digits}f}"
 
 
-def _map(title: str, values: NDArray[np.floating] | None, unusable: NDArray[np.bool_], less: float = 0.0) -> Plot:
+def _map(title: str, values: NDArray[np.floating] | None, unusable: NDArray[np.bool_], less: float = 0.0) -> _Plot:
     """Return the plot of one map less a number; its scale spans the usable pixels."""
 
     def draw(axes: Axes, _: NoiseCalibration) -> None:
@@ -163,15 +159,13 @@ def _map(title: str, values: NDArray[np.floating] | None, unusable: NDArray[np.b
         low, high = np.quantile(thinned(values, ~unusable), [0.005, 0.995]) - less
         height, width = values.shape
         step = max(max(height, width) // _MAX_SHOWN_PX, 1)  # more pixels than the page has take seconds to draw
-        extent = (-0.5, width - 0.5, height - 0.5, -0.5)
+        look: dict[str, Any] = {"extent": (-0.5, width - 0.5, height - 0.5, -0.5), "interpolation": "nearest"}
         shown = values[::step, ::step] - less
-        image = axes.imshow(
-            shown, extent=extent, vmin=low, vmax=max(high, low + 1e-6), cmap="viridis", interpolation="nearest"
-        )
+        image = axes.imshow(shown, vmin=low, vmax=max(high, low + 1e-6), cmap="viridis", **look)
         axes.set(xlabel="column [px]", ylabel="row [px]")
         axes.figure.colorbar(image, ax=axes, shrink=0.8)
 
-    return Plot(title, draw, _why_empty(values, unusable))
+    return _Plot(title, draw, _why_empty(values, unusable))
 
 
 def _why_empty(values: NDArray[np.floating] | None, unusable: NDArray[np.bool_]) -> str | None:

@@ -4,17 +4,17 @@ import base64
 import io
 import re
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup, escape
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from faintfield.pipelines.formats.units import StatedUnits
-
-if TYPE_CHECKING:
-    from jinja2 import Environment, Template
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 # Colour of lines and text in drawings; in the SVG it is replaced by the page's own text colour, light or dark.
 INK = "#010203"
@@ -28,16 +28,24 @@ _SYMBOL = re.compile(
 LOSSLESS = 101
 
 
-def template(name: str) -> "Template":
+class Row(NamedTuple):
+    """A line of a table of quantities; `why` is a remark, or the reason for no value."""
+
+    words: str
+    value: str = "–"
+    error: str = ""
+    unit: str = ""
+    why: str = ""
+    symbol: str = ""
+
+
+def template(name: str) -> Template:
     """Return a page's template; its filter `figure` writes a number to three digits."""
     return _environment().get_template(name)
 
 
 @cache
-def _environment() -> "Environment":
-    """Return the templates, each of which is compiled once."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined  # only pages need it
-
+def _environment() -> Environment:
     environment = Environment(
         loader=PackageLoader("faintfield.pipelines.pages"),
         autoescape=True,
@@ -56,8 +64,13 @@ def figure(value: float | None, digits: int = 3) -> str:
     rounded = float(f"{value:.{digits}g}")
     if rounded == 0 or 1e-4 <= abs(rounded) < 1e6:
         decimals = digits - 1 - int(np.floor(np.log10(abs(rounded)))) if rounded else 0
-        return f"{rounded:.{max(decimals, 0)}f}".replace("-", "−")
+        return fixed(rounded, decimals)
     return f"{rounded:.{digits - 1}e}".replace("-", "−")
+
+
+def fixed(value: float, decimals: int) -> str:
+    """Return a number with fixed decimals, none if these are negative, and the minus sign of print."""
+    return f"{value:.{max(decimals, 0)}f}".replace("-", "−")
 
 
 def format_depths(units: StatedUnits, *depths: float, join: str = ", ") -> str:
@@ -95,15 +108,8 @@ def data_uri(content: bytes, suffix: str) -> str:
 def smaller_uri(content: bytes, quality: int = LOSSLESS) -> str:
     """Return a PNG as a data URI: as WebP if that is smaller, as it most often is by a third without losses.
 
-    Parameters
-    ----------
-    content : bytes
-        The PNG. One that OpenCV cannot decode, or of 16 bits, is left as it is.
-    quality : int
-        Of WebP, 1 to 100; without losses by default.
+    A PNG of 16 bits, or one that OpenCV cannot decode, is left as it is.
     """
-    import cv2  # only pages with pictures need it
-
     pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.dtype != np.uint8:
         return data_uri(content, ".png")
@@ -111,33 +117,22 @@ def smaller_uri(content: bytes, quality: int = LOSSLESS) -> str:
     return data_uri(packed.tobytes(), ".webp") if done and packed.size < len(content) else data_uri(content, ".png")
 
 
-def blank_drawing(width_in: float, height_in: float, layout: Any = None) -> "tuple[Figure, Axes]":
+def blank_drawing(width_in: float, height_in: float, layout: Any = "constrained") -> tuple[Figure, Axes]:
     """Return a figure of a size in inches with one pair of axes."""
-    from matplotlib.figure import Figure  # loading it costs most of a second
-
     figure = Figure(figsize=(width_in, height_in), layout=layout)
     return figure, figure.subplots()
 
 
-def svg(figure: "Figure") -> str:
+def svg(figure: Figure) -> str:
     """Return a drawing as SVG in the text colour of the page; equal drawings give equal text."""
-    from matplotlib import rc_context
-
-    text = io.StringIO()
+    text, undated = io.StringIO(), {"Date": None, "Creator": None}
     with rc_context({"svg.hashsalt": "faintfield"}):
-        figure.savefig(
-            text,
-            format="svg",
-            transparent=True,
-            bbox_inches="tight",
-            pad_inches=0.05,
-            metadata={"Date": None, "Creator": None},
-        )
+        figure.savefig(text, format="svg", transparent=True, bbox_inches="tight", pad_inches=0.05, metadata=undated)
     drawn = text.getvalue()
     return drawn[drawn.index("<svg") :].replace(INK, "currentColor")
 
 
-def ink(axes: "Axes") -> None:
+def ink(axes: Axes) -> None:
     """Give axes the colour `INK`, and remove the frame above and to the right."""
     axes.tick_params(which="both", colors=INK)
     axes.spines[:].set_color(INK)

@@ -3,7 +3,7 @@
 from collections.abc import Set
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -14,10 +14,8 @@ from faintfield.pipelines.formats.reading import read_content
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_PAGE, GeometryRecord, read_geometry
 from faintfield.pipelines.formats.results.noise import Measured, NoiseRecord, read_noise
 from faintfield.pipelines.formats.units import MAX_PREVIEW_BYTES
-from faintfield.pipelines.pages.page import smaller_uri
-
-if TYPE_CHECKING:
-    from faintfield.pipelines.pages.geometry_page import Row
+from faintfield.pipelines.pages.geometry_page import node_drawing, sigma_maps, stage_rows
+from faintfield.pipelines.pages.page import Row, smaller_uri
 
 _NOISE_ROWS = (
     ("offset_dn", "offset", "DN"),
@@ -31,27 +29,13 @@ _NOISE_ROWS = (
 )
 
 
-class NoiseRow(NamedTuple):
-    """A quantity of the sensor as the page shows it: its words, its unit, and the decimals that its error deserves."""
-
-    words: str
-    unit: str
-    digits: int
-    measured: Measured
-
-
 @dataclass(frozen=True, kw_only=True)
-class Section[Record, Line]:
-    """A calibration on the page: its record, as lines of a table and as drawings.
+class Section[Record]:
+    """A calibration on the page.
 
-    Attributes
-    ----------
-    where, used : str, bool
-        Address of its file, and True if the planes were made with it.
-    pages : list of (str, str or None)
-        Addresses of its own pages, each with the page as a data URI if it is a picture.
-    unusable, drawing, maps
-        Number of unusable pixels by kind, of a noise calibration; drawings of the nodes, of a geometry.
+    `where` is the address of its file, and `used` tells if the planes were made with it. `pages` are the addresses of
+    its own pages, each with the page as a data URI if it is a picture. `unusable`, the number of unusable pixels by
+    kind, is of a noise calibration; `drawing` and `maps` are of a geometry.
     """
 
     where: str
@@ -60,14 +44,14 @@ class Section[Record, Line]:
     pages: list[tuple[str, str | None]]
     made: Provenance[dict[str, object]] | None
     record: Record
-    rows: list[Line]
+    rows: list[Row]
     unusable: dict[str, int] = field(default_factory=dict)
     drawing: str | None = None
     maps: list[str] = field(default_factory=list)
 
 
-type NoiseSection = Section[NoiseRecord, NoiseRow]
-type GeometrySection = Section[GeometryRecord, Row]
+type NoiseSection = Section[NoiseRecord]
+type GeometrySection = Section[GeometryRecord]
 
 
 def find_calibration(directory: Path, name: str) -> Path | None:
@@ -77,17 +61,7 @@ def find_calibration(directory: Path, name: str) -> Path | None:
 
 
 def noise_section(directory: Path, path: Path, inputs: Set[str]) -> NoiseSection:
-    """Return the section about the sensor's noise.
-
-    Parameters
-    ----------
-    directory : Path
-        The folder of the page.
-    path : Path
-        The noise.json.
-    inputs : set of str
-        SHA-256 of the files that the planes were made from.
-    """
+    """Return the section of a noise.json; `inputs` are the SHA-256 of the files that the planes were made from."""
     record = read_noise(path)
     pages = [file_within(path.parent, page.name) for page in sorted(path.parent.glob("noise_page*.png"))]
     return Section(
@@ -96,8 +70,7 @@ def noise_section(directory: Path, path: Path, inputs: Set[str]) -> NoiseSection
         made=record.provenance,
         record=record,
         rows=[
-            # As many decimals as the standard error deserves
-            NoiseRow(words, unit, int(np.clip(np.ceil(1 - np.log10(se)), 0, 6)) if (se := measured.se) else 4, measured)
+            _noise_row(measured, words, unit)
             for name, words, unit in _NOISE_ROWS
             if isinstance(measured := getattr(record, name), Measured)
         ],
@@ -105,11 +78,17 @@ def noise_section(directory: Path, path: Path, inputs: Set[str]) -> NoiseSection
     )
 
 
-def geometry_section(directory: Path, path: Path, inputs: Set[str]) -> GeometrySection:
-    """Return the section about the poses of the camera; parameters as for `noise_section`."""
-    # Loads the calibration of geometries, which most reports do not show
-    from faintfield.pipelines.pages.geometry_page import node_drawing, sigma_maps, stage_rows
+def _noise_row(measured: Measured, words: str, unit: str) -> Row:
+    if measured.value is None:
+        return Row(words, why=measured.why or "no reason stated")
+    # As many decimals as the standard error deserves
+    digits = int(np.clip(np.ceil(1 - np.log10(measured.se)), 0, 6)) if measured.se else 4
+    interval = " … ".join(f"{end:.{digits}f}" for end in measured.ci95) if measured.ci95 else "–"
+    return Row(words, f"{measured.value:.{digits}f}", interval, unit)
 
+
+def geometry_section(directory: Path, path: Path, inputs: Set[str]) -> GeometrySection:
+    """Return the section of a geometry.json; `inputs` as for `noise_section`."""
     record = read_geometry(path, GeometryRecord)
     page = path.with_name(GEOMETRY_PAGE)
     options = msgspec.structs.asdict(record.options)
@@ -125,7 +104,6 @@ def geometry_section(directory: Path, path: Path, inputs: Set[str]) -> GeometryS
 
 
 def _origin(directory: Path, path: Path, inputs: Set[str]) -> dict[str, Any]:
-    """Return the beginning of a `Section`."""
     digest = sha256(path)
     return {"where": _link(directory, path), "sha256": digest, "used": digest in inputs}
 

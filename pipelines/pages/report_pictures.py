@@ -30,20 +30,8 @@ _LINES = (("#0072b2", "o"), ("#e69f00", "s"), ("#009e73", "^"), ("#cc79a7", "D")
 _MAX_LABELLED = 8
 
 
-@dataclass(frozen=True)
-class Row:
-    """The pictures of one plane side by side, one per column as a data URI; None if it was not reconstructed."""
-
-    words: str
-    cells: list[str | None]
-
-
-@dataclass(frozen=True)
-class Sigmas:
-    """The standard deviations of the planes on one scale, whose white is in the unit of light.
-
-    A picture is its title, the median, and the data URI.
-    """
+class Sigmas(NamedTuple):
+    """The standard deviations of the planes on one scale; a picture is its title, the median, and the data URI."""
 
     white: float
     pictures: list[tuple[str, float, str]]
@@ -61,19 +49,8 @@ class Proposed(NamedTuple):
 class PlaneSections:
     """Part of the page about the planes, by default without any; the names are those of the template.
 
-    Attributes
-    ----------
-    best, best_title, best_planes, certificates
-        Of the column that the page leads with: a plane, the title, names and pictures, and bounds on the distance to
-        the optimum.
-    left_out, blurred
-        Reason for leaving occlusion out there, and True if its planes contain the blur of other planes.
-    columns, rows
-        Titles, and pictures side by side.
-    slider, slider_column, slider_depth, slider_picture
-        The sliders, and what they show first.
-    depths, white, sharp
-        Number of planes per column, white of the scale in the unit of light, and depths of the focus curve's peaks.
+    The page leads with the `best` column. Pictures are data URIs, on a scale whose `white` is in the unit of light;
+    `rows` are side by side, a cell per column, None if the plane was not reconstructed.
     """
 
     best: Plane | None = None
@@ -84,7 +61,7 @@ class PlaneSections:
     weight_curves: str | None = None
     certificates: list[tuple[str, Certificate]] = field(default_factory=list)
     columns: list[str] = field(default_factory=list)
-    rows: list[Row] = field(default_factory=list)
+    rows: list[tuple[str, list[str | None]]] = field(default_factory=list)
     slider: list[dict[str, Any]] | None = None
     slider_column: int = 0
     slider_depth: int = 0
@@ -110,18 +87,19 @@ def plane_sections(planes: list[Plane], results: Iterable[ReconstructionRecord])
     white = _shared_white(planes, columns)
     shown_depths = _shown_depths(sorted({plane.depth_mm for plane in planes if not plane.name}), focus)
     shown = [plane for plane in planes if plane.name or plane.depth_mm in shown_depths]
+    in_order = {column: sorted((p for p in planes if p.column == column), key=lambda p: p.place) for column in columns}
     of_best = [plane for plane in planes if plane.column == best]
     records = [(plane.label, record) for plane in of_best for record in plane.records]
     several = len(places) > 1 or len(columns) > 1
     slider_depth = _first_depth([depth for depth, _ in places], focus)
-    first_slide = _in_order(planes, best)[: slider_depth + 1][-1]
+    first_slide = in_order[best][: slider_depth + 1][-1]
     best_rows = _side_by_side([plane for plane in shown if plane.column == best], [best], white)
     return PlaneSections(
         best=of_best[0],
         best_title=titles[best],
         left_out=next((record.occlusion_left_out for _, record in records if record.occlusion_left_out), None),
         blurred=len(places) > 1 and of_best[0].method not in JOINT_METHODS,
-        best_planes=[(row.words, cell) for row in best_rows for cell in row.cells if cell],
+        best_planes=[(words, cell) for words, cells in best_rows for cell in cells if cell],
         weight_curves=_weight_curves(of_best),
         certificates=[
             (label, record.certificate)
@@ -130,7 +108,7 @@ def plane_sections(planes: list[Plane], results: Iterable[ReconstructionRecord])
         ],
         columns=list(titles.values()),
         rows=_side_by_side(shown, columns, white),
-        slider=_slider(planes, titles) if several else None,
+        slider=[_slides(titles[column], in_order[column]) for column in columns] if several else None,
         slider_column=columns.index(best),
         slider_depth=slider_depth,
         slider_picture=_picture(first_slide.pixels(), white, _SLIDER_WIDTH_PX, ".jpg") if several else None,
@@ -141,6 +119,12 @@ def plane_sections(planes: list[Plane], results: Iterable[ReconstructionRecord])
         focus_curve=_focus_curve(focus, units) if focus else None,
         sharp=_sharp(focus, units) if focus else "",
     )
+
+
+def _slides(title: str, planes: list[Plane]) -> dict[str, Any]:
+    """Return the planes of a column, whose pictures the page's script takes from the viewer."""
+    slides = [{"depth": plane.depth_mm, "words": plane.label, "samples": plane.pixels().shape[1]} for plane in planes]
+    return {"title": title, "planes": slides}
 
 
 def _sharp(focus: FocusCurve, units: StatedUnits) -> str:
@@ -167,7 +151,7 @@ def _shown_depths(depths: list[float], focus: FocusCurve | None) -> list[float]:
     return sorted(marked)[:_MAX_ROWS]
 
 
-def _side_by_side(planes: list[Plane], columns: list[str], white: float) -> list[Row]:
+def _side_by_side(planes: list[Plane], columns: list[str], white: float) -> list[tuple[str, list[str | None]]]:
     """Return the pictures side by side: a row per depth, and per plane given by a pose; a cell per column."""
     by_place = {(plane.place, plane.column): plane for plane in planes}
     width_px = min(_GRID_WIDTH_PX, _ROW_WIDTH_PX // len(columns))
@@ -175,56 +159,35 @@ def _side_by_side(planes: list[Plane], columns: list[str], white: float) -> list
     for place in sorted({plane.place for plane in planes}):
         row = (by_place.get((place, column)) for column in columns)
         cells = [None if plane is None else _picture(plane.pixels(), white, width_px, ".png") for plane in row]
-        rows.append(Row(place_name(planes[0].units, *place), cells))
+        rows.append((place_name(planes[0].units, *place), cells))
     return rows
 
 
 def _sigmas(planes: list[Plane], titles: dict[str, str]) -> Sigmas | None:
-    """Return the standard deviations on one scale of their own, None if they were not asked for."""
+    """Return the standard deviations, None if they were not asked for."""
     maps = [
         (f"{titles[plane.column]}, {plane.label}", sigma)
         for plane in sorted(planes, key=lambda plane: plane.depth_mm)
-        if (sigma := plane.sigma_e()) is not None
+        if (sigma := plane.pixels_beside("sigma_file")) is not None
     ]
     if not maps:
         return None
     white = max(white_level(sigma) for _, sigma in maps)
-    pictures = [_picture(sigma, white, _GRID_WIDTH_PX, ".png") for _, sigma in maps]
-    return Sigmas(
-        white, [(name, float(np.median(sigma)), uri) for (name, sigma), uri in zip(maps, pictures, strict=True)]
-    )
+    pictures = [(name, float(np.median(sigma)), _picture(sigma, white, _GRID_WIDTH_PX, ".png")) for name, sigma in maps]
+    return Sigmas(white, pictures)
 
 
 def _proposals(planes: list[Plane], titles: dict[str, str], white: float) -> list[Proposed]:
     """Return what was proposed on the scale of the planes, and what the data moved, on one of ± 3 σ."""
     proposals = []
     for plane in sorted(planes, key=lambda plane: plane.depth_mm):
-        proposal, moved = plane.proposal_e(), plane.moved_sigma()
+        proposal, moved = plane.pixels_beside("proposal_file"), plane.pixels_beside("moved_file")
         if proposal is not None and moved is not None:
             levels = shrunk(grey_levels(moved, _MOST_MOVED, -_MOST_MOVED), _GRID_WIDTH_PX)
             picture = _picture(proposal, white, _GRID_WIDTH_PX, ".png")
             title = f"{titles[plane.column]}, {plane.label}"
             proposals.append(Proposed(title, picture, data_uri(encoded(levels, ".png"), ".png")))
     return proposals
-
-
-def _slider(planes: list[Plane], titles: dict[str, str]) -> list[dict[str, Any]]:
-    """Return the planes of each column, the nearest first, whose pictures the page's script takes from the viewer."""
-    return [
-        {
-            "title": title,
-            "planes": [
-                {"depth": plane.depth_mm, "words": plane.label, "samples": plane.pixels().shape[1]}
-                for plane in _in_order(planes, column)
-            ],
-        }
-        for column, title in titles.items()
-    ]
-
-
-def _in_order(planes: list[Plane], column: str) -> list[Plane]:
-    """Return the planes of a column by depth."""
-    return sorted((plane for plane in planes if plane.column == column), key=lambda plane: plane.place)
 
 
 def _first_depth(depths: list[float], focus: FocusCurve | None) -> int:
@@ -240,8 +203,7 @@ def _picture(pixels: NDArray[Any], white: float, width_px: int, suffix: str) -> 
 
 
 def _focus_curve(focus: FocusCurve, units: StatedUnits) -> str:
-    """Return the focus curve as SVG that takes its colour from the page."""
-    figure, axes = blank_drawing(6.0, 2.6, "constrained")
+    figure, axes = blank_drawing(6.0, 2.6)
     axes.plot(focus.depth_mm, focus.detail_e2, "o-", color="#2b8cbe", markersize=3, linewidth=1.5)
     for depth in focus.sharp_mm:
         axes.axvline(depth, color="#d95f02", linewidth=1, linestyle="--")
@@ -249,8 +211,8 @@ def _focus_curve(focus: FocusCurve, units: StatedUnits) -> str:
         peak = (depth, max(focus.detail_e2))
         axes.annotate(text, peak, (4, -2), textcoords="offset points", color="#d95f02", va="top")
     squared = {"electrons": "e⁻²", "dn": "DN²", "relative": "white²"}[units.light]
-    axes.set(xlabel=f"{units.quantity} ({units.length or 'relative'})")
-    axes.set(ylabel=f"detail both halves\nof the views agree on ({squared})")
+    axes.set_xlabel(f"{units.quantity} ({units.length or 'relative'})")
+    axes.set_ylabel(f"detail both halves\nof the views agree on ({squared})")
     axes.ticklabel_format(axis="y", scilimits=(-3, 3))
     ink(axes)
     return svg(figure)
@@ -266,7 +228,7 @@ def _weight_curves(planes: Sequence[Plane]) -> str | None:
     }
     if not records:
         return None
-    figure, axes = blank_drawing(5.6, 3.0, "constrained")
+    figure, axes = blank_drawing(5.6, 3.0)
     for index, (((name, channel), record), (colour, marker)) in enumerate(zip(records.items(), cycle(_LINES))):
         curve = sorted(record.penalty_weight_curve or [], key=lambda score: score.weight)
         held_out = np.array([score.held_out for score in curve])
@@ -288,6 +250,4 @@ def _weight_curves(planes: Sequence[Plane]) -> str | None:
 
 def _line_name(plane: Plane) -> str:
     """Return the name of a plane in the legend; planes that were solved together share one curve."""
-    if plane.method in JOINT_METHODS:
-        return "all planes"
-    return plane.name or format_depths(plane.units, plane.depth_mm)
+    return "all planes" if plane.method in JOINT_METHODS else plane.name or format_depths(plane.units, plane.depth_mm)

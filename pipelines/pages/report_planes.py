@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from msgspec import UNSET, UnsetType
+from msgspec import UNSET
 from numpy.typing import NDArray
 
 from faintfield.pipelines.errors import MissingFile
@@ -48,14 +48,10 @@ METHOD_NAMES: dict[Method, str] = {
 
 @dataclass(frozen=True)
 class Plane:
-    """One plane of one method on disk, with its records, one per colour, and their units.
+    """One plane of one method on disk, with its records, one per colour.
 
-    Attributes
-    ----------
-    column : str
-        The column of the report: the method, after the folder of its set if that is not the report's own.
-    depth_mm : float
-        Depth on the axis, in the unit of the records.
+    Its column of the report is the method, after the folder of its set if that is not the report's own. Its depth on
+    the axis is in the unit of its records.
     """
 
     column: str
@@ -85,19 +81,9 @@ class Plane:
         """Return the light of the plane (row, column[, colour])."""
         return read_frame(self.path).pixels_dn
 
-    def sigma_e(self) -> NDArray[Any] | None:
-        """Return the standard deviation of each sample, None if it was not asked for."""
-        return self._pixels_of(self.records[0].sigma_file)
-
-    def proposal_e(self) -> NDArray[Any] | None:
-        """Return the proposal of a prior, None if it was not saved."""
-        return self._pixels_of(self.records[0].proposal_file)
-
-    def moved_sigma(self) -> NDArray[Any] | None:
-        """Return the change of the proposal by the data, in standard deviations, None if it was not saved."""
-        return self._pixels_of(self.records[0].moved_file)
-
-    def _pixels_of(self, name: str | UnsetType) -> NDArray[Any] | None:
+    def pixels_beside(self, key: Literal["sigma_file", "proposal_file", "moved_file"]) -> NDArray[Any] | None:
+        """Return the pixels of a file beside the plane that its record names, None if it names none."""
+        name = getattr(self.records[0], key)
         return read_frame(_existing(self.path.with_name(Path(name).name))).pixels_dn if name else None
 
 
@@ -134,7 +120,6 @@ def read_planes(directory: Path, results: dict[Path, ReconstructionRecord]) -> l
 
 
 def _existing(path: Path) -> Path:
-    """Return the path of a file that reconstruction.json names, if it exists (else MissingFile)."""
     if not path.is_file():
         raise MissingFile(f"{path}: is recorded in reconstruction.json but missing; reconstruct again")
     return path
@@ -173,14 +158,9 @@ def place_name(units: StatedUnits, depth: float, name: str) -> str:
 
 @dataclass(frozen=True)
 class ErrorSections:
-    """Part of the page about errors; the names are those of the template.
+    """Part of the page about errors: of each plane, after the title of its method, and of the measured poses.
 
-    Attributes
-    ----------
-    metrics, geometry_off
-        Errors of each plane, after the title of its method, and of the measured poses.
-    pose_kinds, by_poses
-        Poses in the order of the comparison, and the errors (bright) by poses, after depth, object and method.
+    `by_poses` holds the errors (bright) by poses, after depth, object and method; `pose_kinds` are its poses in order.
     """
 
     metrics: list[tuple[str, PlaneErrors]]
@@ -216,6 +196,5 @@ def _is_of(errors: PlaneErrors, plane: Plane) -> bool:
 
 
 def _title_of(errors: PlaneErrors, planes: Sequence[Plane]) -> str:
-    """Return the title of the method of errors, as the planes have it."""
     records = next((plane.records for plane in planes if _is_of(errors, plane)), None)
     return METHOD_NAMES[errors.method] if records is None else method_title(records)

@@ -1,8 +1,7 @@
 """Data of a report's viewer: numbers packed in lossless pictures that the page's script decodes, and scales."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Literal, NotRequired, TypedDict
+from typing import Any, Literal, NamedTuple, NotRequired, TypedDict
 
 import cv2
 import numpy as np
@@ -42,8 +41,7 @@ type Kind = Literal["light", "sigma", "view", "bright"]
 type Scales = dict[Kind, dict[str, float | str]]
 
 
-@dataclass(frozen=True)
-class Fineness:
+class Fineness(NamedTuple):
     """Largest step of the numbers of a plane: the greater of a share of its noise and of its range."""
 
     of_noise: float
@@ -85,14 +83,7 @@ class ViewerPicture(TypedDict):
 def viewer_of(planes: list[Plane], shown: PlaneSections, the_set: SetSection | None) -> dict[str, Any] | None:
     """Return the data of the viewer as JSON for the page's script, None without planes.
 
-    Parameters
-    ----------
-    planes : list of Plane
-        All planes, in the order of the columns.
-    shown : PlaneSections
-        Other pictures of them on the page; the grey scales are the same.
-    the_set : SetSection, optional
-        The set whose views the page shows.
+    The grey scales are those of the pictures `shown`. The views are those of `the_set`, if there is one.
     """
     if not planes:
         return None
@@ -148,22 +139,22 @@ def _views(the_set: SetSection, scales: Scales) -> list[ViewerPicture]:
         black, white = the_set.overview.grey_scale_dn
         scales["view"] = {"black": black, "white": white, "name": "view as recorded"}
         step = (white - black) / _TOP_GREY
-        views.append(_view("view", "One view", "as recorded", "DN", black, step, "recorded-view"))
+        views.append(_view("view", "One view", "as recorded", "DN", black, step))
     if the_set.pictures["bright"]:
         scales["bright"] = {"black": 0.0, "white": float(_TOP_GREY), "name": "bright view"}
         title, unit = "The same view in plenty of light", f"of {_TOP_GREY} grey levels"
-        views.append(_view("bright", title, "preview", unit, 0.0, 1.0, "bright-view"))
+        views.append(_view("bright", title, "preview", unit, 0.0, 1.0))
     return views
 
 
-def _view(kind: Kind, title: str, caption: str, unit: str, low: float, step: float, element: str) -> ViewerPicture:
+def _view(kind: Kind, title: str, words: str, unit: str, low: float, step: float) -> ViewerPicture:
+    element = f"{'recorded' if kind == 'view' else kind}-view"
     return ViewerPicture(
-        kind=kind, title=title, words=caption, place=None, unit=unit, low=low, step=step, bins=1, element=element
+        kind=kind, title=title, words=words, place=None, unit=unit, low=low, step=step, bins=1, element=element
     )
 
 
-@dataclass(frozen=True)
-class _Source:
+class _Source(NamedTuple):
     """A picture whose numbers are read when they are needed, and what is said of it."""
 
     plane: Plane
@@ -173,7 +164,7 @@ class _Source:
 
     def read(self, coarser: int) -> tuple[NDArray[np.floating], int]:
         """Return the numbers (row, column[, colour]) in bins, and the width of these; `coarser` is added to it."""
-        numbers = self.plane.sigma_e() if self.kind == "sigma" else self.plane.pixels()
+        numbers = self.plane.pixels_beside("sigma_file") if self.kind == "sigma" else self.plane.pixels()
         assert numbers is not None
         bins = 1
         while (numbers.shape[0] // bins) * (numbers.shape[1] // bins) > _MAX_SAMPLES:
@@ -218,8 +209,7 @@ def _binned(numbers: NDArray[np.floating], bins: int) -> NDArray[np.floating]:
     return np.asarray(cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA), np.float32)
 
 
-@dataclass(frozen=True)
-class Packed:
+class Packed(NamedTuple):
     """Numbers as a PNG: a number is `low + step * level`, high bytes of the levels above low bytes."""
 
     png: bytes
@@ -230,12 +220,7 @@ class Packed:
 def pack(numbers: NDArray[np.floating], step: float) -> Packed:
     """Return numbers (row, column[, colour]) as a PNG twice as high, which a canvas of 8 bits can decode.
 
-    Parameters
-    ----------
-    numbers : array
-        Numbers that are not finite have the level `UNKNOWN_LEVEL`.
-    step : float
-        Difference of two levels, in the unit of the numbers; at least their range over 65534.
+    Numbers that are not finite have the level `UNKNOWN_LEVEL`. `step` is at least the range of the others over 65534.
     """
     known = np.isfinite(numbers)
     low = float(numbers[known].min()) if known.any() else 0.0
@@ -255,7 +240,6 @@ def _noise(plane: NDArray[np.floating]) -> float:
 
 
 def _picture(source: _Source, fineness: Fineness, coarser: int, units: StatedUnits) -> ViewerPicture:
-    """Return one plane for the page's script."""
     numbers, bins = source.read(coarser)
     packed = pack(numbers, fineness.step(numbers))
     record = source.plane.records[0]

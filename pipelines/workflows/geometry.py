@@ -57,9 +57,10 @@ def measure_stage(
     board_set = load_board_set(directory)
     out = out or board_set.source.parent
     options = GeometryOptions(lens, tuple(depth_mm or DEFAULT_DEPTHS_MM), limit_px)
-    measured = measure_geometry(board_set, GeometrySettings(lens, options.depth_mm, limit_px))
+    limits = GeometrySettings(lens, options.depth_mm, limit_px)
+    measured = measure_geometry(board_set, limits)
     record = geometry_record(measured, options)
-    write_geometry(out, record, {**geometry_files(measured), GEOMETRY_PAGE: geometry_page(record)})
+    write_geometry(out, record, {**geometry_files(measured), GEOMETRY_PAGE: geometry_page(record, limits)})
     _inform_of(measured, record)
     figures = {name: getattr(record, name) for name in GeometrySummary.__struct_fields__[2:]}
     return GeometrySummary(str(out), str(out / GEOMETRY_PAGE), **figures)

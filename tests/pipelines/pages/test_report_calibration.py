@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from msgspec import structs
 
+from faintfield.calib.geometry import GeometrySettings
 from faintfield.pipelines.formats.image_files import write_png
 from faintfield.pipelines.formats.results.geometry import GeometryRecord
 from faintfield.pipelines.formats.results.overview import Overview
@@ -69,7 +70,8 @@ def session(drawn: Path, tmp_path: Path) -> Path:
 def test_error_of_held_out_boards_has_its_limit(ratio: float | None, boards: int, rows: list[tuple[str, str]]) -> None:
     content = _geometry() | {"holdout_ratio": ratio, "rms_inlier_px": 0.01}
     content["boards"] = content["boards"][:boards]
-    for row, (value, why) in zip(holdout_rows(msgspec.convert(content, GeometryRecord)), rows, strict=True):
+    found = holdout_rows(msgspec.convert(content, GeometryRecord), GeometrySettings())
+    for row, (value, why) in zip(found, rows, strict=True):
         assert row.value == value
         assert why in row.why
         assert ("waived" in row.why) == (why == "waived")
