@@ -8,8 +8,10 @@ import os
 import re
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from io import BufferedReader
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -69,8 +71,9 @@ _BMP_UNCOMPRESSED = (0, 3, 6)
 
 _EXR = b"\x76\x2f\x31\x01"
 
-# Messages of tifffile are dropped: the failure says it all.
+# Messages of the libraries are dropped: the failure says it all.
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 
 def decode_tiff(file: BufferedReader, path: Path, accept: Accept, number: int | None = None) -> NDArray[Any]:
@@ -97,24 +100,23 @@ def decode_tiff(file: BufferedReader, path: Path, accept: Accept, number: int | 
 def count_pages(file: BufferedReader) -> int:
     """Return how many pictures of the first one's size and type a TIFF holds from its beginning, at most 100 000."""
     with tifffile.TiffFile(file, name="frame", **_NO_SPECIAL_KIND) as tiff:
-        first, count = tiff.pages.first, 1
-        while count < _MAX_PAGES:
-            try:
-                page = tiff.pages[count]
-            except IndexError:
-                break
-            if (page.shape, page.dtype) != (first.shape, first.dtype):
-                if any(
-                    (page.shape, page.dtype) == (first.shape, first.dtype)
-                    for page in tiff.pages[count + 1 : _MAX_PAGES]
-                ):
-                    raise ValueError(f"picture {count + 1} has another size or type than those around it")
-                break
-            count += 1
-        return count
+        alike = list(_alike(tiff))
+    count = [*alike, False].index(False)
+    if any(alike[count:]):
+        raise ValueError(f"picture {count + 1} has another size or type than those around it")
+    return count
 
 
-def decode_photo(file: BufferedReader, accept: Accept) -> NDArray[Any]:
+def _alike(tiff: tifffile.TiffFile) -> Iterator[bool]:
+    """Yield for each picture whether it has the size and type of the first."""
+    first = tiff.pages.first
+    with suppress(IndexError):  # at the end; a slice would first look for this, and chains of pages may have none
+        for number in range(_MAX_PAGES):
+            page = tiff.pages[number]
+            yield bool((page.shape, page.dtype) == (first.shape, first.dtype))
+
+
+def decode_photo(file: BufferedReader, _: Path, accept: Accept) -> NDArray[Any]:
     """Return the picture of a PNG or JPEG, (row, column) or (row, column, RGB), with its own depth and orientation."""
     mark = next((mark for mark in _END_MARKS if file.peek(8).startswith(mark)), None)
     if mark is None:
@@ -131,12 +133,7 @@ def decode_photo(file: BufferedReader, accept: Accept) -> NDArray[Any]:
 
 def _require_one_page(tiff: tifffile.TiffFile, path: Path) -> None:
     """Refuse a stack; a smaller picture after the first, as cameras add, is passed over."""
-    first = tiff.pages.first
-    try:
-        second = tiff.pages[1]
-    except IndexError:
-        return
-    if (second.shape, second.dtype) == (first.shape, first.dtype):
+    if list(islice(_alike(tiff), 2)) == [True, True]:
         raise UnreadableImage(
             f"{path}: holds several pictures of one size; export one to a file of its own, or, if they are views of a "
             "grid, name this file in `faintfield import grid`"
@@ -182,7 +179,6 @@ def _jpeg_size(file: BufferedReader) -> tuple[int, int, int]:
 
 def decode_with_opencv(content: bytes) -> NDArray[Any]:
     """Return the picture of a file's content, in the order red, green, blue."""
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the failure below says it in one line
     pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise ValueError("not an image, or truncated")
@@ -190,7 +186,6 @@ def decode_with_opencv(content: bytes) -> NDArray[Any]:
 
 
 def _page_with_opencv(content: bytes, number: int) -> NDArray[Any]:
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     buffer = np.frombuffer(content, np.uint8)
     done, pages = cv2.imdecodemulti(buffer, cv2.IMREAD_UNCHANGED, None, (number, number + 1))
     if not done or len(pages) != 1:
@@ -247,15 +242,14 @@ def decode_netpbm(file: BufferedReader, path: Path, accept: Accept) -> tuple[NDA
     return (pixels[::-1] if white is None else pixels).astype(dtype.newbyteorder("=")), white
 
 
-def decode_bmp(file: BufferedReader, accept: Accept) -> NDArray[Any]:
+def decode_bmp(file: BufferedReader, _: Path, accept: Accept) -> NDArray[Any]:
     """Return the picture of an uncompressed BMP, (row, column) or (row, column, RGB), of 8 bits."""
     head = file.read(34)
     if len(head) < 34 or not head.startswith(b"BM"):
         raise ValueError("not a BMP file, or truncated")
     start, header_bytes = struct.unpack_from("<2I", head, 10)
     if header_bytes == 12:
-        width, height, _, bits = struct.unpack_from("<4H", head, 18)
-        compression = 0
+        (width, height, _, bits), compression = struct.unpack_from("<4H", head, 18), 0
     else:
         width, height, _, bits, compression = struct.unpack_from("<2i2HI", head, 18)
     if compression not in _BMP_UNCOMPRESSED or bits not in (1, 4, 8, 16, 24, 32):

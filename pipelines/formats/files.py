@@ -16,6 +16,7 @@ import msgspec
 
 from faintfield.pipelines.errors import BadValue, CannotWrite, DiskFull, MissingFile, OutputBusy, OutputExists
 from faintfield.pipelines.formats.provenance import with_digest
+from faintfield.pipelines.formats.reading import naming_unreadable
 from faintfield.pipelines.formats.units import json_of
 from faintfield.rig import files as rig_files
 
@@ -132,10 +133,9 @@ def check_free(out: Path, *, replace_if: str | None = None, replace_only: Collec
         return
     if not out.is_dir():
         raise OutputExists(f"{out}: is a file, and a folder is to be written there; name another place")
-    held = sorted(path.name for path in out.iterdir())
-    kept = [name for name in held if not any(fnmatchcase(name, pattern) for pattern in replace_only)]
+    kept = [path.name for path in out.iterdir() if not any(fnmatchcase(path.name, name) for name in replace_only)]
     if kept:
-        named = ", ".join(kept[:3]) + (f" and {len(kept) - 3} more" if len(kept) > 3 else "")
+        named = ", ".join(sorted(kept)[:3]) + (f" and {len(kept) - 3} more" if len(kept) > 3 else "")
         raise OutputExists(f"{out}: holds files already ({named}) that are not overwritten; name a new or empty folder")
 
 
@@ -209,16 +209,8 @@ def require_room(path: Path, needed_bytes: int) -> None:
 
 def sha256(path: Path) -> str:
     """Return the SHA-256 of a file, in hexadecimal; raise MissingFile if it cannot be read."""
-    with _naming_unreadable(path):
+    with naming_unreadable(path):
         return rig_files.sha256(path)
-
-
-@contextmanager
-def _naming_unreadable(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as failure:
-        raise MissingFile(f"{path}: cannot be read ({failure.strerror}); allow it to be read") from failure
 
 
 @contextmanager
@@ -253,10 +245,6 @@ class _Known(msgspec.Struct, frozen=True):
     inode: int
     sha256: str
 
-    def is_of(self, state: os.stat_result) -> bool:
-        then = (self.size, self.mtime_ns, self.ctime_ns, self.inode)
-        return then == (state.st_size, state.st_mtime_ns, state.st_ctime_ns, state.st_ino)
-
 
 class Hashes:
     """SHA-256 of the files of a folder, each computed again only if its size, inode or times of change differ.
@@ -276,17 +264,17 @@ class Hashes:
     def of(self, name: str) -> str:
         """Return the SHA-256 of a file, by its name within the folder."""
         path = self._folder / name
-        with _naming_unreadable(path):
+        with naming_unreadable(path):
             state = path.stat()
-        known = self._known.get(name)
-        if known is not None and known.is_of(state):
-            return known.sha256
         begun_ns = time.time_ns()
+        known = self._known.get(name)
+        now = _Known(state.st_size, state.st_mtime_ns, state.st_ctime_ns, state.st_ino, known.sha256 if known else "")
+        if known == now:
+            return now.sha256
         digest = sha256(path)
         self._known.pop(name, None)
         if state.st_mtime_ns < begun_ns - _AT_REST_NS:
-            known = _Known(state.st_size, state.st_mtime_ns, state.st_ctime_ns, state.st_ino, digest)
-            self._known[name] = known
+            self._known[name] = msgspec.structs.replace(now, sha256=digest)
         self._changed = True
         return digest
 

@@ -132,11 +132,9 @@ def read_frame(
                 "take it again with the same settings, or correct the size that is stated"
             )
 
-    most = (
-        MAX_FRAME_BYTES
-        if expected_px is None or page is not None
-        else expected_px[0] * expected_px[1] * _MAX_PIXEL_BYTES
-    )
+    most = MAX_FRAME_BYTES
+    if expected_px is not None and page is None:
+        most = expected_px[0] * expected_px[1] * _MAX_PIXEL_BYTES
     with opened(path) as file:
         try:
             require_size(file, most + OVERHEAD_BYTES)  # decoders read what a header states before they tell its size
@@ -179,24 +177,21 @@ def _require_sane_size(path: Path, width: int, height: int, size_bytes: int) -> 
 def _decoded(file: BufferedReader, path: Path, suffix: str, accept: Accept, page: int | None) -> Frame:
     if suffix in RAW_SUFFIXES:
         return _read_raw(file, path, accept)
-    saturation_dn = None
+    white_dn = None
     if suffix in NETPBM_SUFFIXES:
-        pixels, saturation_dn = decode_netpbm(file, path, accept)
-    elif suffix == ".bmp":
-        pixels = decode_bmp(file, accept)
-    elif suffix == ".exr":
-        pixels = decode_exr(file, path, accept)
+        pixels, white_dn = decode_netpbm(file, path, accept)
+    elif suffix in TIFF_SUFFIXES:
+        pixels = decode_tiff(file, path, accept, page)
     else:
-        pixels = decode_tiff(file, path, accept, page) if suffix in TIFF_SUFFIXES else decode_photo(file, accept)
-    pixels = pixels[:, :, :3] if pixels.ndim == 3 and pixels.shape[2] == 4 else pixels
-    return Frame(pixels, saturation_dn=saturation_dn)
+        decode = {".bmp": decode_bmp, ".exr": decode_exr}.get(suffix, decode_photo)
+        pixels = decode(file, path, accept)
+    return Frame(pixels[:, :, :3] if pixels.ndim == 3 and pixels.shape[2] == 4 else pixels, saturation_dn=white_dn)
 
 
 def _read_raw(file: BufferedReader, path: Path, accept: Accept) -> Frame:
     import rawpy  # slow to load, and only raw files need it
 
-    if (size := path.stat().st_size) > MAX_FRAME_BYTES:
-        raise ValueError(f"a raw file has at most {MAX_FRAME_BYTES} bytes, this {size}")
+    require_size(file, MAX_FRAME_BYTES)
     try:
         with rawpy.imread(file) as raw:
             sizes = raw.sizes

@@ -37,9 +37,7 @@ def memory_or_file(folder: Path) -> Allocate:
         if _bytes(shape, dtype) <= SHARE_OF_MEMORY * available_bytes():
             return np.empty(shape, dtype)
         with translated_write_errors(folder):
-            folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=folder) as file:
-                return mapped(file, shape, dtype)
+            return _in_nameless_file(folder, shape, dtype)
 
     return allocate
 
@@ -57,13 +55,17 @@ def maps_in_files(folder: Path) -> Allocate:
                 folder.mkdir(parents=True, exist_ok=True)
                 free_bytes = disk_usage(folder).free
                 left_bytes[:] = left_bytes or [(1 - _SHARE_OF_DISK) * free_bytes]
-                if free_bytes - _bytes(shape, dtype) < left_bytes[0]:
-                    return np.empty(shape, dtype)
-                with tempfile.TemporaryFile(dir=folder) as file:
-                    return mapped(file, shape, dtype)
+                if free_bytes - _bytes(shape, dtype) >= left_bytes[0]:
+                    return _in_nameless_file(folder, shape, dtype)
         return np.empty(shape, dtype)
 
     return allocate
+
+
+def _in_nameless_file(folder: Path, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=folder) as file:
+        return mapped(file, shape, dtype)
 
 
 def mapped(file: IO[bytes], shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:

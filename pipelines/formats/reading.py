@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -43,33 +43,38 @@ def is_folder(path: Path) -> bool:
 
 
 def _is_there(path: Path, test: Callable[[Path], bool]) -> bool:
-    try:
-        return test(path)
-    except ValueError:  # a name with a NUL
-        return False
-    except OSError as failure:
-        if failure.errno == errno.ENAMETOOLONG:
+    with naming_unreadable(path):
+        try:
+            return test(path)
+        except OSError as failure:
+            if failure.errno != errno.ENAMETOOLONG:
+                raise
             return False
-        raise _unreadable(path, failure) from failure
+
+
+@contextmanager
+def naming_unreadable(path: Path) -> Iterator[None]:
+    """Turn the failures of a file that cannot be opened or read into MissingFile with the path."""
+    try:
+        yield
+    except (OSError, ValueError) as failure:  # a ValueError is a name with a NUL
+        reason = failure.strerror if isinstance(failure, OSError) else failure
+        raise MissingFile(f"{path}: cannot be read ({reason}); name a file of the kind that is read here") from failure
 
 
 @contextmanager
 def opened(path: Path) -> Iterator[BufferedReader]:
     """Open a regular file for reading; raise MissingFile if it cannot be opened, or is not a regular file."""
-    try:
+    with naming_unreadable(path):
         file = open_regular(path)
-    except (OSError, ValueError) as failure:
-        raise _unreadable(path, failure) from failure
     with file:
         yield file
 
 
 def read_content(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> bytes:
     """Return the content of a regular file; raise MissingFile if it cannot be read, or is larger than `max_bytes`."""
-    try:
+    with naming_unreadable(path):
         return read_regular(path, max_bytes)
-    except (OSError, ValueError) as failure:
-        raise _unreadable(path, failure) from failure
 
 
 def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
@@ -95,7 +100,7 @@ def read_json[T](path: Path, kind: type[T], *, what: str, remedy: str) -> T:
 
 
 def read_arrays(
-    path: Path, names: Collection[str], *, max_bytes: int, remedy: str, shape: tuple[int, ...] | None = None
+    path: Path, names: Collection[str], *, shape: tuple[int, ...], max_bytes: int, remedy: str
 ) -> dict[str, NDArray[Any]]:
     """Return those of the named arrays of numbers that a .npz file has; they cannot be written to.
 
@@ -118,34 +123,21 @@ def read_arrays(
     return arrays
 
 
-def _member(archive: zipfile.ZipFile, name: str, max_bytes: int, shape: tuple[int, ...] | None) -> NDArray[Any]:
+def _member(archive: zipfile.ZipFile, name: str, max_bytes: int, shape: tuple[int, ...]) -> NDArray[Any]:
     entry = archive.getinfo(f"{name}.npy")
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise ValueError(f"{name} is compressed by method {entry.compress_type}, which numpy does not use")
     with archive.open(entry) as member:
-        found, column_major, dtype = _array_header(member)
-        size = math.prod(found) * dtype.itemsize
-        if dtype.kind not in _NUMBERS or min(found, default=0) < 0:
-            raise ValueError(f"{name} is {dtype} of shape {found}, which are no numbers")
-        if shape is not None and found != shape:
+        np.lib.format.read_magic(member)
+        found, column_major, dtype = np.lib.format.read_array_header_1_0(member)
+        if dtype.kind not in _NUMBERS:
+            raise ValueError(f"{name} is {dtype}, which are no numbers")
+        if found != shape:
             raise ValueError(f"{name} has shape {found}, expected is {shape}")
+        size = math.prod(found) * dtype.itemsize
         if size > max_bytes:
             raise ValueError(f"{name} takes {size} bytes, at most {max_bytes} are expected")
         content = member.read(size + 1)  # up to the end, where the checksum is compared
     if len(content) != size:
         raise ValueError(f"{name} does not have the {size} bytes that it states")
     return np.frombuffer(content, dtype).reshape(found, order="F" if column_major else "C")
-
-
-def _array_header(member: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Return shape, order and data type that an array in a file states."""
-    version = np.lib.format.read_magic(member)
-    read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
-    if read is None:
-        raise ValueError(f"version {version} of the format is not read")
-    return read(member)
-
-
-def _unreadable(path: Path, failure: OSError | ValueError) -> MissingFile:
-    reason = failure.strerror if isinstance(failure, OSError) else str(failure)
-    return MissingFile(f"{path}: cannot be read ({reason}); name a file of the kind that is read here")
