@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import msgspec
 from cyclopts import Parameter
 
-from faintfield.pipelines.arguments import Count, Fraction, NotNegative, Positive, Seed, SizePx
+from faintfield.pipelines.arguments import Count, NotNegative, Positive, Seed, SizePx
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.simulation.options import DarkeningOptions, SyntheticOptions
 
@@ -130,12 +130,7 @@ def darken(
     out: Path,
     /,
     *,
-    snr: Positive = _DARK.snr,
-    seed: Seed = _DARK.seed,
-    exposure_s: Positive = _DARK.exposure_s,
-    read_noise_e: NotNegative = _DARK.read_noise_e,
-    dark_current_e_per_s: NotNegative = _DARK.dark_current_e_per_s,
-    quantum_efficiency: Fraction = _DARK.quantum_efficiency,
+    options: DarkeningOptions = _DARK,
     overwrite: bool = False,
 ) -> Dark:
     """Make a dark set from a bright one: the same views with a few photons per pixel.
@@ -150,27 +145,14 @@ def darken(
         Folder with elemental.toml of the bright set.
     out
         Folder to write.
-    snr
-        SNR of the reference view, eq. (4).
-    seed
-        Seed of the random generator.
-    exposure_s
-        Exposure of each dark view.
-    read_noise_e
-        Standard deviation of the dark camera's read noise.
-    dark_current_e_per_s
-        Dark electrons per pixel and second of the dark camera.
-    quantum_efficiency
-        Electrons per photon of the dark camera.
     overwrite
         Replace an earlier set in OUT.
     """
-    options = {name: value for name, value in locals().items() if name not in ("set_path", "out", "overwrite")}
     from faintfield.pipelines.formats.sets.elemental_set import load_set
     from faintfield.pipelines.simulation.darken import darken_set
 
-    darkened = darken_set(load_set(set_path), out, DarkeningOptions(**options), overwrite=overwrite)
+    darkened = darken_set(load_set(set_path), out, options, overwrite=overwrite)
     measured = "no SNR" if darkened.snr_measured is None else f"SNR {darkened.snr_measured:.3f}"
     photons = f"{darkened.photons_on_object:.2f} photons per pixel on the object"
-    inform(f"{out}: {measured} measured for {snr:g} asked; {photons}")
+    inform(f"{out}: {measured} measured for {options.snr:g} asked; {photons}")
     return darkened
