@@ -35,7 +35,7 @@ def init(rig: Path = Path("rig.toml"), /) -> dict[str, str]:
         File to write; an existing one is left alone.
     """
     from faintfield.pipelines.formats.files import write_whole
-    from faintfield.pipelines.formats.rig_file import rig_template
+    from faintfield.pipelines.formats.toml_files import rig_template
 
     if rig.exists():
         raise OutputExists(f"{rig}: exists and is not overwritten; name another file, or edit this one")

@@ -3,6 +3,7 @@
 import difflib
 import re
 from collections.abc import Callable
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,10 @@ import tomli_w
 
 from faintfield.pipelines.errors import BadValue, InputError, MissingFile, UnknownKey
 from faintfield.pipelines.formats.files import write_whole
-from faintfield.pipelines.formats.reading import is_file, read_content
+from faintfield.pipelines.formats.reading import is_file, read_content, read_json
+from faintfield.rig.errors import UnknownPlugin
+from faintfield.rig.plugins import fold_plugins
+from faintfield.rig.settings import RigSettings
 
 # No quantity of a rig is larger, and computing with numbers up to it does not overflow.
 _MAX_NUMBER = 1e12
@@ -139,3 +143,34 @@ def _without_none(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _without_none(part) for key, part in value.items() if part is not None}
     return [_without_none(part) for part in value] if isinstance(value, list | tuple) else value
+
+
+def read_rig(path: Path) -> RigSettings:
+    """Read a rig.toml; raises as `read_rig_tables` does."""
+    return read_rig_tables(path, RigSettings)
+
+
+def read_rig_tables[T](path: Path, kind: type[T]) -> T:
+    """Read a rig.toml, or those of its tables that `kind` has; raise as `read_toml` does, or UnknownPlugin."""
+    try:
+        return read_toml(path, kind, fold_plugins)
+    except UnknownPlugin as failure:
+        raise UnknownPlugin(f"{path}: {failure}") from None
+
+
+def rig_template() -> str:
+    """Return the text of a commented rig.toml, which describes a simulated rig."""
+    return files("faintfield.pipelines.formats").joinpath("rig_template.toml").read_text(encoding="utf-8")
+
+
+def stage_settings_path(rig: Path) -> Path:
+    """Return the path of the stored settings of the stage of a rig.toml."""
+    return rig.with_suffix(".stage.json")
+
+
+def read_stage_settings(rig: Path) -> dict[str, str] | None:
+    """Read the stored settings of the stage of a rig.toml, None if there are none."""
+    path = stage_settings_path(rig)
+    if not is_file(path):
+        return None
+    return read_json(path, dict[str, str], what="what --remember writes", remedy="run with --remember again")

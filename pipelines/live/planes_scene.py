@@ -12,8 +12,8 @@ from faintfield.pipelines.formats.frames import Frame, Lattice, mosaic_period
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, CameraPoses, read_geometry
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, FittedNoise, read_fitted_noise
 from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSetFile
-from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, with_measured_geometry
-from faintfield.pipelines.formats.sets.session_set import nominal_view, relative_to_axis
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
+from faintfield.pipelines.formats.sets.session_set import nominal_view, relative_to_axis, with_measured_geometry
 from faintfield.pipelines.live.planes_client import LiveOrder
 from faintfield.pipelines.planning.known import KnownLens, Sensor, calibration_file, known_lens, known_sensor
 from faintfield.pipelines.reconstruction.channels import ChannelLayout

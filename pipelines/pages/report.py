@@ -9,14 +9,13 @@ import numpy as np
 from msgspec import UNSET
 
 from faintfield.pipelines.formats.files import files_below, write_whole
+from faintfield.pipelines.formats.results.figures import OVERVIEW_FILE, GeometryErrors
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE
 from faintfield.pipelines.formats.results.noise import NOISE_FILE
-from faintfield.pipelines.formats.results.overview import OVERVIEW_FILE
 from faintfield.pipelines.formats.results.records import (
     RECONSTRUCTION_FILE,
     REPORT_FILE,
     BestFocusRecord,
-    GeometryErrors,
     ReconstructionRecord,
 )
 from faintfield.pipelines.formats.results.stacks import at_depths

@@ -11,16 +11,8 @@ from numpy.typing import NDArray
 from faintfield.pipelines.errors import MissingFile
 from faintfield.pipelines.formats.files import files_below
 from faintfield.pipelines.formats.frames import read_frame
-from faintfield.pipelines.formats.results.records import (
-    METRICS_FILE,
-    GeometryErrors,
-    Method,
-    Metrics,
-    PlaneErrors,
-    PlaneRecord,
-    Poses,
-    ReconstructionRecord,
-)
+from faintfield.pipelines.formats.results.figures import METRICS_FILE, GeometryErrors, Metrics, PlaneErrors
+from faintfield.pipelines.formats.results.records import Method, PlaneRecord, Poses, ReconstructionRecord
 from faintfield.pipelines.formats.results.surface import read_result
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS
 from faintfield.pipelines.formats.units import StatedUnits, units_of

@@ -12,7 +12,7 @@ from faintfield.pipelines.formats.files import file_within
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import encoded
 from faintfield.pipelines.formats.reading import read_content
-from faintfield.pipelines.formats.results.overview import Overview
+from faintfield.pipelines.formats.results.figures import Overview
 from faintfield.pipelines.formats.results.surface import read_result
 from faintfield.pipelines.formats.units import MAX_PREVIEW_BYTES, units_of
 from faintfield.pipelines.pages.page import LOSSLESS, smaller_uri

@@ -16,8 +16,9 @@ from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.files import check_free, exclusive, remove, write_json, write_whole
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.provenance import Provenance, provenance
+from faintfield.pipelines.formats.results.figures import PhotonsRecord, SnrRecord
 from faintfield.pipelines.formats.results.geometry import DEFAULT_DEPTHS_MM
-from faintfield.pipelines.formats.results.records import Method, PhotonsRecord, PlaneRecord, SnrRecord
+from faintfield.pipelines.formats.results.records import Method, PlaneRecord
 from faintfield.pipelines.formats.sets.elemental_set import NOISE_REFERENCE, load_set
 from faintfield.pipelines.formats.sets.ground_truth import read_truth, texture_and_region
 from faintfield.pipelines.pages.page import data_uri, template

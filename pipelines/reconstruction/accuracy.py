@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.files import remove, write_record
 from faintfield.pipelines.formats.frames import read_frame
-from faintfield.pipelines.formats.results.records import Method, Metrics, PhotonsRecord, PlaneErrors, Poses, SnrRecord
-from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
+from faintfield.pipelines.formats.results.figures import Metrics, PhotonsRecord, PlaneErrors, SnrRecord
+from faintfield.pipelines.formats.results.records import Method, Poses
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, in_units, load_set
 from faintfield.pipelines.formats.sets.ground_truth import (
     Truth,
     read_true_depth_mm,
@@ -20,7 +21,6 @@ from faintfield.pipelines.formats.sets.ground_truth import (
     texture_and_region,
     true_plane,
 )
-from faintfield.pipelines.formats.sets.stated import in_units
 from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
 from faintfield.pipelines.reconstruction.overview import OBJECT_REGION, brightness

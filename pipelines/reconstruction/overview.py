@@ -13,9 +13,8 @@ from faintfield.pipelines.errors import BadValue, UnreadableImage
 from faintfield.pipelines.formats.files import write_record, write_whole
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import Picture, contact_sheet, encoded, grey_levels, white_level
-from faintfield.pipelines.formats.results.overview import OVERVIEW_FILE, Brightness, Overview
-from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
-from faintfield.pipelines.formats.sets.stated import in_units
+from faintfield.pipelines.formats.results.figures import OVERVIEW_FILE, Brightness, Overview
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, in_units
 from faintfield.pipelines.reconstruction.channels import channel_layouts, lattice_noise, view_electrons
 from faintfield.recon.metrics import photons_from_linear_snr, photons_from_moments, snr_from_powers
 from faintfield.recon.threads import map_in_threads

@@ -19,8 +19,7 @@ from faintfield.pipelines.formats.results.records import (
     ReconstructionOptions,
     ReconstructionRecord,
 )
-from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
-from faintfield.pipelines.formats.sets.stated import plane_stem
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, plane_stem
 from faintfield.pipelines.reconstruction.depth.autofocus import (
     best_focus,
     found_range_mm,

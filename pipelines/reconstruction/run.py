@@ -14,24 +14,22 @@ from faintfield.pipelines.errors import BadValue, OutputExists
 from faintfield.pipelines.formats.files import remove, remove_leftovers, require_room, write_record
 from faintfield.pipelines.formats.plane_poses import Place
 from faintfield.pipelines.formats.provenance import provenance
+from faintfield.pipelines.formats.results.figures import METRICS_FILE, Metrics
 from faintfield.pipelines.formats.results.plane_files import PARTS, PlaneFiles
 from faintfield.pipelines.formats.results.records import (
-    METRICS_FILE,
     RECONSTRUCTION_FILE,
     REPORT_FILE,
     BestFocusRecord,
     DepthMapRecord,
     FocusCurve,
     Method,
-    Metrics,
     PlaneRecord,
     ReconstructionRecord,
 )
 from faintfield.pipelines.formats.results.stacks import write_stack
 from faintfield.pipelines.formats.results.surface import SURFACE_FILE, SurfaceRecord
-from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, in_units, light_per_e, plane_stem
 from faintfield.pipelines.formats.sets.ground_truth import read_truth
-from faintfield.pipelines.formats.sets.stated import in_units, light_per_e, plane_stem
 from faintfield.pipelines.formats.units import StatedUnits
 from faintfield.pipelines.reconstruction.accuracy import assess, write_depth_errors
 from faintfield.pipelines.reconstruction.channels import SHARE_OF_DISK, channel_layouts, keeping_frames

@@ -7,7 +7,7 @@ import msgspec
 
 from faintfield.pipelines.console import console
 from faintfield.pipelines.errors import WrongUsage
-from faintfield.pipelines.formats.rig_file import read_rig
+from faintfield.pipelines.formats.toml_files import read_rig
 from faintfield.pipelines.live.guided import capture_session
 from faintfield.pipelines.live.planes_client import MAX_DEPTHS, LiveOrder
 from faintfield.pipelines.reconstruction.options import sweep_values

@@ -7,7 +7,7 @@ import msgspec
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import MissingFile
 from faintfield.pipelines.formats.files import require_room, write_json
-from faintfield.pipelines.formats.rig_file import read_rig, read_stage_settings, stage_settings_path
+from faintfield.pipelines.formats.toml_files import read_rig, read_stage_settings, stage_settings_path
 from faintfield.pipelines.live.guided import changed_settings, needed_bytes, survey_lines
 from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import open_rig

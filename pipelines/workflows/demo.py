@@ -15,16 +15,11 @@ from faintfield.pipelines.arguments import Method, SolverOptions
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.exchange.imported_set import relative
 from faintfield.pipelines.formats.files import check_free, write_json, write_record
+from faintfield.pipelines.formats.results.figures import METRICS_FILE, GeometryErrors, KnownValue, Metrics
 from faintfield.pipelines.formats.results.geometry import CameraPoses, read_geometry
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, read_noise
 from faintfield.pipelines.formats.results.plane_files import plane_name
-from faintfield.pipelines.formats.results.records import (
-    JOINT_METHODS,
-    METRICS_FILE,
-    GeometryErrors,
-    KnownValue,
-    Metrics,
-)
+from faintfield.pipelines.formats.results.records import JOINT_METHODS
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, load_session, nominal_session
 from faintfield.pipelines.formats.toml_files import write_toml

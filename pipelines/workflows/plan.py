@@ -7,7 +7,7 @@ from faintfield.pipelines.errors import WrongUsage
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE
 from faintfield.pipelines.formats.results.noise import NOISE_FILE
 from faintfield.pipelines.formats.results.noise_fit import Measured
-from faintfield.pipelines.formats.rig_file import read_rig
+from faintfield.pipelines.formats.toml_files import read_rig
 from faintfield.pipelines.planning.known import calibration_file, known_lens, known_pace, known_sensor, planned_light
 from faintfield.pipelines.planning.options import PlanOptions
 from faintfield.pipelines.planning.predict import Predictor, parse_grids, scene_view

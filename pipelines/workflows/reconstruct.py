@@ -11,8 +11,8 @@ from faintfield.pipelines.console import inform, working
 from faintfield.pipelines.errors import WrongUsage
 from faintfield.pipelines.formats.files import exclusive
 from faintfield.pipelines.formats.results.records import REPORT_FILE
-from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set, with_measured_geometry
-from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, load_session
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
+from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, load_session, with_measured_geometry
 from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.reconstruction.channels import keeping_frames
 from faintfield.pipelines.reconstruction.options import OF_PLANES, Options

@@ -13,9 +13,9 @@ from faintfield.pipelines.errors import NAMED_FAILURES, MissingFile, WrongUsage
 from faintfield.pipelines.formats.files import Hashes, exclusive
 from faintfield.pipelines.formats.provenance import first_difference, provenance
 from faintfield.pipelines.formats.reading import JSON_FAILURES, read_content
+from faintfield.pipelines.formats.results.figures import OVERVIEW_FILE
 from faintfield.pipelines.formats.results.geometry import DEFAULT_DEPTHS_MM, GEOMETRY_FILE
 from faintfield.pipelines.formats.results.noise import NOISE_FILE
-from faintfield.pipelines.formats.results.overview import OVERVIEW_FILE
 from faintfield.pipelines.formats.results.records import RECONSTRUCTION_FILE, REPORT_FILE, ReconstructionRecord
 from faintfield.pipelines.formats.results.surface import SURFACE_FILE
 from faintfield.pipelines.formats.results.verification import is_record, records_of, verify_results

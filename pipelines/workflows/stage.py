@@ -10,7 +10,7 @@ from rich.text import Text
 from faintfield.pipelines.arguments import StageConnection
 from faintfield.pipelines.console import console, inform, visible
 from faintfield.pipelines.errors import BadValue, WrongUsage
-from faintfield.pipelines.formats.rig_file import read_rig_tables
+from faintfield.pipelines.formats.toml_files import read_rig_tables
 from faintfield.rig.devices import SIMULATED, SIMULATED_FIRMWARE, open_stage
 from faintfield.rig.errors import StageUnfit
 from faintfield.rig.simulation.controller.bench import Server

@@ -6,8 +6,8 @@ import pytest
 
 from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.results.figures import Metrics
 from faintfield.pipelines.formats.results.plane_files import plane_name
-from faintfield.pipelines.formats.results.records import Metrics
 from faintfield.pipelines.formats.sets.session_set import load_session
 from faintfield.pipelines.reconstruction.accuracy import assess
 from faintfield.pipelines.reconstruction.options import Options

@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from faintfield.pipelines.formats.rig_file import read_rig
+from faintfield.pipelines.formats.toml_files import read_rig
 from faintfield.rig import plugins
 from faintfield.rig.cameras.folder import FolderCamera
 from faintfield.rig.cameras.settings import (

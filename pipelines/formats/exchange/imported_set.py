@@ -40,8 +40,8 @@ from faintfield.pipelines.formats.sets.elemental_file import (
     View,
     write_set,
 )
+from faintfield.pipelines.formats.sets.elemental_set import stated_length
 from faintfield.pipelines.formats.sets.session_set import load_set_or_session
-from faintfield.pipelines.formats.sets.stated import stated_length
 from faintfield.pipelines.formats.units import MAX_ANGLE_RAD, MAX_LENGTH_MM, Units
 
 # Largest error of the columns of a rotation in length and right angles, as rounded numbers have it.

@@ -22,7 +22,6 @@ from faintfield.pipelines.formats.units import StatedUnits
 
 RECONSTRUCTION_FILE = "reconstruction.json"
 DEPTH_MAP_FILE = "depth_map.json"
-METRICS_FILE = "metrics.json"
 REPORT_FILE = "report.html"
 
 # A file beside a record: one name, which cannot lead elsewhere or act on a terminal.
@@ -298,59 +297,3 @@ class ReconstructionRecord(Struct, frozen=True, kw_only=True):
         """Names of the files that it lists, beside it."""
         maps = self.depth_map.files if self.depth_map else []
         return [*dict.fromkeys(name for plane in self.planes for name in plane.files), *maps, *map(preview_name, maps)]
-
-
-class PlaneErrors(Struct, frozen=True, kw_only=True):
-    """The errors of one plane against the truth, the object scaled to 0…1."""
-
-    depth_mm: float
-    method: Method
-    poses: Poses
-    object: str
-    mse_bright: float
-    mse_texture: float
-    mse_plane: float | None = None
-    psnr_db: float | None
-
-
-class SnrRecord(Struct, frozen=True):
-    """The SNR of eq. (4): asked of the simulator, and measured."""
-
-    asked: float
-    measured: float | None
-
-
-class PhotonsRecord(Struct, frozen=True):
-    """Photons per pixel of the reference view, by three definitions."""
-
-    linear: float
-    from_moments: float
-    on_object: float
-
-
-class GeometryErrors(Struct, frozen=True):
-    """Errors of the measured poses."""
-
-    nodes: int
-    centre_rms_mm: float
-    centre_rms_axes_mm: tuple[float, float, float]
-    rotation_rms_mdeg: float
-
-
-class KnownValue(Struct, frozen=True):
-    """A measured number, its standard error, and the truth."""
-
-    value: float | None
-    se: float | None
-    truth: float
-
-
-class Metrics(Struct, frozen=True, kw_only=True):
-    """`metrics.json`: the errors of planes whose truth is known; a demo adds those of its calibration."""
-
-    geometry: GeometryErrors | UnsetType = UNSET
-    noise: dict[str, KnownValue] | UnsetType = UNSET
-    planes: list[PlaneErrors]
-    units: StatedUnits | UnsetType = UNSET
-    snr: SnrRecord | UnsetType = UNSET
-    photons_per_px: PhotonsRecord | UnsetType = UNSET

@@ -16,15 +16,13 @@ from faintfield.pipelines.errors import InputError, MissingFile
 from faintfield.pipelines.formats.files import files_below, problem_of_file, sha256
 from faintfield.pipelines.formats.provenance import digest_holds
 from faintfield.pipelines.formats.reading import JSON_FAILURES, read_content
+from faintfield.pipelines.formats.results.figures import METRICS_FILE, OVERVIEW_FILE, Metrics, Overview
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, CameraPoses, GeometryRecord
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, NoiseRecord
-from faintfield.pipelines.formats.results.overview import OVERVIEW_FILE, Overview
 from faintfield.pipelines.formats.results.records import (
     DEPTH_MAP_FILE,
-    METRICS_FILE,
     RECONSTRUCTION_FILE,
     DepthMapFileRecord,
-    Metrics,
     PlaneFileRecord,
     ReconstructionRecord,
     record_name,

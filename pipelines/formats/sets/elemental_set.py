@@ -1,24 +1,26 @@
-"""The elemental set: checked images and poses, whatever files they come from."""
+"""The elemental set: checked images and poses, whatever files they come from, and values in its units."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, is_dataclass
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
+from msgspec import Struct, structs
 from numpy.typing import NDArray
 
-from faintfield.calib.homography import rotation_matrix
 from faintfield.calib.lens import Lens
 from faintfield.calib.noise_model import Map, NoiseModel
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import sha256
 from faintfield.pipelines.formats.frames import Frame, read_frame
-from faintfield.pipelines.formats.reading import is_file, is_folder
-from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, CameraPoses, read_geometry
+from faintfield.pipelines.formats.plane_poses import Place, TiltedPlane
+from faintfield.pipelines.formats.reading import is_file
 from faintfield.pipelines.formats.results.noise import NOISE_MAPS, FittedNoise, read_fitted_noise
+from faintfield.pipelines.formats.results.plane_files import plane_name
 from faintfield.pipelines.formats.results.records import Poses
 from faintfield.pipelines.formats.sets.elemental_file import (
     FILE_NAME,
@@ -27,11 +29,14 @@ from faintfield.pipelines.formats.sets.elemental_file import (
     named_files,
     read_set_file,
 )
-from faintfield.pipelines.formats.units import Pose, StatedUnits
+from faintfield.pipelines.formats.units import DEPTH_KEYS, LENGTH_KEYS, LIGHT_KEYS, StatedUnits
 from faintfield.recon.threads import map_in_threads
 
 # Exposure without light, beside a set's images if there is one.
 NOISE_REFERENCE = "noise_reference.tiff"
+
+# Options that name the unit of depths.
+_UNIT_KEYS = frozenset({"unit", "depth_map"})
 
 # Largest relative response of a pixel.
 _MAX_RESPONSE = 1e6
@@ -256,65 +261,88 @@ def _read_flat(path: Path, size_px: tuple[int, int]) -> NDArray[np.float32]:
     return np.asarray(flat, np.float32)
 
 
-def with_measured_geometry(elemental_set: ElementalSet, path: Path) -> ElementalSet:
-    """Return a set with the lens of a geometry.json, each view at its node's measured pose; BadValue if one lacks."""
-    path = path / GEOMETRY_FILE if is_folder(path) else path
-    geometry, settings = read_geometry(path, CameraPoses), elemental_set.settings
-    poses = {entry.node: entry.rt_cam_ref for entry in geometry.nodes}
-    _check_match(path, geometry, elemental_set)
-    lens = geometry.camera_lens()
-    stated = ("fx_px", "fy_px", "cx_px", "cy_px", "distortion")
-    camera = msgspec.structs.replace(settings.camera, **{name: getattr(lens, name) for name in stated})
-    shifts_mm = _homing_shifts_mm(path, geometry, elemental_set)
-    views = [
-        msgspec.structs.replace(
-            view, rt_cam_ref=_shifted(poses[view.node], shifts_mm[view.homing]), cx_px=None, cy_px=None
-        )
-        for view in settings.view
-        if view.node is not None
-    ]
-    measured = msgspec.structs.replace(settings, camera=camera, view=views)
-    return replace(elemental_set, settings=measured, lens=lens, measured_in=path, poses="measured")
-
-
-def _homing_shifts_mm(path: Path, geometry: CameraPoses, elemental_set: ElementalSet) -> dict[int, NDArray[np.float64]]:
-    views = elemental_set.settings.view
-    of_reference = views[elemental_set.settings.reference_view].homing
-    shifts = {homing: geometry.homing_shift_mm(of_reference, homing) for homing in {view.homing for view in views}}
-    unknown = [view for view in views if shifts[view.homing] is None]
-    if unknown:
-        inform(
-            f"{elemental_set.folder}: the stage homed while the views were taken; {path} knows no shift by that, so "
-            f"{len(unknown)} of {len(views)} views ({unknown[0].image} is the first) may be off by as much as the "
-            "switches repeat; show boards before and after within one sweep, or take the scene again"
-        )
-    return {homing: np.zeros(3) if shift is None else np.array(shift) for homing, shift in shifts.items()}
-
-
-def _shifted(rt_cam_ref: Pose, shift_mm: NDArray[np.float64]) -> Pose:
-    """Return the pose of a camera whose centre is shifted in the reference frame."""
-    if not shift_mm.any():
-        return rt_cam_ref
-    turned = rotation_matrix(np.array(rt_cam_ref)) @ shift_mm
-    a, b, c, x, y, z = (np.array(rt_cam_ref) - np.append(np.zeros(3), turned)).tolist()
-    return a, b, c, x, y, z
-
-
-def _check_match(path: Path, geometry: CameraPoses, elemental_set: ElementalSet) -> None:
-    settings, nodes = elemental_set.settings, {entry.node for entry in geometry.nodes}
-    if geometry.size_px != settings.camera.size_px:
+def light_per_e(elemental_set: ElementalSet) -> float:
+    """Return how much light one electron is, in the unit of the set; BadValue if that is white, which is not known."""
+    light, noise = elemental_set.units.light, elemental_set.noise
+    if light == "electrons":
+        return 1.0
+    gain = float(np.mean(noise.gain_dn_per_e))
+    if light == "dn":
+        return gain
+    white_dn = float(np.mean(noise.saturation_dn)) - float(np.mean(noise.offset_dn))
+    if not (np.isfinite(white_dn) and white_dn > 0):
         raise BadValue(
-            f"{path}: is of {geometry.size_px} px images, the set has {settings.camera.size_px}; use its own"
+            f"{elemental_set.folder}: light is relative to white, which is {white_dn:g} DN above the dark level; state "
+            "noise.saturation_dn, or units.light"
         )
-    missing = [view.image for view in settings.view if view.node not in nodes]
-    if missing:
-        raise BadValue(
-            f"{path}: has no pose for {len(missing)} of {len(settings.view)} views ({missing[0]} is the first); "
-            "state the node of every view, and show a board at every node"
-        )
-    reference = settings.view[settings.reference_view].node
-    if reference != geometry.reference_node:
-        raise BadValue(
-            f"{path}: its reference is node {list(geometry.reference_node)}, the set's is {reference}; "
-            "set reference_view to the view of that node"
-        )
+    return gain / (white_dn * elemental_set.frames_per_view)
+
+
+def unit_of_maps(units: StatedUnits, *, as_px: bool = False) -> Any:
+    """Return the unit of a map of depths: "mm", "px" or "relative"; `as_px` asks for disparities."""
+    return "px" if as_px else units.length or "relative"
+
+
+def stated_length(elemental_set: ElementalSet, unit: str) -> str:
+    """Return the unit of lengths of an export, "relative" if the set has no scale, which a message then says."""
+    if elemental_set.units.depth == "mm":
+        return unit
+    nodes = (
+        " from node to node, for a focal length that was taken" if elemental_set.units.depth == "disparity_px" else ""
+    )
+    inform(
+        f"{elemental_set.folder}: has no scale, so that lengths are relative{nodes}; "
+        "scale them when something is measured"
+    )
+    return "relative"
+
+
+def plane_stem(elemental_set: ElementalSet, place: Place) -> str:
+    """Return the name of a plane's files without suffix, by its depth in the unit of the set.
+
+    `plane_00500.0` is at 500 mm, `plane_px_-003.250` at a disparity of -3.25 px, and `plane_rel_4.63158` at a relative
+    depth, given to six digits.
+    """
+    if isinstance(place, TiltedPlane) or elemental_set.units.depth == "mm":
+        return plane_name(place)
+    depth = elemental_set.stated_depth(place)
+    return f"plane_px_{depth:+08.3f}" if elemental_set.units.depth == "disparity_px" else f"plane_rel_{depth:.6g}"
+
+
+def rounded_depth(elemental_set: ElementalSet, depth_mm: float) -> float:
+    """Return a depth as precisely as the name of a plane states it: to 0.1 mm, 0.001 px of disparity, six digits."""
+    if elemental_set.units.depth == "mm":
+        return round(depth_mm, 1)
+    if elemental_set.units.depth == "relative":
+        return float(f"{depth_mm:.6g}")
+    return elemental_set.depth_of_disparity(round(elemental_set.disparity_of_depth(depth_mm), 3))
+
+
+def in_units[Record](elemental_set: ElementalSet, record: Record) -> Record:
+    """Return a record whose numbers are in the units of the set, given one in mm and electrons."""
+    units = elemental_set.units
+    if (units.depth, units.light) == ("mm", "electrons"):
+        return record
+    light = light_per_e(elemental_set)
+
+    def convert(name: str, value: Any, depth_mm: Any) -> Any:
+        """Return a value in the units of the set, by the name of its field; lengths across a plane need its depth."""
+        if isinstance(value, Struct) or is_dataclass(value):
+            depth_mm = getattr(value, "depth_mm", None)
+            parts = structs.asdict(value) if isinstance(value, Struct) else vars(value)
+            kind: Any = type(value)
+            return kind(**{key: convert(key, part, depth_mm) for key, part in parts.items()})
+        if isinstance(value, (list, tuple)):
+            return type(value)([convert(name, part, depth_mm) for part in value])
+        if value == "mm" and name in _UNIT_KEYS:
+            return unit_of_maps(units)
+        if not isinstance(value, (int, float)) or isinstance(value, bool):
+            return value
+        if name in DEPTH_KEYS:
+            return elemental_set.stated_depth(value)
+        if name in LENGTH_KEYS and units.depth == "disparity_px":
+            return value * elemental_set.settings.camera.fx_px / depth_mm
+        return value * light ** (2 if name.endswith("2") else 1) if name in LIGHT_KEYS else value
+
+    converted: Record = convert("", record, None)
+    return converted

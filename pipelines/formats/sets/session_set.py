@@ -1,11 +1,14 @@
 """The frames of one kind of a session as an elemental set, in the session's own files."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from faintfield.calib.homography import rotation_matrix
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.arguments import SceneKind as SceneKind
 from faintfield.pipelines.console import inform
@@ -15,7 +18,8 @@ from faintfield.pipelines.formats.reading import is_file, is_folder
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, CameraPoses, PosesOfSession, read_geometry
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, NOISE_MAPS, read_fitted_noise
 from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSetFile, View
-from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set, with_measured_geometry
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
+from faintfield.pipelines.formats.units import Pose
 from faintfield.rig.plan import CapturePlan, StepKind, Stop, planned_frames
 from faintfield.rig.session.homings import read_homing_groups
 from faintfield.rig.session.session import PLAN, has_session, read_plan, taken_frames
@@ -145,3 +149,67 @@ def nominal_view(stop: Stop, centre: Stop, names: list[str], homing: int) -> Vie
     """Return the view of a node, with the pose that the stage was told."""
     right_mm, down_mm = stop.target.x_mm - centre.target.x_mm, stop.target.y_mm - centre.target.y_mm
     return View(names[0], (0.0, 0.0, 0.0, -right_mm, -down_mm, 0.0), stop.node, repeats=tuple(names[1:]), homing=homing)
+
+
+def with_measured_geometry(elemental_set: ElementalSet, path: Path) -> ElementalSet:
+    """Return a set with the lens of a geometry.json, each view at its node's measured pose; BadValue if one lacks."""
+    path = path / GEOMETRY_FILE if is_folder(path) else path
+    geometry, settings = read_geometry(path, CameraPoses), elemental_set.settings
+    poses = {entry.node: entry.rt_cam_ref for entry in geometry.nodes}
+    _check_match(path, geometry, elemental_set)
+    lens = geometry.camera_lens()
+    stated = ("fx_px", "fy_px", "cx_px", "cy_px", "distortion")
+    camera = msgspec.structs.replace(settings.camera, **{name: getattr(lens, name) for name in stated})
+    shifts_mm = _homing_shifts_mm(path, geometry, elemental_set)
+    views = [
+        msgspec.structs.replace(
+            view, rt_cam_ref=_shifted(poses[view.node], shifts_mm[view.homing]), cx_px=None, cy_px=None
+        )
+        for view in settings.view
+        if view.node is not None
+    ]
+    measured = msgspec.structs.replace(settings, camera=camera, view=views)
+    return replace(elemental_set, settings=measured, lens=lens, measured_in=path, poses="measured")
+
+
+def _homing_shifts_mm(path: Path, geometry: CameraPoses, elemental_set: ElementalSet) -> dict[int, NDArray[np.float64]]:
+    views = elemental_set.settings.view
+    of_reference = views[elemental_set.settings.reference_view].homing
+    shifts = {homing: geometry.homing_shift_mm(of_reference, homing) for homing in {view.homing for view in views}}
+    unknown = [view for view in views if shifts[view.homing] is None]
+    if unknown:
+        inform(
+            f"{elemental_set.folder}: the stage homed while the views were taken; {path} knows no shift by that, so "
+            f"{len(unknown)} of {len(views)} views ({unknown[0].image} is the first) may be off by as much as the "
+            "switches repeat; show boards before and after within one sweep, or take the scene again"
+        )
+    return {homing: np.zeros(3) if shift is None else np.array(shift) for homing, shift in shifts.items()}
+
+
+def _shifted(rt_cam_ref: Pose, shift_mm: NDArray[np.float64]) -> Pose:
+    """Return the pose of a camera whose centre is shifted in the reference frame."""
+    if not shift_mm.any():
+        return rt_cam_ref
+    turned = rotation_matrix(np.array(rt_cam_ref)) @ shift_mm
+    a, b, c, x, y, z = (np.array(rt_cam_ref) - np.append(np.zeros(3), turned)).tolist()
+    return a, b, c, x, y, z
+
+
+def _check_match(path: Path, geometry: CameraPoses, elemental_set: ElementalSet) -> None:
+    settings, nodes = elemental_set.settings, {entry.node for entry in geometry.nodes}
+    if geometry.size_px != settings.camera.size_px:
+        raise BadValue(
+            f"{path}: is of {geometry.size_px} px images, the set has {settings.camera.size_px}; use its own"
+        )
+    missing = [view.image for view in settings.view if view.node not in nodes]
+    if missing:
+        raise BadValue(
+            f"{path}: has no pose for {len(missing)} of {len(settings.view)} views ({missing[0]} is the first); "
+            "state the node of every view, and show a board at every node"
+        )
+    reference = settings.view[settings.reference_view].node
+    if reference != geometry.reference_node:
+        raise BadValue(
+            f"{path}: its reference is node {list(geometry.reference_node)}, the set's is {reference}; "
+            "set reference_view to the view of that node"
+        )

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from faintfield.calib.homography import fronto_parallel_rt_ref_plane, image_lattice, transfer
 from faintfield.pipelines.console import inform, working
 from faintfield.pipelines.formats.results.records import BestFocusRecord
-from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
-from faintfield.pipelines.formats.sets.stated import rounded_depth
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, rounded_depth
 from faintfield.pipelines.reconstruction.depth.comparison import BinnedViews, Compared, binned_views, check_places
 from faintfield.recon.depth.agreement import DepthEstimate, Significance
 from faintfield.recon.depth.focus import MIN_SAMPLES, SURE, likeliest_depth_mm, places_of_focus

@@ -15,8 +15,7 @@ from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import ONE_PIXEL, encoded, grey_levels, white_level, write_plane
 from faintfield.pipelines.formats.results.plane_files import Origin, read_current
 from faintfield.pipelines.formats.results.records import DEPTH_MAP_FILE, DepthMapFileRecord, DepthMapRecord, Method
-from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
-from faintfield.pipelines.formats.sets.stated import unit_of_maps
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, unit_of_maps
 from faintfield.pipelines.reconstruction.operators import plane_grid
 
 # The file of the depths by their unit.

@@ -23,8 +23,7 @@ from faintfield.pipelines.formats.results.records import (
     PlaneFileRecord,
     PlaneRecord,
 )
-from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
-from faintfield.pipelines.formats.sets.stated import in_units, light_per_e
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, in_units, light_per_e
 from faintfield.pipelines.reconstruction.channels import ChannelLayout, load_channel
 from faintfield.pipelines.reconstruction.operators import OperatorFactory
 from faintfield.pipelines.reconstruction.planes.penalised import Pilot, Solution

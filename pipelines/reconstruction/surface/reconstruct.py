@@ -25,8 +25,7 @@ from faintfield.pipelines.formats.results.surface import (
     SurfaceFileRecord,
     SurfaceRecord,
 )
-from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
-from faintfield.pipelines.formats.sets.stated import in_units, light_per_e, unit_of_maps
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, in_units, light_per_e, unit_of_maps
 from faintfield.pipelines.reconstruction.accuracy import write_depth_errors
 from faintfield.pipelines.reconstruction.channels import (
     SHARE_OF_DISK,

@@ -26,8 +26,9 @@ from faintfield.pipelines.formats.results.geometry import (
     read_geometry,
 )
 from faintfield.pipelines.formats.sets.board_set import load_board_set
-from faintfield.pipelines.formats.sets.elemental_set import load_set, with_measured_geometry
+from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.formats.sets.ground_truth import read_truth
+from faintfield.pipelines.formats.sets.session_set import with_measured_geometry
 from faintfield.pipelines.workflows.geometry import GeometrySummary
 from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
 from tests.pipelines.conftest import Command, assert_refused, drawing_nothing

@@ -18,7 +18,8 @@ from faintfield.pipelines.formats.results.geometry import (
     PosesOfSession,
 )
 from faintfield.pipelines.formats.sets import session_set
-from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set, with_measured_geometry
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
+from faintfield.pipelines.formats.sets.session_set import with_measured_geometry
 from faintfield.rig.session.homings import HomingGroups
 from tests.calib.geometry.simulated import centres_mm
 

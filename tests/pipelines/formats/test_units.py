@@ -19,8 +19,7 @@ import tifffile
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.results.records import PlaneFileRecord, ReconstructionRecord
 from faintfield.pipelines.formats.sets.elemental_file import read_set_file, write_set
-from faintfield.pipelines.formats.sets.elemental_set import load_set
-from faintfield.pipelines.formats.sets.stated import plane_stem, rounded_depth
+from faintfield.pipelines.formats.sets.elemental_set import load_set, plane_stem, rounded_depth
 from faintfield.pipelines.formats.units import DepthUnit, LightUnit, StatedUnits, Units, json_of, record_of
 from tests.pipelines.conftest import SMALL, Command, made_once, run_undrawn
 from tests.pipelines.formats.results.test_golden import KINDS

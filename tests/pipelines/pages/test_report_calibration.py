@@ -16,8 +16,8 @@ from msgspec import structs
 
 from faintfield.calib.geometry import GeometrySettings
 from faintfield.pipelines.formats.image_files import write_png
+from faintfield.pipelines.formats.results.figures import Overview
 from faintfield.pipelines.formats.results.geometry import GeometryRecord
-from faintfield.pipelines.formats.results.overview import Overview
 from faintfield.pipelines.pages.geometry_page import holdout_rows
 from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.pages.report_calibration import find_calibration

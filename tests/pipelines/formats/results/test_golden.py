@@ -6,15 +6,10 @@ import msgspec
 import pytest
 
 from faintfield.pipelines.formats.files import write_json
+from faintfield.pipelines.formats.results.figures import Metrics, Overview
 from faintfield.pipelines.formats.results.geometry import GeometryRecord
 from faintfield.pipelines.formats.results.noise import NoiseRecord
-from faintfield.pipelines.formats.results.overview import Overview
-from faintfield.pipelines.formats.results.records import (
-    DepthMapFileRecord,
-    Metrics,
-    PlaneFileRecord,
-    ReconstructionRecord,
-)
+from faintfield.pipelines.formats.results.records import DepthMapFileRecord, PlaneFileRecord, ReconstructionRecord
 from faintfield.pipelines.formats.results.surface import SurfaceFileRecord
 from faintfield.recon.surface import confidence
 from tests.pipelines.conftest import Command
