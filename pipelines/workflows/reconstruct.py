@@ -16,8 +16,8 @@ from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, load_
 from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.reconstruction.channels import keeping_frames
 from faintfield.pipelines.reconstruction.options import OF_PLANES, Options
-from faintfield.pipelines.reconstruction.planes.cluster import make_runner
 from faintfield.pipelines.reconstruction.planes.sweep import Runner, run_serially
+from faintfield.pipelines.reconstruction.planes.workers import make_runner
 from faintfield.pipelines.reconstruction.request import Request, resolve, select_planes
 from faintfield.pipelines.reconstruction.run import Outcome, reconstruct_set
 from faintfield.pipelines.reconstruction.surface.reconstruct import reconstruct_surface

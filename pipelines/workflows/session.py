@@ -24,8 +24,8 @@ from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, files
 from faintfield.pipelines.formats.units import record_of
 from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.reconstruction.options import OF_PLANES, PLACES, Options
-from faintfield.pipelines.reconstruction.planes.cluster import make_runner
 from faintfield.pipelines.reconstruction.planes.sweep import Runner
+from faintfield.pipelines.reconstruction.planes.workers import make_runner
 from faintfield.pipelines.reconstruction.request import (
     Selection,
     distinct_depths,

@@ -15,8 +15,8 @@ from faintfield.pipelines.formats.files import UNFINISHED
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.plane_poses import Place
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
-from faintfield.pipelines.reconstruction.planes.cluster import make_runner
 from faintfield.pipelines.reconstruction.planes.sweep import PlaneTask
+from faintfield.pipelines.reconstruction.planes.workers import make_runner
 from faintfield.pipelines.reconstruction.request import Request
 from faintfield.pipelines.reconstruction.run import reconstruct_set
 from tests.pipelines.conftest import Command, Edit, assert_refused

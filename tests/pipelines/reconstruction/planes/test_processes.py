@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from faintfield.pipelines.errors import ClusterFailed
-from faintfield.pipelines.reconstruction.planes.processes import in_processes
+from faintfield.pipelines.reconstruction.planes.workers import in_processes
 from faintfield.recon import names
 from tests.patience import HANG_S
 
@@ -105,14 +105,14 @@ def test_failure_comes_with_traceback_and_ends_processes(job: int, failure: type
     with pytest.raises(failure, match=r"no 1|_UnsendableError") as raised:
         list(in_processes(1, _fail, [0, job, 3]))
     if job == 1:
-        assert "in _fail" in raised.value.__notes__[0]
+        assert "in _fail" in str(raised.value.__cause__)
     assert not _workers()
 
 
 def test_compiling_is_announced_once_for_all_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     announced: list[str] = []
     monkeypatch.setattr(names, "on_compiling", [lambda: announced.append("compiling")])
-    monkeypatch.setattr("faintfield.pipelines.reconstruction.planes.processes.on_compiling", names.on_compiling)
+    monkeypatch.setattr("faintfield.pipelines.reconstruction.planes.workers.on_compiling", names.on_compiling)
     assert len(list(in_processes(2, _announce, range(4)))) == 4
     assert announced == ["compiling"]
 
@@ -141,7 +141,7 @@ def test_process_has_one_thread_and_trusted_modules(tmp_path: Path) -> None:
     code = (
         "import sys; sys.path[:] = [path for path in sys.path if path]\n"
         "import os, numba\n"
-        "from faintfield.pipelines.reconstruction.planes.processes import in_processes\n"
+        "from faintfield.pipelines.reconstruction.planes.workers import in_processes\n"
         "before = dict(os.environ), numba.config.NUMBA_NUM_THREADS\n"
         "asked = \"__import__('numba').config.NUMBA_NUM_THREADS\", "
         "\"__import__('os').environ['OPENBLAS_NUM_THREADS']\"\n"
