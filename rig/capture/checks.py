@@ -1,14 +1,16 @@
-"""Check a frame right after it was taken, while lights, boards and lens cap are still as they were."""
+"""Measure frames while lights, boards and lens cap are still as they were: their quality, and how the rig settles."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import cv2
 import numpy as np
 from msgspec import Struct
+from numpy.typing import NDArray
 
 from faintfield.rig.cameras.protocol import Pixels
+from faintfield.rig.clock import Clock
 from faintfield.rig.plan import PlannedFrame, StepKind
-from faintfield.rig.settings import BoardSettings, CheckSettings
+from faintfield.rig.settings import BoardSettings, CheckSettings, SettleSettings
 
 LIT_KINDS: frozenset[StepKind] = frozenset({"charuco", "bright", "flat"})
 DARK_KINDS: frozenset[StepKind] = frozenset({"noise_reference", "dark"})
@@ -41,7 +43,7 @@ def check_frame(
     Corners of boards are only counted: a warning depends on more than one frame, see `board_warnings`.
     """
     values: dict[str, float] = {"median_dn": float(np.median(pixels))}
-    grey = pixels if pixels.ndim == 2 else pixels.mean(axis=2)
+    grey = _grey(pixels)
     if kind in LIT_KINDS:
         largest_dn = np.iinfo(pixels.dtype).max if pixels.dtype.kind in "iu" else np.inf
         values["saturated_share"] = float(np.mean(pixels >= (limits.saturation_dn or largest_dn)))
@@ -55,6 +57,10 @@ def check_frame(
     return Findings(
         {name: round(value, 5) for name, value in values.items()}, _warnings(kind, values, limits, earlier_sharpness)
     )
+
+
+def _grey(pixels: Pixels) -> Pixels:
+    return pixels if pixels.ndim == 2 else pixels.mean(axis=2)
 
 
 def _sharpness(grey: Pixels) -> float:
@@ -160,3 +166,61 @@ def board_warnings(
                 "poses cannot be found; add a sweep with a board in their view"
             )
     return tuple(warnings)
+
+
+# Fewer leave the last third, which is taken as the picture at rest, a single frame.
+_MIN_FRAMES = 6
+
+
+class Settling(Struct, frozen=True):
+    """Result of `measure_settling`: the rest before an exposure, and whether the rig was seen at rest.
+
+    The scatter is the median shift at rest, which is due to noise; the curve has the time in s after the stop, and the
+    shift in pixels from the picture at rest.
+    """
+
+    wait_s: float
+    settled: bool
+    scatter_px: float
+    curve: tuple[tuple[float, float], ...]
+
+
+def measure_settling(expose: Callable[[float], Pixels], clock: Clock, settings: SettleSettings) -> Settling:
+    """Measure when the rig comes to rest; call it right after a move.
+
+    The mean of the last third of the frames is the picture r at rest. A small shift d changes a frame by ∇r · d, so d
+    is the least-squares solution of ∇r · d = frame − r over all pixels. `expose` takes and returns a frame, given its
+    exposure time in s.
+    """
+    begun_s = clock.now_s()
+    times_s: list[float] = []
+    frames: list[Pixels] = []
+    while clock.now_s() - begun_s < settings.longest_s or len(frames) < _MIN_FRAMES:
+        times_s.append(clock.now_s() - begun_s)
+        frames.append(_smooth(expose(settings.exposure_s)))
+    at_rest = len(frames) - len(frames) // 3
+    shifts_px = _shifts_px(frames, np.mean(frames[at_rest:], axis=0))
+    scatter_px = float(np.median(shifts_px[at_rest:]))
+    swinging = np.flatnonzero(shifts_px > max(settings.limit_px, 4.0 * scatter_px))
+    first_still = int(swinging[-1]) + 1 if len(swinging) else 0
+    # In the dark, shifts are noise; a rig that swings to the end has no picture at rest
+    settled = first_still <= at_rest and scatter_px <= settings.limit_px
+    return Settling(
+        wait_s=times_s[first_still] if settled else settings.longest_s,
+        settled=settled,
+        scatter_px=round(scatter_px, 5),
+        curve=tuple((round(t, 4), round(float(shift), 4)) for t, shift in zip(times_s, shifts_px, strict=True)),
+    )
+
+
+def _smooth(pixels: Pixels) -> NDArray[np.float32]:
+    """Return a frame in grey, blurred a little, so that noise does not dominate the gradient."""
+    return np.asarray(cv2.GaussianBlur(np.asarray(_grey(pixels), np.float32), (0, 0), 1.5), np.float32)
+
+
+def _shifts_px(frames: list[Pixels], rest: Pixels) -> NDArray[np.float64]:
+    along_rows, along_columns = np.gradient(np.asarray(rest, float))
+    gradients = np.stack([along_columns.ravel(), along_rows.ravel()])
+    normal = gradients @ gradients.T + 1e-9 * np.eye(2)
+    changes = np.stack([gradients @ (frame - rest).ravel() for frame in frames])
+    return np.asarray(np.linalg.norm(np.linalg.solve(normal, changes.T), axis=0))

@@ -1,16 +1,20 @@
-"""Guide the operator through a capture: what to do before each step, questions, answers, warnings and status."""
+"""Guide the operator through a capture: what to do before each step, questions, answers, warnings, remaining time."""
 
 from collections import defaultdict
 from collections.abc import Mapping
+from statistics import median
 from typing import Literal, NoReturn, Protocol
 
 from msgspec import Struct
 
 from faintfield.rig.cameras.protocol import Pixels
-from faintfield.rig.capture.pace import Pace
+from faintfield.rig.clock import Clock
 from faintfield.rig.errors import CaptureStopped
 from faintfield.rig.plan import PlannedFrame, StepKind
 from faintfield.rig.session.session import Session
+from faintfield.rig.stages.gantry import Gantry
+from faintfield.rig.stages.motion import one_sided_path, path_duration_s
+from faintfield.rig.stages.protocol import Point
 
 type Answer = Literal["go", "again", "keep", "retake", "skip", "stop"]
 type OperatorRequest = Literal["pause", "skip", "retake", "stop"]
@@ -61,20 +65,9 @@ TITLES: dict[StepKind, str] = {
 
 
 class Prompt(Struct, frozen=True):
-    """A question to the operator.
+    """A question to the operator, whose usual answer comes first; a capture without a person gives `unattended`.
 
-    Parameters
-    ----------
-    key : str
-        Subject of the question, for the journal: `home`, `step`, `paused`, `stage`, `camera`, `drift`, `skipped`.
-    title : str
-        Title in a few words.
-    lines : tuple of str
-        What to do, what will happen, how long it takes, and what to check.
-    answers : tuple of str
-        Possible answers, the usual one first.
-    unattended : str
-        Answer of a capture without a person (`--yes`).
+    The journal knows it by its key: `home`, `step`, `paused`, `stage`, `camera`, `drift` or `skipped`.
     """
 
     key: str
@@ -85,26 +78,10 @@ class Prompt(Struct, frozen=True):
 
 
 class Status(Struct, frozen=True):
-    """State of the capture.
+    """State of the capture, whose present step is the one of number `step`, from 1.
 
-    Parameters
-    ----------
-    doing : str
-        What happens now, in a few words.
-    step, steps : int
-        Number of the present step, from 1, and number of steps.
-    title : str
-        Title of the present step.
-    done, total : int
-        Frames taken, and frames of the plan.
-    to_go_s : float
-        Remaining time in s, without prompts.
-    node : (int, int), optional
-        Row and column of the node where the stage is or goes.
-    grid : tuple of tuple of float
-        Share of this step's frames that is done, per row and column; −1 where the step has none.
-    warnings : tuple of str
-        The latest warnings.
+    `done` of `total` frames are taken; the rest takes `to_go_s` without prompts. `node` is where the stage is or goes,
+    and `grid` has the share of this step's frames that is done, per row and column; −1 where the step has none.
     """
 
     doing: str
@@ -161,24 +138,78 @@ def format_duration(duration_s: float) -> str:
     return f"about {minutes} min" if minutes < 90 else f"about {minutes // 60} h {minutes % 60:02d} min"
 
 
+# Time in s of a stop besides motion and rest, and of a frame besides exposure and readout, until one has been measured:
+# two status reports, and writing a file.
+_STOP_S, _FRAME_S = 0.5, 0.2
+
+
+class Pace:
+    """Tracks where the stage is (`here`), and learns how long a stop, a frame and a drift check (`check_s`) take.
+
+    It begins with the planned rest at each stop, and the planned time of a frame besides its exposure.
+    """
+
+    def __init__(self, stage: Gantry, clock: Clock, rest_s: float, readout_s: float) -> None:
+        self._stage = stage
+        self._clock = clock
+        self._stop_s: list[float] = []
+        self._frame_s: dict[bool, list[float]] = {False: [], True: []}
+        self._guess_s = (_STOP_S + rest_s, _FRAME_S + readout_s)
+        self._departed_s = 0.0
+        self._start: Point | None = None
+        self._repeated = False
+        self.here: Point | None = None
+        self.check_s = 0.0
+
+    def depart(self) -> None:
+        """Note that the stage leaves its position."""
+        self._departed_s, self._start = self._clock.now_s(), self.here
+        self.here, self._repeated = None, False
+
+    def arrive(self, target: Point, *, timed: bool) -> None:
+        """Note that the stage is at rest at `target`; learn from the time it took if `timed`."""
+        if timed and self._start is not None:
+            self._stop_s.append(self._clock.now_s() - self._departed_s - self._motion_s(self._start, target))
+        self.here = target
+
+    def finish_frame(self, begun_s: float, exposure_s: float) -> None:
+        """Note that a frame that was begun at `begun_s` is committed.
+
+        The first frame at a stop is told from the next ones, which are faster: a controller that was just asked for its
+        position is not asked again at once.
+        """
+        self._frame_s[self._repeated].append(self._clock.now_s() - begun_s - exposure_s)
+        self._repeated = True
+
+    def remaining_s(self, frames: list[PlannedFrame], drift_checks: int) -> float:
+        """Return how long `frames`, in this order, and a number of drift checks will take, without prompts."""
+        stop_s = median(self._stop_s) if self._stop_s else self._guess_s[0]
+        first_s = median(self._frame_s[False] or [self._guess_s[1]])
+        again_s = median(self._frame_s[True] or [first_s])
+        total_s = drift_checks * self.check_s
+        here, last_step = self.here, None
+        for frame in frames:
+            target = frame.stop.target
+            arrives = target != here or frame.step != last_step
+            if arrives:
+                total_s += stop_s + (self._motion_s(here, target) if here is not None else 0.0)
+            total_s += frame.exposure_s + (first_s if arrives else again_s)
+            here, last_step = target, frame.step
+        return total_s
+
+    def _motion_s(self, start: Point, target: Point) -> float:
+        path = (start, *one_sided_path(start, target, self._stage.settings.approach_mm))
+        return path_duration_s(path, self._stage.identify().motion, self._stage.feed_mm_per_s())
+
+
 # Without an operator, a capture stops after this many failures in a row at one frame, or failed drift checks in all.
 MAX_UNATTENDED_TRIES = 3
 
 
 class Dialogue:
-    """The capture's side of the conversation with the operator.
+    """The capture's side of the conversation with the operator, which the journal keeps.
 
-    Parameters
-    ----------
-    session, pace : Session, Pace
-        Open session, whose state is shown and whose journal keeps what is said; and the remaining time.
-    operator : OperatorInterface
-        Answers prompts and shows the state of the capture.
-
-    Attributes
-    ----------
-    warnings : tuple of str
-        The latest warnings, shown with the status.
+    `warnings` are the latest ones, shown with the status.
     """
 
     def __init__(self, session: Session, operator: OperatorInterface, pace: Pace) -> None:

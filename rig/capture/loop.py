@@ -3,8 +3,15 @@
 import msgspec
 
 from faintfield.rig.cameras.protocol import Decode
-from faintfield.rig.capture.guide import MAX_UNATTENDED_TRIES, Answer, Dialogue, OperatorInterface, Prompt, step_prompt
-from faintfield.rig.capture.pace import Pace
+from faintfield.rig.capture.guide import (
+    MAX_UNATTENDED_TRIES,
+    Answer,
+    Dialogue,
+    OperatorInterface,
+    Pace,
+    Prompt,
+    step_prompt,
+)
 from faintfield.rig.capture.survey import check_plan
 from faintfield.rig.capture.take import DriftChecks, FrameTaker
 from faintfield.rig.devices import Rig
@@ -17,16 +24,9 @@ from faintfield.rig.stages.drift import recover
 
 
 class Capture:
-    """Takes the missing frames of a session; call `run` once.
+    """Takes the missing frames of an open session, with a rig that is not yet connected; call `run` once.
 
-    Parameters
-    ----------
-    session, rig : Session, Rig
-        Open session, where the frames are stored; stage and camera, not yet connected.
-    operator : OperatorInterface
-        Answers prompts and shows the state of the capture.
-    decode : callable
-        Reads the pixels of a frame's file for checks and display; returns None if it cannot.
+    `decode` reads the pixels of a frame's file for checks and display; it returns None if it cannot.
     """
 
     def __init__(self, session: Session, rig: Rig, operator: OperatorInterface, decode: Decode) -> None:

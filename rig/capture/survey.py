@@ -4,8 +4,8 @@ import math
 
 from msgspec import Struct
 
-from faintfield.rig.cameras.protocol import CameraReport
-from faintfield.rig.capture.temperature import require_temperature
+from faintfield.rig.cameras.protocol import Camera, CameraReport, Thermometer
+from faintfield.rig.cameras.settings import CameraSettings
 from faintfield.rig.devices import Rig
 from faintfield.rig.errors import PlanRefused
 from faintfield.rig.plan import CapturePlan
@@ -26,10 +26,7 @@ class Survey(Struct, frozen=True):
 def survey(rig: Rig, settings: RigSettings) -> Survey:
     """Connect to stage and camera, make the plan, and disconnect; nothing moves and nothing is exposed.
 
-    Raises
-    ------
-    RigError
-        Stage or camera does not answer, or the plan is not possible.
+    Raises `RigError` if stage or camera does not answer, or the plan is not possible.
     """
     try:
         rig.stage.connect()
@@ -54,13 +51,7 @@ def survey(rig: Rig, settings: RigSettings) -> Survey:
 
 
 def check_plan(plan: CapturePlan, stage: Gantry, camera: CameraReport) -> None:
-    """Check that the stage allows all positions of a plan and the camera offers all its exposure times.
-
-    Raises
-    ------
-    PlanRefused
-        A position is not allowed or an exposure time is not offered; the message names the first.
-    """
+    """Raise `PlanRefused` unless the stage allows all positions of a plan and the camera offers all exposure times."""
     stage.workspace().check_path(plan.path())
     for exposure_s in sorted({exposure_s for step in plan.steps for exposure_s in step.exposure_s}):
         if not camera.offers(exposure_s):
@@ -69,3 +60,18 @@ def check_plan(plan: CapturePlan, stage: Gantry, camera: CameraReport) -> None:
             raise PlanRefused(
                 f"the camera does not offer exposure_s = {exposure_s:g}, the nearest is {nearest:g}; correct it"
             )
+
+
+def require_temperature(camera: Camera, settings: CameraSettings) -> None:
+    """Raise `PlanRefused` if the settings make captures wait for a temperature that the camera does not report."""
+    wanted_c = settings.settle_temperature_c
+    if wanted_c is not None and read_temperature(camera) is None:
+        raise PlanRefused(
+            f"camera.settle_temperature_c = {wanted_c:g}, but the camera reports no temperature; remove the key, and "
+            "wait for the sensor yourself"
+        )
+
+
+def read_temperature(camera: Camera) -> float | None:
+    """Return the temperature of a camera's sensor in °C, None if it reports none."""
+    return camera.temperature_c() if isinstance(camera, Thermometer) else None

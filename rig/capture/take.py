@@ -1,6 +1,7 @@
-"""Take one frame, and check for drift: move, rest, verify the position, expose, write, check and commit."""
+"""Take one frame: move, rest, verify the position, expose, write, check and commit; and check for drift."""
 
 import itertools
+import math
 from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -8,13 +9,19 @@ from tempfile import TemporaryDirectory
 import msgspec
 
 from faintfield.rig.cameras.protocol import Decode, Exposure, Pixels
-from faintfield.rig.capture.checks import LIT_KINDS, Findings, board_warnings, check_frame
-from faintfield.rig.capture.guide import MAX_UNATTENDED_TRIES, Answer, Dialogue, Prompt
-from faintfield.rig.capture.pace import Pace
-from faintfield.rig.capture.settling import Settling, measure_settling
-from faintfield.rig.capture.temperature import TemperatureWait
+from faintfield.rig.cameras.settings import CoolingSettings
+from faintfield.rig.capture.checks import (
+    LIT_KINDS,
+    Findings,
+    Settling,
+    board_warnings,
+    check_frame,
+    measure_settling,
+)
+from faintfield.rig.capture.guide import MAX_UNATTENDED_TRIES, Answer, Dialogue, Pace, Prompt
+from faintfield.rig.capture.survey import read_temperature
 from faintfield.rig.devices import Rig
-from faintfield.rig.errors import CameraError, DriftUnknown, PositionDrifted
+from faintfield.rig.errors import CameraError, CameraTimeout, DriftUnknown, PositionDrifted
 from faintfield.rig.plan import PlannedFrame
 from faintfield.rig.session.journal import CommittedFrame, FrameRecord
 from faintfield.rig.session.session import Session
@@ -22,19 +29,9 @@ from faintfield.rig.stages.drift import DriftWatch
 
 
 class DriftChecks:
-    """The drift checks of a capture, if the rig asks for any.
+    """The drift checks of a capture; `watch`, which measures the drift, is None if `drift.check` is off.
 
-    Parameters
-    ----------
-    session, rig, dialogue, pace : Session, Rig, Dialogue, Pace
-        Frames become void if they are taken again; stage and clock; asks what to do; learns how long a check takes.
-
-    Attributes
-    ----------
-    watch : DriftWatch or None
-        Measures the drift; None if `drift.check` is off.
-    nodes : int
-        Number of nodes that the stage moved to since the last check.
+    `nodes` counts those that the stage moved to since the last check.
     """
 
     def __init__(self, session: Session, rig: Rig, dialogue: Dialogue, pace: Pace) -> None:
@@ -79,13 +76,7 @@ class DriftChecks:
             self._session.journal.event("drift_check", away_mm=drift.away_mm)
 
     def ask_to_retake(self, failure: PositionDrifted | DriftUnknown, title: str, failures: int, reason: str) -> None:
-        """Record which frames are suspect, and ask whether to take them again; stop unattended captures at last.
-
-        Raises
-        ------
-        CaptureStopped
-            The operator asked for it.
-        """
+        """Record which frames are suspect, and ask whether to take them again, or to stop (`CaptureStopped`)."""
         suspect = [frame for frame in failure.suspect if isinstance(frame, CommittedFrame)]
         self._session.journal.event("suspect", message=str(failure), intents=[frame.intent for frame in suspect])
         self._dialogue.warn(str(failure))
@@ -98,23 +89,16 @@ class DriftChecks:
 # Exposures that are not kept are numbered from here, beyond the number of any frame.
 _FIRST_UNKEPT_NUMBER = 10**9
 
+# Interval in s at which the temperature is read, and the time for which it must stay within the tolerance: a cooler
+# that overshoots passes it twice.
+_POLL_S, _STEADY_S = 2.0, 10.0
+
 
 class FrameTaker:
-    """Takes the frames of a session one by one.
+    """Takes the frames of a session one by one, with a rig that is connected and homed.
 
-    Parameters
-    ----------
-    session, rig : Session, Rig
-        Open session, where the frames are stored; stage, camera and clock, connected and homed before `take`.
-    dialogue, drift, pace : Dialogue, DriftChecks, Pace
-        Informs the operator; counts nodes and frames for the next drift check; knows the position of the stage.
-    decode : callable
-        Reads the pixels of a frame's file; returns None if it cannot, and raises `CameraError` for a damaged file.
-
-    Attributes
-    ----------
-    last : PlannedFrame or None
-        The frame taken last.
+    `decode` reads the pixels of a frame's file; it returns None if it cannot, and raises `CameraError` for a damaged
+    file. `last` is the frame taken last.
     """
 
     def __init__(
@@ -127,7 +111,7 @@ class FrameTaker:
         self._drift = drift
         self._pace = pace
         self._decode = decode
-        self._temperature = TemperatureWait(session, rig, dialogue)
+        self._cooled_step: int | None = None
         self._settle_s: float | None = None
         self._layouts: dict[str, str | None] = {}
         self._unkept_numbers = itertools.count(_FIRST_UNKEPT_NUMBER)
@@ -141,19 +125,56 @@ class FrameTaker:
         StageError, NotHomed
             The stage failed, or is not where it was sent.
         CameraError
-            The camera failed.
+            The camera failed, or its temperature does not settle within `settle_limit_s` (`CameraTimeout`).
         SessionUnwritable
             The frame could not be written.
         """
-        self._temperature.before(frame)
+        settings = self._session.rig.camera
+        if settings.settle_temperature_c is not None and frame.step != self._cooled_step:
+            self._wait_for_temperature(frame, settings, settings.settle_temperature_c)
+        self._cooled_step = frame.step
         self._dialogue.show_status(frame, "moving")
         self._go_to(frame)
         self._dialogue.show_status(frame, "exposing")
         try:
             self._expose(frame)
         except CameraError:
-            self._temperature.forget()
+            self._cooled_step = None  # a camera that failed was perhaps switched off
             raise
+
+    def _wait_for_temperature(self, frame: PlannedFrame, settings: CoolingSettings, target_c: float) -> None:
+        """Wait until the sensor is at its temperature: dark current doubles over a few kelvins."""
+        clock = self._rig.clock
+        begun_s, steady_s = clock.now_s(), math.inf
+        while True:
+            temperature_c = read_temperature(self._rig.camera)
+            if temperature_c is None:
+                raise CameraError(
+                    f"camera.settle_temperature_c = {target_c:g}, but the camera reports no temperature; check cooler "
+                    "and cable"
+                )
+            now_s = clock.now_s()
+            near = abs(temperature_c - target_c) <= settings.settle_tolerance_c
+            steady_s = min(steady_s, now_s) if near else math.inf
+            if now_s - steady_s >= _STEADY_S:
+                break
+            if now_s - begun_s >= settings.settle_limit_s:
+                raise CameraTimeout(
+                    f"the sensor is at {temperature_c:.1f} C after {now_s - begun_s:.0f} s, and did not stay within "
+                    f"{settings.settle_tolerance_c:g} K of {target_c:.1f} C for {_STEADY_S:g} s; check its cooler and "
+                    "the set point in the camera's settings, or raise camera.settle_limit_s"
+                )
+            self._dialogue.show_status(frame, f"sensor at {temperature_c:.1f} C, waiting for {target_c:.1f} C")
+            request = self._dialogue.operator.take_request()
+            if request is not None:  # other wishes than to stop are for the frames
+                self._session.journal.event("wish", frame=frame.number, wish=request)
+                if request == "stop":
+                    self._dialogue.stop()
+                self._dialogue.warn(f"there is nothing to {request} while the sensor settles; stop, or wait")
+            clock.sleep_s(_POLL_S)
+        self._session.journal.event(
+            "temperature", frame=frame.number, temperature_c=temperature_c, waited_s=round(now_s - begun_s, 3)
+        )
 
     def _go_to(self, frame: PlannedFrame) -> None:
         target = frame.stop.target

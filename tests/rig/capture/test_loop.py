@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from faintfield.rig.cameras.protocol import CameraReport
 from faintfield.rig.cameras.settings import SimulatedSettings
-from faintfield.rig.capture.guide import Answer, OperatorRequest
+from faintfield.rig.capture.checks import Settling
+from faintfield.rig.capture.guide import Answer, OperatorRequest, Pace
 from faintfield.rig.capture.loop import Capture
-from faintfield.rig.capture.pace import Pace
-from faintfield.rig.capture.settling import Settling
 from faintfield.rig.capture.survey import check_plan, survey
 from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import CaptureStopped, OutsideTravel, PlanRefused

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from faintfield.rig.cameras.protocol import Pixels
-from faintfield.rig.capture.settling import measure_settling
+from faintfield.rig.capture.checks import measure_settling
 from faintfield.rig.settings import SettleSettings
 from faintfield.rig.simulation.controller.kinematics import SimulatedClock
 from faintfield.rig.simulation.experiment import paper_experiment

@@ -11,8 +11,7 @@ from msgspec.structs import replace
 from faintfield.rig.cameras.protocol import Camera
 from faintfield.rig.cameras.settings import CameraSettings, FolderSettings, SimulatedSettings
 from faintfield.rig.capture.guide import Status
-from faintfield.rig.capture.survey import survey
-from faintfield.rig.capture.temperature import require_temperature
+from faintfield.rig.capture.survey import require_temperature, survey
 from faintfield.rig.devices import Rig, open_rig
 from faintfield.rig.errors import CameraTimeout, CaptureStopped, PlanRefused
 from faintfield.rig.session.journal import Journal
