@@ -168,18 +168,18 @@ class CapturePlan(Struct, frozen=True, forbid_unknown_fields=True):
         """Return the size of all frames on disk."""
         return self.frame_count() * self.frame_bytes
 
-    def path(self, start: Point | None = None) -> tuple[Point, ...]:
-        """Return all points of the stage's path in order, turning points included, from `start` if it is known."""
+    def path(self) -> tuple[Point, ...]:
+        """Return all points of the stage's path in order, turning points included."""
         targets = [stop.target for step in self.steps for stop in self.stops_of(step)]
-        points = [targets.pop(0) if start is None else start] if targets else []
-        for target in targets:
+        points = targets[:1]
+        for target in targets[1:]:
             if target != points[-1]:
                 points.extend(one_sided_path(points[-1], target, self.approach_mm))
         return tuple(points)
 
-    def duration_s(self, motion: MotionLimits, feed_mm_per_s: float, start: Point | None = None) -> float:
+    def duration_s(self, motion: MotionLimits, feed_mm_per_s: float) -> float:
         """Return the duration of the capture without prompts, from the controller's rates and accelerations."""
-        total_s = path_duration_s(self.path(start), motion, feed_mm_per_s)
+        total_s = path_duration_s(self.path(), motion, feed_mm_per_s)
         for step in self.steps:
             exposing_s = step.frames_per_node * sum(step.exposure_s) + step.frames_per_stop() * self.readout_s
             total_s += len(self.stops_of(step)) * (_ARRIVAL_S + self.settle_s + exposing_s)

@@ -5,7 +5,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import NamedTuple
 
 from faintfield.rig.cameras.protocol import CameraReport, Decode, Exposure
 from faintfield.rig.cameras.settings import FolderSettings
@@ -24,15 +23,6 @@ _TIME_GRAIN_S = 2.0
 _ZERO_TAIL_BYTES = 512
 # A file for this moment is made, and removed, to learn the time by the clock of the folder's file system.
 _PROBE = ".faintfield-time"
-
-
-class _Request(NamedTuple):
-    """A request for a frame, by the rig's clock; `folder_time_s` is by that of the folder's file system, if known."""
-
-    asked_s: float
-    exposure_s: float
-    deadline_s: float
-    folder_time_s: float | None
 
 
 @dataclass
@@ -80,45 +70,34 @@ class FolderCamera:
         A file is complete when it decodes as a whole picture. One that cannot be decoded here, or that ends in zeros,
         is complete when neither its size nor its time has changed for `quiet_s`.
 
-        After a frame that did not come in time, the next file that appears is refused: it may be that frame.
-
-        Raises
-        ------
-        CameraTimeout
-            No file appeared, or it did not become complete.
-        CameraError
-            A file appeared too early, or may be the frame before; two appeared at once; or the folder is gone.
+        A file that appears too early is refused, and the first after a frame that did not come in time: it may be that
+        frame.
         """
         known = self._require_open()
+        bound_s = exposure_s + self._settings.arrival_s
         with self._translate_errors():
             files = set(self._files())
             if self._known_when_late is not None and files - self._known_when_late:
                 self._known_when_late = None  # the late file has come in the meantime
             known.update(files)  # a late or unrequested frame shows another position
-            now_s = self._clock.now_s()
-            deadline_s = now_s + exposure_s + self._settings.arrival_s
-            request = _Request(now_s, exposure_s, deadline_s, self._folder_time_s())
+            asked_s, folder_time_s = self._clock.now_s(), self._folder_time_s()
             arrival: _Arrival | None = None
-            while self._clock.now_s() < request.deadline_s:
+            while self._clock.now_s() < asked_s + bound_s:
                 arrival = self._arriving_file(known, arrival)
                 if arrival is not None:
-                    self._refuse_late(arrival, known)
-                    self._refuse_early(arrival, request, known)
+                    reason = self._lateness() or self._earliness(arrival, exposure_s, asked_s, folder_time_s)
+                    if reason:
+                        known.add(arrival.path)
+                        raise CameraError(f"{arrival.path}: {reason}")
                     if self._is_complete(arrival):
                         known.add(arrival.path)
-                        return Exposure(
-                            arrival.path.suffix.lower(),
-                            content=arrival.path.read_bytes(),
-                            metadata={"camera_file": arrival.path.name},
-                        )
+                        suffix, name = arrival.path.suffix.lower(), arrival.path.name
+                        return Exposure(suffix, arrival.path.read_bytes(), metadata={"camera_file": name})
                 self._clock.sleep_s(_POLL_S)
         self._known_when_late = set(known)
-        state = "no file came"
-        if arrival is not None:
-            state = f"{arrival.path.name} never stopped growing"
-            if arrival.problem:
-                state = f"{arrival.path.name} is not complete ({arrival.problem.partition('; ')[0]})"
-        bound_s = exposure_s + self._settings.arrival_s
+        state = (
+            "no file came" if arrival is None else f"{arrival.path.name} {arrival.problem or 'never stopped growing'}"
+        )
         raise CameraTimeout(f"{self._folder}: {state} within {bound_s:g} s; check that the program saves there")
 
     def close(self) -> None:
@@ -158,39 +137,34 @@ class FolderCamera:
             return before
         return _Arrival(*state, self._clock.now_s())
 
-    def _refuse_late(self, arrival: _Arrival, known: set[Path]) -> None:
-        """Refuse the first file after a frame that did not come in time, perhaps of where the stage was before."""
+    def _lateness(self) -> str:
+        """Return why the first file after a frame that did not come in time is refused, "" if it is another."""
         if self._known_when_late is None:
-            return
+            return ""
         self._known_when_late = None
-        known.add(arrival.path)
-        raise CameraError(
-            f"{arrival.path}: may be the frame before, which did not come in time; take this frame again, and raise "
-            "camera.arrival_s if files often come late"
+        return (
+            "may be the frame before, which did not come in time; take this frame again, and raise camera.arrival_s if "
+            "files often come late"
         )
 
-    def _refuse_early(self, arrival: _Arrival, request: _Request, known: set[Path]) -> None:
-        """Refuse a file whose exposure was begun before the frame was asked for, perhaps while the stage moved."""
+    def _earliness(self, arrival: _Arrival, exposure_s: float, asked_s: float, folder_time_s: float | None) -> str:
+        """Return why a file is refused whose exposure was begun before the request, perhaps while the stage moved."""
         # Read after the listing, so that a file is never taken for an earlier one than it is
-        after_s = self._clock.now_s() - request.asked_s
-        if after_s < request.exposure_s:
-            known.add(arrival.path)
-            raise CameraError(
-                f"{arrival.path}: came {after_s:.2f} s after the request for a frame of {request.exposure_s:g} s, so "
-                "that its exposure was begun before; start no exposure by hand, state the camera's true exposure "
-                "time, and take this frame again"
+        after_s = self._clock.now_s() - asked_s
+        if after_s < exposure_s:
+            return (
+                f"came {after_s:.2f} s after the request for a frame of {exposure_s:g} s, so that its exposure was "
+                "begun before; start no exposure by hand, state the camera's true exposure time, and take this frame "
+                "again"
             )
-        if request.folder_time_s is None:
-            return
         changed_s = 1e-9 * arrival.changed_ns
-        early_s = request.folder_time_s + request.exposure_s - changed_s
-        if early_s > _TIME_GRAIN_S:
-            known.add(arrival.path)
-            raise CameraError(
-                f"{arrival.path}: was last changed at {_utc(changed_s)}, {early_s:.1f} s before the exposure of "
-                f"{request.exposure_s:g} s that was asked for at {_utc(request.folder_time_s)} could end; "
-                "take this frame again, or set camera.file_times = false if the program keeps the camera's own time"
-            )
+        if folder_time_s is None or folder_time_s + exposure_s - changed_s <= _TIME_GRAIN_S:
+            return ""
+        return (
+            f"was last changed at {_utc(changed_s)}, {folder_time_s + exposure_s - changed_s:.1f} s before the "
+            f"exposure of {exposure_s:g} s that was asked for at {_utc(folder_time_s)} could end; "
+            "take this frame again, or set camera.file_times = false if the program keeps the camera's own time"
+        )
 
     def _is_complete(self, arrival: _Arrival) -> bool:
         quiet_s = self._clock.now_s() - arrival.since_s
@@ -206,7 +180,7 @@ class FolderCamera:
         try:
             return self._decode(arrival.path) is not None or long_quiet
         except CameraError as failure:
-            arrival.problem = str(failure)
+            arrival.problem = f"is not complete ({str(failure).partition('; ')[0]})"
             return False
 
     def _files(self) -> list[Path]:
