@@ -41,11 +41,10 @@ class GPhoto2Camera:
         """Return model, serial number, exposure times and settings."""
         values = self._bounded(self._read_settings, "reporting its settings")
         name = " ".join(values.get(key, "") for key in ("manufacturer", "cameramodel", "serialnumber")).strip()
-        choices = self._bounded(self._shutter_choices, "listing its exposure times")
         return CameraReport(
             name=name or "camera without a name",
             frame_bytes=round(self._settings.frame_mb * 1e6),
-            exposures_s=tuple(sorted(choices)),
+            exposures_s=tuple(sorted(self._bounded(self._shutter_choices, "listing its exposure times"))),
             readout_s=1.0,
             settings={key: values[key] for key in _RECORDED if key in values},
         )

@@ -4,6 +4,7 @@ import math
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from typing import Any, Literal
 
 from msgspec import Struct
@@ -89,8 +90,7 @@ class MicroManagerController:
         self._shared.import_package()
         self.close()
         try:
-            loading = "loading the configuration"
-            self._core, self._label = self._run(self._load, self._options.answer_s, loading, connected=False)
+            self._core, self._label = self._run(self._load, "loading the configuration", connected=False)
         except (StageLost, PlanRefused):
             self._release()
             raise
@@ -101,7 +101,7 @@ class MicroManagerController:
         if self._travel_mm is None:
             raise WrongFirmware("Micro-Manager does not report the travel of a stage; set stage.travel_mm")
         options = self._options
-        name, properties = self._run(self._describe, options.answer_s, "describing the stage")
+        name, properties = self._run(self._describe, "describing the stage")
         return Identity(
             firmware=name,
             travel_mm=self._travel_mm,
@@ -122,10 +122,8 @@ class MicroManagerController:
         begun_s = self._clock.now_s()
         if self._options.origin == "confirmed":
             if not self._origin_confirmed:
-                raise StageUnfit(
-                    "the position is lost, and with it the origin that stage.origin = 'confirmed' stands for; find the "
-                    "origin with the stage's own program, then give the command again"
-                )
+                problem = "the position is lost, and with it the confirmed origin"
+                raise StageUnfit(f"{problem}; find the origin with the stage's own program, then go on")
             self._origin_confirmed = False
         else:
             self._move("home", (), bound_s, "homing")
@@ -152,10 +150,9 @@ class MicroManagerController:
             self._clock.sleep_s(_REST_S)
             point = self._report()
             limit_mm = _EQUAL_SHARE * self._options.tolerance_mm
-            if all(abs(a - b) <= limit_mm for a, b in zip(earlier, point, strict=True)):
-                busy = self._run(lambda: self._core.deviceBusy(self._label), self._options.answer_s, "asking for rest")
-                if not busy:
-                    return point
+            equal = all(abs(a - b) <= limit_mm for a, b in zip(earlier, point, strict=True))
+            if equal and not self._run(lambda: self._core.deviceBusy(self._label), "asking for rest"):
+                return point
             earlier = point
         raise StageTimeout(f"the stage does not come to rest at {earlier}; look what moves it, then home it")
 
@@ -167,14 +164,14 @@ class MicroManagerController:
 
     def stop(self) -> bool:
         """Stop and wait for rest. The position counts as lost, since adapters differ in how abruptly they stop."""
-        self._run(lambda: self._core.stop(self._label), self._options.answer_s, "stopping")
+        self._run(lambda: self._core.stop(self._label), "stopping")
         self.read_position()
         return False
 
     def abort(self) -> bool:
         """Tell the stage to stop; the position counts as lost."""
         with suppress(StageError):
-            self._run(lambda: self._core.stop(self._label), min(_ABORT_S, self._options.answer_s), "stopping")
+            self._run(lambda: self._core.stop(self._label), "stopping", answer_s=min(_ABORT_S, self._options.answer_s))
         return False
 
     def recover(self, wait_s: float) -> bool:
@@ -194,7 +191,7 @@ class MicroManagerController:
 
     def _release(self) -> None:
         with suppress(TimeoutError, RuntimeError):  # any fault was already raised when the stage was used
-            result_within(self._options.answer_s, lambda: self._shared.release("stage"), "stage")
+            result_within(self._options.answer_s, partial(self._shared.release, "stage"), "stage")
 
     def _load(self) -> tuple[Any, str]:
         core = self._shared.acquire("stage")
@@ -225,14 +222,20 @@ class MicroManagerController:
             finally:
                 core.setTimeoutMs(usual_ms)
 
-        self._run(work, bound_s + self._options.answer_s, what, waits_s=bound_s)
+        self._run(work, what, waits_s=bound_s)
 
     def _report(self) -> Point:
-        x_um, y_um = self._run(lambda: self._core.getXYPosition(self._label), self._options.answer_s, "its report")
+        x_um, y_um = self._run(lambda: self._core.getXYPosition(self._label), "its report")
         return Point(x_um / _UM_PER_MM, y_um / _UM_PER_MM)
 
     def _run[T](
-        self, call: Callable[[], T], bound_s: float, what: str, *, waits_s: float | None = None, connected: bool = True
+        self,
+        call: Callable[[], T],
+        what: str,
+        *,
+        waits_s: float = 0.0,
+        answer_s: float | None = None,
+        connected: bool = True,
     ) -> T:
         """Call with a time limit, and raise a `StageError` for what the core raises.
 
@@ -241,22 +244,22 @@ class MicroManagerController:
         """
         if connected and self._core is None:
             raise StageLost("the stage is not connected; connect it first")
-        begun_s = self._clock.now_s()
-        core, label, given_up = self._core, self._label, threading.Event()
+        begun_s, bound_s = self._clock.now_s(), waits_s + (answer_s or self._options.answer_s)
+        stop, given_up = partial(_stop, self._core, self._label), threading.Event()
 
         def work() -> T:
             try:
                 return call()
             finally:
                 if given_up.is_set():
-                    _stop(core, label)
+                    stop()
 
         try:
             return result_within(bound_s, work, "stage")
         except TimeoutError as failure:
             given_up.set()
             with suppress(TimeoutError):
-                result_within(min(_ABORT_S, self._options.answer_s), lambda: _stop(core, label), "stage")
+                result_within(min(_ABORT_S, self._options.answer_s), stop, "stage")
             self._core = None
             self._shared.abandon("stage")
             raise StageTimeout(
@@ -267,7 +270,7 @@ class MicroManagerController:
             raise PlanRefused(f"[stage]: {failure}") from failure
         except (RuntimeError, OSError) as failure:
             reason = in_one_line(failure)
-            if waits_s is not None and self._clock.now_s() - begun_s >= waits_s:
+            if waits_s and self._clock.now_s() - begun_s >= waits_s:
                 raise StageTimeout(
                     f"the stage did not finish {what} within {waits_s:.1f} s ({reason}); look for an obstacle, or "
                     "lower stage.rate_mm_per_s, then home it"
