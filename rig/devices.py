@@ -1,4 +1,4 @@
-"""Makes the stage and the camera that rig.toml describes, real or simulated."""
+"""Construct the stage and the camera that rig.toml describes, real or simulated."""
 
 import weakref
 from collections.abc import Callable
@@ -26,8 +26,7 @@ from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.simulation.lab import SimulatedCamera, SimulatedLab
 from faintfield.rig.stages.gantry import Gantry, serial_stage
 from faintfield.rig.stages.micromanager import MicroManagerController, MicroManagerStage
-from faintfield.rig.stages.protocol import SERIAL_PROTOCOLS, StageSettings
-from faintfield.rig.stages.protocol import SIMULATED as SIMULATED  # commands take it from here
+from faintfield.rig.stages.protocol import SERIAL_PROTOCOLS, SIMULATED, StageSettings
 from faintfield.rig.stages.transport import SerialPort, TrafficLog
 
 SIMULATED_FIRMWARE = {"grbl": SimulatedGrbl, "grblhal": SimulatedGrblHal, "marlin": SimulatedMarlin}

@@ -1,4 +1,4 @@
-"""One Micro-Manager core, with all devices of its configuration, for whichever of camera and stage need it."""
+"""One Micro-Manager core with all devices of its configuration, which camera and stage may share."""
 
 from collections.abc import Mapping
 from pathlib import Path

@@ -85,7 +85,9 @@ def plugin_camera(settings: PluginSettings, clock: Clock) -> Camera:
     """Return the camera that a plug-in makes; raises `PlanRefused` if its settings are wrong or it cannot be used."""
     plugin = _load(CAMERAS, settings.name, CameraPlugin)
     options = checked_options(settings.options, plugin.settings, f"[camera] with backend = {settings.name!r}")
-    with _naming(PluginFailed, f"the plug-in {settings.name!r} failed", "correct its settings, or tell its authors"):
+    with _translated_failures(
+        PluginFailed, f"the plug-in {settings.name!r} failed", "correct its settings, or tell its authors"
+    ):
         return PluginCamera(settings.name, plugin.make(options, clock))
 
 
@@ -98,31 +100,33 @@ class PluginCamera:
 
     def open(self) -> None:
         """Connect to the camera."""
-        with self._naming():
+        with self._translated_failures():
             self._camera.open()
 
     def report(self) -> CameraReport:
         """Return the camera's name, limits and settings."""
-        with self._naming():
+        with self._translated_failures():
             return self._camera.report()
 
     def expose(self, exposure_s: float, number: int) -> Exposure:
         """Take one frame."""
-        with self._naming():
+        with self._translated_failures():
             return self._camera.expose(exposure_s, number)
 
     def temperature_c(self) -> float | None:
         """Return the temperature of the sensor in °C, None if the camera reports none."""
-        with self._naming():
+        with self._translated_failures():
             return self._camera.temperature_c() if isinstance(self._camera, Thermometer) else None
 
     def close(self) -> None:
         """Disconnect."""
-        with self._naming():
+        with self._translated_failures():
             self._camera.close()
 
-    def _naming(self) -> AbstractContextManager[None]:
-        return _naming(CameraError, f"the plug-in {self._name!r} failed", "tell its authors", passing=RigError)
+    def _translated_failures(self) -> AbstractContextManager[None]:
+        return _translated_failures(
+            CameraError, f"the plug-in {self._name!r} failed", "tell its authors", passing=RigError
+        )
 
 
 def plugin_controller(settings: StageSettings, clock: Clock) -> Controller:
@@ -130,7 +134,9 @@ def plugin_controller(settings: StageSettings, clock: Clock) -> Controller:
     name = settings.protocol
     plugin = _load(STAGES, name, StagePlugin)
     options = checked_options(settings.options, plugin.settings, f"[stage] with protocol = {name!r}")
-    with _naming(PluginFailed, f"the plug-in {name!r} failed", "correct its settings, or tell its authors"):
+    with _translated_failures(
+        PluginFailed, f"the plug-in {name!r} failed", "correct its settings, or tell its authors"
+    ):
         return plugin.make(options, settings, clock)
 
 
@@ -163,7 +169,9 @@ def _load[T](group: str, name: str, kind: type[T]) -> T:
     if len(packages) > 1:
         raise UnknownPlugin(f"{key} = {name!r} is offered by {' and '.join(packages)}; uninstall all but one")
     what = f"the plug-in {name!r} of {packages[0]}"
-    with _naming(PluginFailed, f"{what} cannot be imported", "install what it needs, or another version of it"):
+    with _translated_failures(
+        PluginFailed, f"{what} cannot be imported", "install what it needs, or another version of it"
+    ):
         plugin = entries[0].load()
     settings = getattr(plugin, "settings", None)
     strict = (
@@ -176,7 +184,9 @@ def _load[T](group: str, name: str, kind: type[T]) -> T:
 
 
 @contextmanager
-def _naming(kind: type[RigError], what: str, remedy: str, passing: type[Exception] | tuple[()] = ()) -> Iterator[None]:
+def _translated_failures(
+    kind: type[RigError], what: str, remedy: str, passing: type[Exception] | tuple[()] = ()
+) -> Iterator[None]:
     """Raise a failure inside, of whatever type, as one of `kind`; those of type `passing` pass as they are."""
     try:
         yield

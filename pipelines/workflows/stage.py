@@ -11,12 +11,12 @@ from faintfield.pipelines.arguments import StageConnection
 from faintfield.pipelines.console import console, inform, visible
 from faintfield.pipelines.errors import BadValue, WrongUsage
 from faintfield.pipelines.formats.toml_files import read_rig_tables
-from faintfield.rig.devices import SIMULATED, SIMULATED_FIRMWARE, open_stage
+from faintfield.rig.devices import SIMULATED_FIRMWARE, open_stage
 from faintfield.rig.errors import StageUnfit
 from faintfield.rig.simulation.controller.bench import Server
 from faintfield.rig.stages.conformance import Check, check_conformance
 from faintfield.rig.stages.gantry import Gantry
-from faintfield.rig.stages.protocol import Identity, Point, Position, StageSettings
+from faintfield.rig.stages.protocol import SIMULATED, Identity, Point, Position, StageSettings
 
 
 class _RigFile(msgspec.Struct):

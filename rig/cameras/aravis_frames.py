@@ -140,7 +140,7 @@ class Stamps:
 
 
 class FrameTimes:
-    """Refuses frames that began before they were requested.
+    """Check by two clocks that a frame began after it was requested.
 
     A frame that is received sooner after its request than its exposure lasts began before the request. A frame that
     was held back on its way shows by the camera's clock, which is compared with the frame before of the same exposure

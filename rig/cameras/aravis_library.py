@@ -1,4 +1,4 @@
-"""Calls libaravis 0.8 through ctypes: errors become exceptions, and every reference is given back exactly once."""
+"""Call libaravis 0.8 through ctypes: errors become exceptions, and every reference is given back exactly once."""
 
 import ctypes
 import weakref

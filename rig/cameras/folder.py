@@ -1,4 +1,4 @@
-"""A camera behind any vendor's program: waits for the file that the program saves for each frame."""
+"""A camera behind any vendor's program, which saves each frame as a file in a folder."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress

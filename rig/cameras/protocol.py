@@ -1,4 +1,4 @@
-"""Defines a camera: the types that drivers, capture and simulators share."""
+"""The types of a camera that drivers, capture and simulators share."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -83,7 +83,7 @@ class Exposure:
 
 
 class Camera(Protocol):
-    """Takes frames. Every method is bounded in time and raises a `CameraError` if it fails."""
+    """A source of frames. Every method is bounded in time and raises a `CameraError` if it fails."""
 
     def open(self) -> None:
         """Connect to the camera, without exposing."""

@@ -1,4 +1,4 @@
-"""Checks on the stage itself what a capture relies on: limits, speed, arrival, repeatability."""
+"""Test what a capture relies on, by moving the stage: limits, speed, arrival, repeatability."""
 
 import math
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""Detects lost steps, which no report shows, by timing homing again, and recovers the stage after an error.
+"""Detect lost steps, which no report shows, by timing homing again, and recover the stage after an error.
 
 When a motor loses steps, the carriage is not where the controller counts it. Homing from a known position then takes
 longer or shorter than before, since the distance to the switch has changed. The speed of homing is measured at the
@@ -46,7 +46,7 @@ class Drift(Struct, frozen=True):
 
 
 class DriftWatch:
-    """Checks a connected stage for drift; drift up to `limit_mm` passes.
+    """Drift checks of a connected stage; drift up to `limit_mm` passes.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""The stage, whatever its driver: decides when a reported position can be trusted, and checks limits and arrival.
+"""The stage with any driver: trust in reported positions, and checks of limits and arrival.
 
 A `Controller` only sends motions and reads positions; the rules are here, in one place. The position is trusted from
 homing until something happens after which the controller's count and the carriage may differ: an alarm that loses the

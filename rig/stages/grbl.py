@@ -1,4 +1,4 @@
-"""Drives GRBL 1.1 and grblHAL: jogs in machine coordinates, polled until two reports in a row are idle.
+"""Drive GRBL 1.1 and grblHAL: jogs in machine coordinates, polled until two reports in a row are idle.
 
 Jogs (`$J=`) are the safest motion that GRBL has: it refuses a target outside the travel without an alarm, a jog can be
 cancelled without losing the position, and the parser's state does not change. With `G53` the target is in machine

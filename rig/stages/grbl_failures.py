@@ -1,4 +1,4 @@
-"""Explains alarms, errors and states of GRBL and grblHAL: what they mean, if the position is kept, and what to do."""
+"""Explain alarms, errors and states of GRBL and grblHAL: meaning, remedy, and whether the position is kept."""
 
 from faintfield.rig.errors import StageAlarm, StageRejected
 from faintfield.rig.stages.grbl_messages import Report

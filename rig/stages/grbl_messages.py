@@ -1,4 +1,4 @@
-"""Parses the lines that GRBL 1.1 sends, and derives travel, rates and tolerances from its settings.
+"""Parse the lines that GRBL 1.1 sends, and derive travel, rates and tolerances from its settings.
 
 Responses (`ok`, `error:N`) answer commands; GRBL sends all other lines unasked. A line that does not match a known form
 exactly is `Unknown`, so that a damaged line is never taken for a response.

@@ -1,4 +1,4 @@
-"""Drives Marlin: numbered lines with checksums, motion awaited with M400, the position read with M114.
+"""Drive Marlin: numbered lines with checksums, motion awaited with M400, the position read with M114.
 
 The line numbers also reveal a restart that was not seen: after one, Marlin asks for line 1 at the next command.
 """
@@ -6,6 +6,7 @@ The line numbers also reveal a restart that was not seen: after one, Marlin asks
 import re
 from collections.abc import Sequence
 from contextlib import suppress
+from itertools import count
 
 from faintfield.rig.errors import StageAlarm, StageLost, StageRejected, StageTimeout, WrongFirmware
 from faintfield.rig.stages import marlin_messages as marlin
@@ -43,7 +44,7 @@ class MarlinController:
         self._axes = axes
         self._travel_mm = travel_mm
         self._line_number = 0
-        self._markers = 0
+        self._markers = (f"faintfield-{number}." for number in count(1))
 
     def connect(self, wait_s: float = 0.0) -> None:
         """Open the connection and wait for the end of the greeting, since most boards restart when it is opened."""
@@ -132,7 +133,7 @@ class MarlinController:
         `ok` is the first that counts.
         """
         for _ in range(_MAX_STARTS):
-            marker, echoed = self._new_marker(), False
+            marker, echoed = next(self._markers), False
             self._line.send(marlin.numbered(0, "M110 N0") + f"M118 {marker}\n".encode("ascii"))
             for text in self._line.lines_until(self._clock.now_s() + _ECHO_S):
                 if echoed and isinstance(marlin.parse(text), Ok):
@@ -145,7 +146,7 @@ class MarlinController:
 
     def _keeps_count(self) -> bool | None:
         """Return whether the controller accepts the next line number, as none does after a restart; None if mute."""
-        marker = self._new_marker()
+        marker = next(self._markers)
         self._line_number += 1
         self._line.send(marlin.numbered(self._line_number, f"M118 {marker}"))
         answered = None
@@ -154,10 +155,6 @@ class MarlinController:
                 return True
             answered = False
         return answered
-
-    def _new_marker(self) -> str:
-        self._markers += 1
-        return f"faintfield-{self._markers}."
 
     def _await_start(self) -> None:
         """Wait until the controller has started and fallen silent, or did not restart."""

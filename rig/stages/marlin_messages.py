@@ -1,4 +1,4 @@
-"""Parses the lines that Marlin sends, numbers the lines sent to it, and derives travel and rates from its settings.
+"""Parse the lines that Marlin sends, number the lines sent to it, and derive travel and rates from its settings.
 
 A line that does not match a known form exactly is `Unknown`, so that a damaged line is never taken for an answer.
 """

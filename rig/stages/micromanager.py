@@ -1,4 +1,4 @@
-"""Drives an XY stage through Micro-Manager: reports are used after the stage rests, which two equal ones show."""
+"""Drive an XY stage through Micro-Manager; a position counts when two reports in a row are equal."""
 
 import math
 import threading

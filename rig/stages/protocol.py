@@ -1,4 +1,4 @@
-"""The types and settings of a stage, and `Controller`: what the driver of one firmware must be able to do.
+"""The types and settings of a stage, and the protocol that its drivers implement.
 
 Coordinates are the controller's machine coordinates in millimetres, along the two axes that carry the camera. They are
 not shifted or flipped, so a position in a log can be compared with the controller's display.
@@ -129,7 +129,7 @@ class Homing(Struct, frozen=True):
 
 
 class Controller(Protocol):
-    """Takes motions and reports positions; `Gantry` adds trust, limits and verification.
+    """The driver of one firmware; `Gantry` adds trust, limits and verification.
 
     Every method is bounded in time, and raises a `StageError` if the controller does not obey.
     """

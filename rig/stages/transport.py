@@ -1,4 +1,4 @@
-"""Sends and receives lines over a serial port, logging every byte, and defines what both firmwares answer."""
+"""Send and receive lines over a serial port, with a log of every byte; what GRBL and Marlin have in common."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -92,7 +92,7 @@ class SerialPort:
 
 
 class LineTransport:
-    """Sends bytes and receives lines, each within a time limit; `open_port` opens the connection at each `open`."""
+    """A connection of bytes sent and lines received within time limits; each `open` calls `open_port`."""
 
     def __init__(self, open_port: Callable[[], Port], clock: Clock, traffic: TrafficLog | None = None) -> None:
         self.clock = clock
