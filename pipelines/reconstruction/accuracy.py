@@ -36,25 +36,12 @@ _RIGHT = 0.02
 def assess(
     elemental_set: ElementalSet, planes: Mapping[tuple[Method, float], Path], truth_in: Path | None = None
 ) -> Metrics | None:
-    """Return the errors of planes; None for a set without ground truth, or without planes at its objects.
+    """Return the errors of planes, by method and depth in mm; None without truth, or without planes at its objects.
 
-    Each plane of each method has three mean square errors, with the object scaled to 0…1:
-
-    - `mse_bright`, over the region where the object is visible, against the back-projection of the noise-free set
-      (what more light would have shown);
-    - `mse_texture`, over the same region, against the true texture of the object (which also counts the blur of
-      other objects there);
-    - `mse_plane`, over the whole plane, against the texture, which is zero beside the object, where most of that
-      blur is.
-
-    Parameters
-    ----------
-    elemental_set : ElementalSet
-        The set that was reconstructed.
-    planes : mapping of (method, depth in mm) to Path
-        Files of the planes.
-    truth_in : Path, optional
-        Folder of the truth; the set's own if None.
+    The object is scaled to 0…1. `mse_bright` compares with the back-projection of the noise-free set (what more light
+    would have shown), and `mse_texture` with the true texture, both where the object is visible. `mse_plane` compares
+    with the texture over the whole plane, zero beside the object, and so counts most of the blur of others. `truth_in`
+    is the folder of the truth, by default that of the set.
     """
     folder = truth_in or elemental_set.folder
     truth = read_truth(folder)
@@ -99,7 +86,6 @@ def _plane_errors(
 
 
 def _back_projections(noise_free: ElementalSet, depths: list[float]) -> dict[float, NDArray[np.floating]]:
-    """Return the back-projection of the noise-free set at each depth, (row, column[, colour])."""
     colours: dict[float, list[NDArray[np.floating]]] = {depth: [] for depth in depths}
     for layout in channel_layouts(noise_free):
         images = load_channel(noise_free, layout)
@@ -138,21 +124,8 @@ def write_depth_errors(
 ) -> DepthErrors | None:
     """Compare a map in a folder of results with the set's true depth, and write its errors beside it.
 
-    Parameters
-    ----------
-    elemental_set : ElementalSet
-        The set that was reconstructed.
-    folder : Path
-        Of the results; an earlier comparison in it is removed.
-    file : str
-        The map, depths or disparities on the pixels of the reference view, NaN where nothing is known.
-    unit : {"mm", "px", "relative"}
-        Of its values. A truth in mm is only beside sets in mm.
-
-    Returns
-    -------
-    DepthErrors or None
-        None if the set brings no truth, or none for any sample of the map.
+    The map has depths or disparities in `unit` on the pixels of the reference view, NaN where nothing is known. An
+    earlier comparison is removed. The result is None if the set brings no truth, or none for any sample of the map.
     """
     remove(folder / DEPTH_ERRORS_FILE)
     true_mm = read_true_depth_mm(elemental_set.folder)
@@ -175,7 +148,6 @@ def write_depth_errors(
 
 
 def _depth_errors(file: str, found_mm: NDArray[np.float64], true_mm: NDArray[np.float64]) -> DepthErrors | None:
-    """Return the errors of depths (row, column); None if none can be compared."""
     known = np.isfinite(true_mm) & (true_mm > 0)
     both = known & np.isfinite(found_mm)
     if not both.any():
@@ -193,7 +165,6 @@ def _depth_errors(file: str, found_mm: NDArray[np.float64], true_mm: NDArray[np.
 
 
 def _depth_of(elemental_set: ElementalSet, disparity_px: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the depths of disparities, NaN where they belong to none."""
     at_zero, slope = elemental_set.inverse_depth_of_disparity()
     inverse = at_zero + slope * disparity_px
     return np.where(inverse > 0, 1 / np.where(inverse > 0, inverse, 1.0), np.nan)

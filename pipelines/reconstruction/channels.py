@@ -37,14 +37,8 @@ _NOISE_MAPS = ("offset_dn", "gain_dn_per_e", "read_noise_e", "dark_current_e_per
 class ChannelLayout:
     """Position of one colour in the frames.
 
-    Attributes
-    ----------
-    name : str
-        "grey", "red", "green" or "blue".
-    plane_of_colour : int, optional
-        Index of the colour in RGB frames.
-    lattices : tuple of Lattice
-        One per phase of the mosaic that has this colour.
+    `name` is "grey", "red", "green" or "blue", `plane_of_colour` the index of the colour in RGB frames. Of a mosaic
+    there is one lattice for each of its phases that has this colour.
     """
 
     name: str
@@ -117,19 +111,8 @@ def keeping_frames(elemental_set: ElementalSet, folder: Path) -> ElementalSet:
 def load_channel(elemental_set: ElementalSet, layout: ChannelLayout, allocate: Allocate = np.empty) -> ElementalImages:
     """Read one colour of all views in electrons, each frame by one thread, directly into the stack.
 
-    Parameters
-    ----------
-    elemental_set : ElementalSet
-        The set.
-    layout : ChannelLayout
-        The colour.
-    allocate : callable
-        Makes the arrays as large as all views; in memory by default.
-
-    Raises
-    ------
-    WrongSize, WrongBitDepth, UnreadableImage
-        A frame does not match the set; the message names it.
+    `allocate` makes the arrays as large as all views. Raises WrongSize, WrongBitDepth or UnreadableImage for a frame
+    that does not match the set.
     """
     phases = len(layout.lattices)
     views = len(elemental_set.settings.view)
@@ -240,7 +223,6 @@ def _of_file(elemental_set: ElementalSet, lattice: Lattice, frame: Frame) -> dic
 
 
 def _noise_by_frame(elemental_set: ElementalSet, layout: ChannelLayout) -> Callable[[int, Frame | None], NoiseModel]:
-    """Return a function that gives the noise model of a lattice, by its index, in a frame."""
     # Checking the maps of a model takes longer than converting a frame by it, so frames that say the same share one
     noises = [lattice_noise(elemental_set, lattice, None) for lattice in layout.lattices]
     known: dict[tuple[int, tuple[tuple[str, float], ...]], NoiseModel] = {}

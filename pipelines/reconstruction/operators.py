@@ -45,10 +45,7 @@ def default_pitch_px(elemental_set: ElementalSet, layouts: list[ChannelLayout]) 
 def plane_grid(elemental_set: ElementalSet, depth_mm: float, pitch_mm: float | None = None) -> PlaneGrid:
     """Return the samples of the plane at a depth, one per pixel of the reference view by default.
 
-    Raises
-    ------
-    GeometryMismatch
-        The plane is not in front of the camera, or the pitch leaves it without samples.
+    Raises GeometryMismatch if the plane is not in front of the camera, or the pitch leaves it without samples.
     """
     check_in_front(depth_mm)
     camera = elemental_set.settings.camera
@@ -70,10 +67,7 @@ def plane_grid(elemental_set: ElementalSet, depth_mm: float, pitch_mm: float | N
 def tilted_grid(elemental_set: ElementalSet, plane: TiltedPlane, pitch_mm: float) -> PlaneGrid:
     """Return the samples of a plane of any pose: of its stated size, or what the reference view sees of it.
 
-    Raises
-    ------
-    GeometryMismatch
-        A part of the reference view does not meet the plane in front of the camera, or only very far away.
+    Raises GeometryMismatch if a part of the view does not meet the plane in front of the camera, or only very far away.
     """
     width, height = elemental_set.settings.camera.size_px
     if not plane.depth_mm > 0:
@@ -158,12 +152,7 @@ class OperatorFactory:
     def of_scene(self, grids: Mapping[Place, PlaneGrid], opacities: Sequence[Image] | None = None) -> SceneOperator:
         """Return H of all planes together, in the order of `grids`.
 
-        Parameters
-        ----------
-        grids : mapping of Place to PlaneGrid
-            The samples of each plane.
-        opacities : sequence of float array (row, column), optional
-            What each plane hides of those behind it, 0 to 1; nothing by default.
+        `opacities` (row, column) are what each plane hides of those behind it, 0 to 1; nothing by default.
         """
         homographies = np.stack([self._homographies(place) for place in grids])
         occluders = None if opacities is None else Occluders(opacities, [depth_of(place) for place in grids])
@@ -181,7 +170,6 @@ class OperatorFactory:
         return np.repeat(plane_from_ray(poses, rt_ref_plane, shift), self._phases, axis=0)
 
     def _shared(self) -> dict[str, Any]:
-        """Return the arguments that the operators of all planes share."""
         views = len(self._loaded.settings.view)
         lattices = np.tile(np.arange(self._phases), views)
         return {"valid": self._valid, "lattice_of_view": lattices}

@@ -43,12 +43,7 @@ type Region = NDArray[np.bool_]
 def object_region(elemental_set: ElementalSet, path: Path | None = None) -> tuple[Region | None, str]:
     """Return the object region (row, column) of the reference view, None if it is not known, and its name.
 
-    Parameters
-    ----------
-    elemental_set : ElementalSet
-        The set.
-    path : Path, optional
-        Mask to use instead of the set's own.
+    `path` is a mask to use instead of the set's own.
     """
     path = path or elemental_set.folder / OBJECT_REGION
     if path.is_file():
@@ -156,12 +151,7 @@ class SetAtAGlance:
 def look_at(elemental_set: ElementalSet) -> SetAtAGlance:
     """Return a set at a glance; all its views share one grey scale.
 
-    Every view is read, so that one that cannot be used is found before planes are made.
-
-    Raises
-    ------
-    InputError
-        A file cannot be used, or the light of the set is beyond all bounds.
+    Every view is read, so that one that cannot be used is found before planes are made (InputError).
     """
     size_px = elemental_set.settings.camera.size_px
     reference = elemental_set.read_frame(elemental_set.image_paths[elemental_set.reference_view], size_px).pixels_dn
@@ -211,7 +201,6 @@ def look_at(elemental_set: ElementalSet) -> SetAtAGlance:
 
 
 def _pixels_like(elemental_set: ElementalSet, reference: NDArray[Any], path: Path) -> NDArray[Any]:
-    """Return the pixels of a view, which must have the shape of the reference view's."""
     height, width = reference.shape[:2]
     pixels = elemental_set.read_frame(path, (width, height)).pixels_dn
     if pixels.shape != reference.shape:
@@ -230,7 +219,6 @@ def write_overview(overview: SetAtAGlance, out: Path) -> None:
 
 
 def _bright_views(elemental_set: ElementalSet, region: Region | None) -> dict[str, Picture]:
-    """Return the reference view in plenty of light if there is one, and again with the object region outlined."""
     light_e = bright_electrons(elemental_set)
     if light_e is None:
         return {}

@@ -105,16 +105,9 @@ class Request:
 
 @dataclass(frozen=True)
 class Selection:
-    """Planes as the options select them, before the set is known.
+    """Planes as the options select them, before the set is known: single ones and those of a sweep, by unit.
 
-    Attributes
-    ----------
-    options, solver : Options, SolverOptions
-        The options, and those of the solver with the prior that is chosen by default.
-    methods, tilted : list
-        As in `Request`.
-    single, swept : dict of unit to list of float
-        Single depths or disparities, and those of a sweep.
+    `solver` has the prior that is chosen by default.
     """
 
     options: Options
@@ -142,10 +135,8 @@ class Selection:
 def select_planes(options: Options) -> Selection:
     """Return the planes that options select.
 
-    Raises
-    ------
-    WrongUsage, InputError
-        They select none, contradict one another, would have no effect, or name a file that cannot be read.
+    Raises WrongUsage or InputError if they select none, contradict one another, would have no effect, or name a file
+    that cannot be read.
     """
     if not options.given(PLACES):
         raise WrongUsage(
@@ -251,12 +242,8 @@ def resolve(
     """Return the request for a set: disparities become depths, and `auto` the depths that are found.
 
     `out` is for a temporary file while depths are searched. Nothing is searched if the record of an `earlier` result is
-    given: depths are then those that it has by the same search, or none.
-
-    Raises
-    ------
-    WrongUsage, BadValue, NothingInFocus
-        The depths do not suit the options, a disparity has no depth, or the search finds none.
+    given: depths are then those that it has by the same search, or none. Raises WrongUsage, BadValue or NothingInFocus
+    if the depths do not suit the options, a disparity has no depth, or the search finds none.
     """
     _refuse_mm(selection, elemental_set)
     own_px = elemental_set.units.depth == "disparity_px"

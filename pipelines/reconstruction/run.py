@@ -67,12 +67,8 @@ def reconstruct_set(elemental_set: ElementalSet, out: Path, request: Request, ru
     """Reconstruct planes of a set, and write them with their provenance and their errors.
 
     Planes that exist and were made from the same files with the same options are kept. An earlier report is removed,
-    since it shows other planes. The caller has `out` to itself, see `formats.files.exclusive`.
-
-    Raises
-    ------
-    OutputExists
-        A depth map is asked for, and a folder of planes holds a surface, whose files have the same names.
+    since it shows other planes. The caller has `out` to itself, see `formats.files.exclusive`. Raises OutputExists if a
+    depth map is asked for, and a folder of planes holds a surface, whose files have the same names.
     """
     started = time.monotonic()
     depths, methods = distinct_depths(request.depths_mm, elemental_set), list(dict.fromkeys(request.methods))
@@ -123,7 +119,6 @@ def reconstruct_set(elemental_set: ElementalSet, out: Path, request: Request, ru
 
 
 def _refuse_pitch(elemental_set: ElementalSet, request: Request) -> None:
-    """Refuse a pitch in mm for a set that knows no lengths (BadValue)."""
     if request.pitch_mm and elemental_set.units.depth == "disparity_px":
         raise BadValue(
             f"{elemental_set.folder}: knows disparities, no lengths; a pitch of {request.pitch_mm:g} means nothing; "
@@ -132,7 +127,6 @@ def _refuse_pitch(elemental_set: ElementalSet, request: Request) -> None:
 
 
 def _refuse_surfaces(folders: list[Path]) -> None:
-    """Refuse folders that hold a surface (OutputExists)."""
     for folder in folders:
         if (folder / SURFACE_FILE).exists():
             raise OutputExists(

@@ -30,10 +30,7 @@ def reconstruct_folder(
 ) -> Outcome:
     """Reconstruct what the options ask of a set or session, and write the report.
 
-    Raises
-    ------
-    WrongUsage
-        Options contradict one another, or no folder for the results is known.
+    Raises WrongUsage if options contradict one another, or no folder for the results is known.
     """
     if options.surface and (of_planes := options.given(OF_PLANES)):
         raise WrongUsage(
@@ -54,13 +51,7 @@ def reconstruct_folder(
 def reconstruct_and_report(
     elemental_set: ElementalSet, out: Path, request: Request, runner: Runner | None = None
 ) -> Outcome:
-    """Reconstruct planes of a set into `out`, and write the report of them.
-
-    Raises
-    ------
-    OutputBusy
-        Another command is writing to `out`.
-    """
+    """Reconstruct planes of a set into `out`, and write the report of them."""
     started = time.monotonic()
     with exclusive(out):
         outcome = reconstruct_set(elemental_set, out, request, runner or run_serially)
@@ -74,10 +65,7 @@ def reconstruct_and_report(
 def surface_and_report(elemental_set: ElementalSet, out: Path, request: SurfaceRequest, *, page_in: Path) -> Outcome:
     """Reconstruct the surface of a set into `out`, and write the report of all that is in `page_in`, the same or above.
 
-    Raises
-    ------
-    OutputBusy
-        Another command is writing to one of the two.
+    Raises OutputBusy if another command is writing to one of the two.
     """
     started = time.monotonic()
     with ExitStack() as locks:

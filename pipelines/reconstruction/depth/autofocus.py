@@ -51,25 +51,12 @@ _INFINITY = 1e4
 
 
 def best_focus(elemental_set: ElementalSet, out: Path, range_mm: tuple[float, float] | None = None) -> BestFocusRecord:
-    """Find the planes of best focus.
+    """Find the planes of best focus in a range, by default that of `searched_range_mm`.
 
     The range is searched in equal steps of 1/depth, in bins of pixels that suit the steps and the light; then the part
     in which anything was found is searched more finely. Each depth with a large part of the picture is refined on its
-    own samples.
-
-    Parameters
-    ----------
-    elemental_set : ElementalSet
-        The set.
-    out : Path
-        Folder of a temporary file for the images if memory is short.
-    range_mm : (float, float), optional
-        Range to search; by default `searched_range_mm`.
-
-    Raises
-    ------
-    NothingInFocus
-        The views agree on nothing in this range, or no better than shuffled ones.
+    own samples. `out` is for a temporary file if memory is short. Raises NothingInFocus if the views agree on nothing
+    in this range, or no better than shuffled ones.
     """
     near_mm, far_mm = sorted(range_mm or searched_range_mm(elemental_set))
     ranges, compared, found, significance = _narrowed(elemental_set, out, (near_mm, far_mm))
@@ -93,13 +80,7 @@ def best_focus(elemental_set: ElementalSet, out: Path, range_mm: tuple[float, fl
 
 
 def found_range_mm(elemental_set: ElementalSet, out: Path) -> tuple[float, float]:
-    """Return the nearest and farthest depth between which the views agree on anything, with a margin.
-
-    Raises
-    ------
-    NothingInFocus
-        As `best_focus`.
-    """
+    """Return the nearest and farthest depth between which the views agree on anything, with a margin."""
     return _narrowed(elemental_set, out, searched_range_mm(elemental_set))[0][-1]
 
 
@@ -155,7 +136,6 @@ def _narrowed(
 
 
 def _searched_depths(range_mm: tuple[float, float]) -> list[float]:
-    """Return the depths of a search, in equal steps of 1/depth, the nearest first."""
     depths: list[float] = (1 / np.linspace(1 / range_mm[0], 1 / range_mm[1], _DEPTHS)).tolist()
     return depths
 

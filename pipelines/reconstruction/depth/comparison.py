@@ -68,17 +68,7 @@ _SEED = 20
 
 @dataclass(frozen=True)
 class Compared:
-    """The agreement of the views at each depth, all colours together.
-
-    Attributes
-    ----------
-    planes : list of Agreement
-        In the order of the depths.
-    depths_mm : sequence of float
-        The depths.
-    bins_px : int
-        Width of the bins in which pixels were added up, in detector pixels.
-    """
+    """The agreement of the views at each depth, all colours together, in bins of `bins_px` detector pixels."""
 
     planes: list[Agreement]
     depths_mm: Sequence[float]
@@ -91,17 +81,7 @@ class Compared:
 
 @dataclass(frozen=True)
 class BinnedViews:
-    """The views of a set in bins of pixels, one colour after the other.
-
-    Attributes
-    ----------
-    elemental_set : ElementalSet
-        The set, whose poses are those of the views.
-    colours : list of (ChannelLayout, ElementalImages)
-        The pixels of each colour, added up; the middle one of the colours first.
-    bins_px : int
-        Width of the bins in detector pixels.
-    """
+    """The views of a set in bins of `bins_px` detector pixels, one colour after the other, the middle colour first."""
 
     elemental_set: ElementalSet
     colours: list[tuple[ChannelLayout, ElementalImages]]
@@ -154,7 +134,6 @@ def binned_views(elemental_set: ElementalSet, middle_mm: float, out: Path, *, mi
 def _bins(
     elemental_set: ElementalSet, layout: ChannelLayout, images: ElementalImages, middle_mm: float, min_bins_px: int
 ) -> int:
-    """Return the width of the bins in pixels of a colour."""
     lattice = layout.lattices[0]
     needed = bins_for(
         OperatorFactory(elemental_set, layout, images).at(middle_mm, plane_grid(elemental_set, middle_mm)), images
@@ -163,7 +142,6 @@ def _bins(
 
 
 def _sum(first: Agreement, second: Agreement) -> Agreement:
-    """Return the agreement of two colours together."""
     return Agreement(*(a + b for a, b in zip(first, second, strict=True)))
 
 
@@ -184,19 +162,8 @@ class _Views:
 def check_places(views: BinnedViews, range_mm: tuple[float, float]) -> Significance | None:
     """Return how much better the views agree at their places than shuffled, over a whole range of depths.
 
-    It is None, and said so, for fewer than `_FEWEST_VIEWS` views: these have too few orders to tell.
-
-    Parameters
-    ----------
-    views : BinnedViews
-        The views of a set.
-    range_mm : (float, float)
-        Nearest and farthest depth of the search, which is repeated for each shuffle.
-
-    Raises
-    ------
-    NothingInFocus
-        Shuffled views agree as well, or views in reversed or exchanged rows and columns agree better.
+    It is None, and said so, for fewer than `_FEWEST_VIEWS` views: these have too few orders to tell. Raises
+    NothingInFocus if shuffled views agree as well, or views in reversed or exchanged rows and columns agree better.
     """
     chosen = _compared(views)
     count = len(chosen)

@@ -41,18 +41,11 @@ _MIN_RANGE = 1e-3
 
 @dataclass(frozen=True)
 class _Map:
-    """A depth map on the samples of the reference view.
+    """A depth map on the samples of the reference view, each array (row, column).
 
-    Attributes
-    ----------
-    record : DepthMapRecord
-        What reconstruction.json records of it.
-    limits : (float, float)
-        Of the sweep, in the unit of the record, ascending.
-    index : float array (row, column)
-        Between which planes of the sweep each sample lies; given everywhere, even where nothing is known.
-    values, confidence : float array (row, column)
-        Depth or disparity in the unit of the record, NaN where it is not known; and the probability that this is right.
+    `limits` are those of the sweep in the unit of the record, ascending. `index` says between which planes each sample
+    lies, even where nothing is known. `values` are in the unit of the record, NaN where nothing is known, and
+    `confidence` is the probability that they are right.
     """
 
     record: DepthMapRecord
@@ -65,14 +58,8 @@ class _Map:
 def check_sweep(elemental_set: ElementalSet, depths_mm: Sequence[float]) -> None:
     """Refuse a set or a sweep that can have no depth map, before its planes are made.
 
-    Raises
-    ------
-    BadValue
-        The set has too few views, or too small ones.
-    GeometryMismatch
-        The views share too little at the depths of the sweep.
-    NothingInFocus
-        All views were taken from one place.
+    Raises BadValue for too few or too small views, GeometryMismatch if they share too little at the depths of the
+    sweep, and NothingInFocus if all were taken from one place.
     """
     from faintfield.pipelines.reconstruction.depth.search import check_overlap, check_views
 
@@ -106,23 +93,9 @@ def write_depth_map(
 ) -> DepthMapRecord:
     """Write the maps and the all-in-focus picture into each folder of planes, and return their record.
 
-    Depths and their confidence are those of `reconstruct --surface` in the range of the sweep.
-
-    Parameters
-    ----------
-    elemental_set : ElementalSet
-        The set.
-    planes : mapping of (method, depth in mm) to Path
-        Files of the planes; each method has a folder.
-    disparities_px : mapping of depth in mm to px
-        Disparity of every depth if disparities were asked for: the map then is in px.
-    origins : mapping of Method to Provenance
-        Provenance of each method's planes: maps with the same are kept.
-
-    Raises
-    ------
-    GeometryMismatch
-        The range of the sweep is too wide, or views, poses and range do not fit together.
+    Depths and their confidence are those of `reconstruct --surface` in the range of the sweep; in px if all depths have
+    a disparity. Maps of the same provenance are kept. Raises GeometryMismatch if the range is too wide, or views, poses
+    and range do not fit together.
     """
     folders = {method: path.parent for (method, _), path in planes.items()}
     kept = kept_depth_map(folders, origins)
@@ -140,7 +113,6 @@ def write_depth_map(
 
 
 def _map_of(elemental_set: ElementalSet, depths_mm: Sequence[float], disparities_px: Mapping[float, float]) -> _Map:
-    """Return the depth map of a sweep, nearest depth first, in px if there are disparities."""
     # Here, because planes need none of it
     from faintfield.pipelines.reconstruction.depth.search import default_bins, depths_of_set, enlarged, in_unit
     from faintfield.recon.surface.confidence import SURE

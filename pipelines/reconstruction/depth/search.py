@@ -56,12 +56,7 @@ def default_bins(elemental_set: ElementalSet) -> int:
 def luminance(elemental_set: ElementalSet, bins: int) -> PinholeViews:
     """Return the light of all views, in bins of `bins` by `bins` detector pixels, with distortion undone.
 
-    Each view is read by one thread.
-
-    Raises
-    ------
-    WrongSize, WrongBitDepth, UnreadableImage
-        A frame does not match the set; the message names it.
+    Each view is read by one thread. Raises WrongSize, WrongBitDepth or UnreadableImage for a frame that does not match.
     """
     layouts = channel_layouts(elemental_set)
     parts = [(layout, lattice) for layout in layouts for lattice in layout.lattices]
@@ -105,7 +100,6 @@ def _response(elemental_set: ElementalSet, lattice: Lattice, bins: int) -> NDArr
 
 
 def _pixels(lattice: Lattice, bins: int) -> int:
-    """Return the number of a lattice's pixels in a bin."""
     return (bins // lattice.step[0]) * (bins // lattice.step[1])
 
 
@@ -120,7 +114,6 @@ def _summed(values: NDArray[Any], lattice: Lattice, bins: int) -> NDArray[Any]:
 def _electrons(
     elemental_set: ElementalSet, layouts: list[ChannelLayout], view: int
 ) -> Iterator[tuple[Lattice, NDArray[np.float32], NDArray[np.bool_]]]:
-    """Yield the electrons of a view on each lattice of each colour, and where they are saturated."""
     for layout in layouts:
         found = view_electrons(elemental_set, layout, elemental_set.frame_paths(view))
         for lattice, (sum_e, over) in zip(layout.lattices, found, strict=True):
@@ -162,21 +155,9 @@ def _resampled(
 
 
 def check_views(elemental_set: ElementalSet, purpose: str) -> None:
-    """Refuse a set whose views tell no depths.
+    """Refuse a set whose views tell no depths; `purpose` says what these are for.
 
-    Parameters
-    ----------
-    elemental_set : ElementalSet
-        The set.
-    purpose : str
-        What the depths are for, as the messages name it.
-
-    Raises
-    ------
-    BadValue
-        The set has too few views, or too small ones.
-    NothingInFocus
-        All views were taken from one place.
+    Raises BadValue for too few or too small views, and NothingInFocus if all were taken from one place.
     """
     views, size_px = len(elemental_set.settings.view), elemental_set.settings.camera.size_px
     if views < _MIN_VIEWS:
@@ -199,12 +180,7 @@ def check_views(elemental_set: ElementalSet, purpose: str) -> None:
 def limits_mm(elemental_set: ElementalSet, range_mm: tuple[float, float] | None) -> tuple[float, float]:
     """Return the nearest and farthest depth to consider: those of a range, or where the views overlap.
 
-    Raises
-    ------
-    GeometryMismatch
-        The views share too little at the depths of a given range.
-    NothingInFocus
-        The views overlap nowhere.
+    Raises GeometryMismatch if the views share too little in a given range, NothingInFocus if they overlap nowhere.
     """
     if range_mm is None:
         return searched_range_mm(elemental_set)
@@ -244,27 +220,10 @@ def depths_of_set(
 ) -> tuple[NDArray[np.float64], SurfaceEstimate]:
     """Return the 1/depths that are compared, ascending, and the depth of each sample of the bins by them.
 
-    The samples are those of `between_pixels`; `enlarged` brings their maps to the pixels.
-
-    Parameters
-    ----------
-    elemental_set : ElementalSet
-        The set.
-    bins : int
-        Pixels along a side of a bin.
-    range_mm : (float, float)
-        Nearest and farthest depth.
-    find_range : bool
-        Search this range for that of the scene first.
-    out : Path, optional
-        Test in this folder whether the views agree better than shuffled ones; by default `check_agreement` did so.
-
-    Raises
-    ------
-    GeometryMismatch
-        The range is too wide, or views, poses and range do not fit together.
-    NothingInFocus
-        Nothing is found in the range, or the views agree no better than shuffled ones.
+    The samples are those of `between_pixels`; `enlarged` brings their maps to the pixels. With `find_range` the range
+    of the scene is searched first. With `out`, the views must agree better than shuffled ones; by default
+    `check_agreement` tested that. Raises GeometryMismatch if the range is too wide, or views, poses and range do not
+    fit together, and NothingInFocus if nothing is found.
     """
     nodes, views = nodes_of(elemental_set), between_pixels(luminance(elemental_set, bins))
     near, far = 1 / range_mm[0], 1 / range_mm[1]
@@ -297,7 +256,6 @@ def naming_range(elemental_set: ElementalSet, far: float, near: float) -> Iterat
 
 
 def _between(elemental_set: ElementalSet, far: float, near: float) -> str:
-    """Return a range of 1/depth in words."""
     return f"between {elemental_set.depths_text(float(f'{1 / near:.4g}'), float(f'{1 / far:.4g}'), join=' and ')}"
 
 
@@ -310,7 +268,6 @@ def nodes_of(elemental_set: ElementalSet) -> NDArray[np.intp]:
 
 
 def _check_steps(views: PinholeViews, depths: NDArray[np.float64]) -> None:
-    """Refuse a range whose depths are far apart, or warn of it."""
     step = float(depths[1] - depths[0]) * float(views.reach.max())
     apart = (
         f"{len(depths)} depths are compared, and from one to the next a point moves by {step:.1f} bins in the "
@@ -337,18 +294,9 @@ def between_pixels(views: PinholeViews) -> PinholeViews:
 def enlarged(
     part: NDArray[np.floating], shape: tuple[int, int], bins: int, *, moved: float = BETWEEN_PIXELS
 ) -> NDArray[np.float64]:
-    """Return a map of bins on the samples of a picture, each with the nearest value.
+    """Return a map of bins on the samples of a picture (rows, columns), each with the nearest value.
 
-    Parameters
-    ----------
-    part : float array (row, column)
-        The map.
-    shape : (int, int)
-        Rows and columns of the picture.
-    bins : int
-        Samples of the picture along a side of a bin.
-    moved : float
-        By how much the samples of the map lie right of and below the middles of the bins, in bins.
+    The samples of the map lie right of and below the middles of the bins by `moved` bins.
     """
     rows, columns = (
         np.clip(np.floor((np.arange(size) + 0.5) / bins - moved), 0, count - 1).astype(np.intp)

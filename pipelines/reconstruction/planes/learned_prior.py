@@ -39,14 +39,9 @@ type _Tile = tuple[slice, slice]
 def learned_estimate(picture: Image, pilot: Image, patches: Image, noise_variance: Image) -> NDArray[np.float32]:
     """Return p improved by the network (row, column), in electrons; p itself where no view sees the sample.
 
-    The network sees the plane from four sides, and its answers are averaged: what it says turns with the plane.
-
-    Parameters
-    ----------
-    picture, pilot, patches : float array (row, column)
-        y, the back-projection; u, a solution as blurred as y; and p, y filtered in groups of patches, in electrons.
-    noise_variance : float array (row, column)
-        s², the variance of the noise of y in squared electrons; infinite where no view sees the sample.
+    The arrays (row, column) are y, the back-projection; u, a solution as blurred as y; p, y filtered in groups of
+    patches, all in electrons; and s², the variance of the noise of y, infinite where no view sees the sample. The
+    network sees the plane from four sides, and its answers are averaged: what it says turns with the plane.
     """
     seen = _seen(noise_variance)
     if not seen.any():
@@ -66,12 +61,8 @@ def network_input(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return what the network sees (4, row, column), and s (row, column): `(y−p)/s`, `(u−p)/s`, `p/8s`, `ln s/median`.
 
-    Where no view sees the sample, y and u are taken for p, and s is the largest of all.
-
-    Parameters
-    ----------
-    picture, pilot, patches, noise_variance : float array (row, column)
-        As for `learned_estimate`.
+    The arguments are those of `learned_estimate`. Where no view sees the sample, y and u are taken for p, and s is the
+    largest of all.
     """
     seen = _seen(noise_variance)
     deviation = np.sqrt(np.where(seen, noise_variance, 0), dtype=np.float32)
@@ -89,15 +80,7 @@ def network_input(
 
 
 def outside_range(patches: Image, noise: Noise) -> str | None:
-    """Return why a plane is unlike those that the network was trained with, None if it is like them.
-
-    Parameters
-    ----------
-    patches : float array (row, column)
-        p in electrons.
-    noise : Noise
-        Of the back-projection.
-    """
+    """Return why a plane p in electrons is unlike those that the network was trained with, None if it is like them."""
     seen = _seen(noise.variance)
     if min(patches.shape) < _MIN_SIDE:
         return f"the plane has {patches.shape[0]} x {patches.shape[1]} samples, fewer than {_MIN_SIDE} along a side"

@@ -42,17 +42,10 @@ _PMLEM_CERTIFICATE = (
 
 @dataclass(frozen=True)
 class Solution:
-    """One colour of a plane.
+    """One colour of a plane (row, column), in expected electrons, and how it was solved.
 
-    Attributes
-    ----------
-    plane : float array (row, column)
-        In expected electrons.
-    record : SolveRecord
-        How it was solved.
-    sidecars : dict of str to float array (row, column)
-        What else is known of each sample: `sigma`, its standard deviation in electrons; `opacity`, 0 to 1;
-        `proposal`, in electrons, of a prior; `moved`, the plane less the proposal in standard deviations of the noise.
+    The `sidecars` say what else is known of each sample: `sigma`, its standard deviation in electrons; `opacity`, 0 to
+    1; `proposal`, in electrons, of a prior; `moved`, the plane less the proposal in standard deviations of the noise.
     """
 
     plane: Image
@@ -62,15 +55,7 @@ class Solution:
 
 @dataclass(frozen=True)
 class Pilot:
-    """Start of the prior of one colour.
-
-    Attributes
-    ----------
-    solution : Solution
-        The plane of total variation.
-    other_colours : float array (row, column)
-        The sum of the same plane in the other colours, in electrons.
-    """
+    """Start of the prior of one colour: the plane of total variation, and the sum of the other colours in electrons."""
 
     solution: Solution
     other_colours: Image
@@ -85,16 +70,8 @@ def mean_e(plane: Image) -> float:
 class Objective:
     """Objective that PMLEM minimises, without the penalty's weight.
 
-    Attributes
-    ----------
-    posed : SceneProblem
-        The operator, and the images with their likelihood.
-    penalty : Penalty
-        Penalty of a plane.
-    start : float array
-        Where to begin.
-    level_e : float
-        Mean light of the samples that the views see, in electrons.
+    `posed` is the operator, and the images with their likelihood; `level_e` the mean light of the samples that the
+    views see, in electrons.
     """
 
     posed: SceneProblem
@@ -133,17 +110,10 @@ def solve_pmlem(objective: Objective, options: SolverOptions) -> list[Solution]:
 def with_sigma(
     objective: Objective, solutions: list[Solution], answers: Callable[[int, LocalProblem], Answers] | None = None
 ) -> list[Solution]:
-    """Return planes with their standard deviation beside them.
+    """Return all planes of one colour with their standard deviation beside them.
 
-    Parameters
-    ----------
-    objective : Objective
-        What they minimise.
-    solutions : list of Solution
-        All planes of one colour.
-    answers : callable, optional
-        Returns how the plane of an index answers to noise, given what the views say near it; as the optimum of
-        likelihood and penalty by default.
+    `answers` returns how the plane of an index answers to noise, given what the views say near it; as the optimum of
+    likelihood and penalty by default.
     """
     operator, weight = objective.posed.operator, solutions[0].record.penalty_weight or 0.0
     samples = operator.samples_of([solution.plane for solution in solutions])
@@ -206,7 +176,6 @@ def solve_then_sigma(objective: Objective, options: SolverOptions) -> tuple[Solu
 
 
 def _certificate(iterate: PmlemIterate) -> Certificate:
-    """Return the distance of an iterate to the optimum."""
     certificate = iterate.certificate
     return Certificate(
         kind=_PMLEM_CERTIFICATE,

@@ -112,7 +112,6 @@ def _why_no_network(evidences: Sequence[Evidence]) -> str | None:
 
 
 def _candidates(prior: PriorName | None) -> Candidates:
-    """Return the function that makes the candidates of a prior."""
     if prior == "patches":
         return patch_candidates
     return partial(_with_network, alone=prior == "learned")
@@ -154,5 +153,4 @@ def _solution(
 
 
 def _without(solution: Solution, reason: str) -> Solution:
-    """Return the plane of total variation, and say why it is that."""
     return replace(solution, record=structs.replace(solution.record, prior=PriorRecord(name="tv", left_out=reason)))

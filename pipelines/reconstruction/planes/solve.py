@@ -63,10 +63,7 @@ def solve(
 ) -> Solution:
     """Reconstruct one plane of one colour, by a prior from its pilot if there is one.
 
-    Raises
-    ------
-    NotConverged
-        The penalty weight is too large for the views.
+    Raises NotConverged if the penalty weight is too large for the views.
     """
     if method == "backprojection":
         plane = back_projection(operator, images)
@@ -120,7 +117,6 @@ def _solve_one_step_late(
 def _one_step_late_weight(
     operator: PlaneOperator, images: ElementalImages, start: Image, method: Method, options: SolverOptions
 ) -> tuple[float, str]:
-    """Return β and how it was chosen."""
     if method == "mlem":
         return 0.0, "none: maximum likelihood"
     if options.penalty_weight != "auto":
@@ -138,19 +134,9 @@ def solve_together(
 ) -> dict[Method, dict[Place, Solution]]:
     """Reconstruct all planes of one colour together, so that no plane has to explain the light of the others.
 
-    Parameters
-    ----------
-    grids : mapping of Place to PlaneGrid
-        The samples of each plane.
-    methods : collection of Method
-        "joint", "occlusion" or both; with the latter planes hide those behind them if that explains the images better.
-    pilots : mapping of Place to Pilot, optional
-        What a prior begins with: planes of "joint" by total variation.
-
-    Returns
-    -------
-    dict of Method to dict of Place to Solution
-        All records are of one iteration: its penalty weight, passes, objective and certificate.
+    The methods are "joint", "occlusion" or both; with the latter planes hide those behind them if that explains the
+    images better. `pilots` are planes of "joint" by total variation, with which a prior begins. All records are of one
+    iteration: its penalty weight, passes, objective and certificate.
     """
     _check_memory(grids.values())
     operator = factory.of_scene(grids)

@@ -40,22 +40,10 @@ type Runner = Callable[[ElementalSet, Path, Sequence[PlaneTask]], Generator[tupl
 
 @dataclass(frozen=True)
 class PlaneTask:
-    """One plane by the methods that still lack it; holds paths and options, no pixels.
+    """One plane by the methods that still lack it, or all planes for methods that solve them together.
 
-    For methods that reconstruct all planes together: all planes. One colour, or all colours if a prior compares them.
-
-    Attributes
-    ----------
-    layouts : tuple of ChannelLayout
-        The colours.
-    grids : dict of Place to PlaneGrid
-        The samples of each plane.
-    files : tuple of PlaneFiles
-        Where the result of each method and plane goes.
-    solver : SolverOptions
-        SolverOptions of the methods.
-    with_focus : bool
-        Measure the power of detail, too.
+    It holds paths and options, no pixels: one colour, or all colours if a prior compares them; and a file for each
+    method and plane. `with_focus` measures the power of detail, too.
     """
 
     layouts: tuple[ChannelLayout, ...]
@@ -84,13 +72,7 @@ class Channel:
         return {place: solve(operator, self._images, "pmlem", solver) for place, operator in operators.items()}
 
     def do(self, task: PlaneTask, pilots: Mapping[Place, Pilot] | None = None) -> list[str]:
-        """Reconstruct and save this colour of what a task asks for, and return messages for the user.
-
-        Raises
-        ------
-        GeometryMismatch, NotConverged
-            Of the task's depth, or method.
-        """
+        """Reconstruct and save this colour of what a task asks for, and return messages for the user."""
         messages: list[str] = []
         focus: dict[Place, FocusPoint | None] = dict.fromkeys(task.grids)
         for place, grid in task.grids.items():
@@ -119,7 +101,6 @@ class Channel:
             raise GeometryMismatch(f"plane at {self._describe(place)}: {failure}") from failure
 
     def _save(self, task: PlaneTask, files: PlaneFiles, solution: Solution, focus: FocusPoint | None) -> None:
-        """Save one plane of this colour with its record."""
         place, grid = files.place, task.grids[files.place]
         tilted = place if isinstance(place, TiltedPlane) else None
         px_per_sample = grid.pitch_mm * self._loaded.settings.camera.fx_px / depth_of(place)  # on the axis
@@ -145,7 +126,6 @@ class Channel:
         files.save_part(self._layout.name, arrays, in_units(self._loaded, record), focus)
 
     def _describe(self, place: Place) -> str:
-        """Return the name of a plane in messages."""
         return f"'{place.name}'" if isinstance(place, TiltedPlane) else self._loaded.depth_text(place)
 
     def _halves(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -210,24 +190,8 @@ def run_serially(
 class Sweep:
     """The planes of one call: those missing are made, and each is written as soon as all its colours are there.
 
-    Attributes
-    ----------
-    elemental_set : ElementalSet
-        The set.
-    layouts : list of ChannelLayout
-        Its colours.
-    grids : dict of Place to PlaneGrid
-        The samples of each plane.
-    files : sequence of PlaneFiles
-        One per method and plane.
-    origins : dict of Method to Provenance
-        The provenance of all planes of a method together.
-    solver : SolverOptions
-        SolverOptions of the methods.
-    with_focus : bool
-        Make a curve of focus against depth.
-    finished : dict of (Method, Place) to PlaneFileRecord
-        The planes that are there.
+    There is a file for each method and plane. `origins` are the provenances of all planes of a method together, and
+    `finished` the planes that are there.
     """
 
     elemental_set: ElementalSet
@@ -247,13 +211,7 @@ class Sweep:
         return samples * files * (np.dtype(np.float32).itemsize + 3)
 
     def run(self, runner: Runner, out: Path) -> None:
-        """Run the missing tasks, and write each plane at once.
-
-        Raises
-        ------
-        FileFailed
-            A colour that was written cannot be read back.
-        """
+        """Run the missing tasks, and write each plane at once (FileFailed: a colour cannot be read back)."""
         for files in self.files:
             if record := files.finished():
                 self.finished[files.method, files.place] = record
@@ -292,7 +250,6 @@ class Sweep:
         return [task for task in tasks if task.files]
 
     def _write_complete(self, candidates: Sequence[PlaneFiles]) -> None:
-        """Write the planes whose colours are complete."""
         for files in candidates:
             key = (files.method, files.place)
             if key not in self.finished and not files.missing():
@@ -333,7 +290,6 @@ class Sweep:
 
 
 def _sum(points: Sequence[FocusPoint | None]) -> FocusMeasure:
-    """Return the focus of all channels together at one depth."""
     known = [point for point in points if point is not None]
     return FocusMeasure(
         sum(point.detail_e2 for point in known), float(np.linalg.norm([point.sigma_e2 for point in known]))

@@ -54,26 +54,13 @@ _LIGHT: dict[LightUnit, str] = {"electrons": "electrons", "dn": "DN", "relative"
 
 @dataclass(frozen=True)
 class SurfaceMaps:
-    """Maps of a surface, all of one shape (row, column).
+    """Maps of a surface, all of one shape (row, column), unless they have colours (row, column, colour).
 
-    Attributes
-    ----------
-    grid : PlaneGrid
-        The samples' directions: positions at unit depth, x/z and y/z.
-    picture, picture_sigma : float arrays (row, column[, colour])
-        Light in the unit of the set, and its standard deviation.
-    depth, depth_sigma : float arrays (row, column)
-        Depth and its standard deviation in the unit of the record; NaN where the depth is not known.
-    depth_confidence : float array (row, column)
-        Probability that the depth is right within 2 %.
-    visibility : int or float array (row, column)
-        Number of views that see each sample.
-    inverse_depth : float array (row, column)
-        Best estimate of 1/depth in 1/mm, everywhere: what the film is rendered from.
-    aperture_mm : (float, float)
-        Distance of the outermost nodes along x and y, see `parallax.aperture_of`.
-    picture_proposal, picture_moved : float arrays (row, column[, colour]), optional
-        What the prior proposed, in the unit of the set, and the picture less that, in standard deviations of the noise.
+    `grid` are the samples' directions, x/z and y/z. The picture, its `picture_sigma` and `picture_proposal` are in the
+    unit of light of the set, `picture_moved` in standard deviations of the noise. `depth` and `depth_sigma` are in the
+    unit of the record, NaN where the depth is not known, and `depth_confidence` is the probability that it is right
+    within 2 %. `visibility` counts the views that see each sample. The film is rendered from `inverse_depth`, 1/mm
+    everywhere, and `aperture_mm`, see `parallax.aperture_of`.
     """
 
     grid: PlaneGrid
@@ -99,21 +86,8 @@ def write_surface(
 ) -> SurfaceRecord:
     """Write the files of a surface into a folder, last the record that vouches for them, and return what that says.
 
-    Parameters
-    ----------
-    folder : Path
-        The folder. An earlier surface in it is replaced.
-    maps : SurfaceMaps
-        The picture, the depth, and how well they are known.
-    facts : SurfaceFacts
-        What the estimation says besides.
-    origin : Provenance
-        Command, options, inputs and versions.
-
-    Raises
-    ------
-    DiskFull, CannotWrite
-        A file cannot be written; there is then no record, so that nothing vouches for the others.
+    An earlier surface in it is replaced. If a file cannot be written (DiskFull, CannotWrite), there is no record, so
+    that nothing vouches for the others.
     """
     remove(folder / SURFACE_FILE)
     depths = [name for of_unit in _DEPTH_FILES.values() for name in of_unit]  # an earlier surface may have another unit
@@ -131,7 +105,6 @@ def write_surface(
 
 
 def _record(maps: SurfaceMaps, facts: SurfaceFacts, points: str | None, film: str | None) -> SurfaceRecord:
-    """Return the record of a surface; its numbers are those of the maps."""
     depth, depth_sigma = _DEPTH_FILES[facts.unit]
     proposal, moved = (UNSET, UNSET) if maps.picture_proposal is None else _PROPOSED
     known = np.isfinite(maps.depth)
@@ -157,7 +130,6 @@ def _record(maps: SurfaceMaps, facts: SurfaceFacts, points: str | None, film: st
 def _named_maps(
     record: SurfaceRecord, maps: SurfaceMaps, levels: Picture, units: StatedUnits
 ) -> Iterator[tuple[str, NDArray[np.floating], bytes]]:
-    """Yield each map with the name of its file and its preview."""
     what = "disparity" if record.unit == "px" else "depth"
     yield record.picture, maps.picture, encoded(levels, ".png")
     sigma, proposal, moved = maps.picture_sigma, maps.picture_proposal, maps.picture_moved

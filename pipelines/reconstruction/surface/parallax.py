@@ -38,13 +38,7 @@ _PX_AWAY = 10.0
 
 
 def aperture_of(poses_rt_cam_ref: NDArray[np.floating]) -> tuple[float, float]:
-    """Return the distances in mm of the outermost cameras along x and y.
-
-    Parameters
-    ----------
-    poses_rt_cam_ref : float array (view, 6)
-        Poses of the cameras, Rodrigues rad and mm.
-    """
+    """Return the distances in mm of the outermost cameras along x and y, given their poses (view, 6)."""
     turned = Rotation.from_rotvec(poses_rt_cam_ref[:, :3]).inv()
     width_mm, height_mm, _ = np.ptp(turned.apply(poses_rt_cam_ref[:, 3:]), axis=0).tolist()
     return width_mm, height_mm
@@ -55,15 +49,8 @@ def viewpoints(
 ) -> NDArray[np.float64]:
     """Return the viewpoints (frame, 2) of a film: x, y in mm on an ellipse around the middle of the nodes.
 
-    Parameters
-    ----------
-    inverse_depth : float array (row, column)
-        1/depth in 1/mm of each sample.
-    pitch : float
-        Distance of the samples in x/z.
-    aperture_mm : (float, float)
-        Distance of the outermost nodes along x and y. The ellipse reaches them, unless that would move the nearest or
-        the farthest sample too far across the picture.
+    The ellipse reaches the outermost nodes, `aperture_mm` apart, unless that would move the nearest or the farthest
+    sample too far across the picture. `inverse_depth` (row, column) is in 1/mm, the `pitch` of its samples in x/z.
     """
     far, middle, near = np.quantile(inverse_depth, [_QUANTILES[0], 0.5, _QUANTILES[1]])
     px_per_mm = max(near - middle, middle - far) / pitch
@@ -76,26 +63,10 @@ def viewpoints(
 def render_parallax(
     picture: Picture, inverse_depth: NDArray[np.floating], pitch: float, offsets_mm: NDArray[np.floating]
 ) -> list[Picture]:
-    """Return a picture as seen from other viewpoints, reduced to the size of a film.
+    """Return a picture as seen from other viewpoints (frame, 2), reduced to the size of a film.
 
     Each sample is moved by its parallax, the nearer over the farther. What then comes into view behind an edge has the
-    colours of the farther side.
-
-    Parameters
-    ----------
-    picture : uint8 array (row, column[, RGB])
-        The picture.
-    inverse_depth : float array (row, column)
-        1/depth in 1/mm of each sample, known everywhere.
-    pitch : float
-        Distance of the samples in x/z, along both axes.
-    offsets_mm : float array (frame, 2)
-        The viewpoints: x (right) and y (down) from that of the picture.
-
-    Returns
-    -------
-    list of uint8 arrays (row, column[, RGB])
-        The frames, all of one size: the borders that some viewpoint does not see are cut off.
+    colours of the farther side. The frames are of one size: borders that some viewpoint does not see are cut off.
     """
     width = inverse_depth.shape[1]
     picture = shrunk(picture, _DRAWN_WIDTH_PX)
@@ -171,13 +142,10 @@ def _filled(
 def _beyond(
     source: NDArray[np.int32], axis: int, backwards: bool
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
-    """Return what lies before each pixel along an axis, or behind it if `backwards`.
+    """Return what lies before each pixel along an axis, or behind it if `backwards`: arrays (row, column).
 
-    Returns
-    -------
-    edge, mirrored, distance : int arrays (row, column)
-        The last source before a gap, the one that mirrors the pixel there (either -1 if there is none), and how many
-        pixels away the edge is.
+    These are the last source before a gap, the one that mirrors the pixel there (either -1 if there is none), and how
+    many pixels away the edge is.
     """
     ordered = np.flip(source, axis) if backwards else source
     place = np.indices(source.shape, np.int32)[axis]

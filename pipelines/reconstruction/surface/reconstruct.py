@@ -67,18 +67,8 @@ def reconstruct_surface(
 ) -> SurfaceRecord:
     """Reconstruct the surface of a set, and write it with its record; one that is up to date is kept.
 
-    The caller has `out` to itself, see `formats.files.exclusive`.
-
-    Parameters
-    ----------
-    elemental_set : ElementalSet
-        The set.
-    out : Path
-        Folder of the files.
-    request : SurfaceRequest
-        The range of depths, and how the light is solved.
-    pages : sequence of Path
-        Pages that show an earlier surface: they are removed before its files are.
+    The caller has `out` to itself, see `formats.files.exclusive`. Earlier `pages` are removed before the files that
+    they show are.
 
     Raises
     ------
@@ -89,8 +79,7 @@ def reconstruct_surface(
     GeometryMismatch
         The views share too little at the depths of a given range, or the range is too wide.
     NothingInFocus
-        All views were taken from one place; they agree no better than shuffled ones; or no range of depths is given,
-        and none is found.
+        The views tell no depths, agree no better than shuffled ones, or show nothing in the range.
     """
     started = time.monotonic()
     _check(elemental_set, out)
@@ -138,7 +127,6 @@ def reconstruct_surface(
 
 
 def _check(elemental_set: ElementalSet, out: Path) -> None:
-    """Refuse sets and folders for which no surface can be made."""
     check_views(elemental_set, "a surface")
     if (out / DEPTH_MAP_FILE).exists():
         raise OutputExists(
@@ -199,7 +187,6 @@ def _name_blind_views(elemental_set: ElementalSet, operator: SurfaceOperator, ph
 
 
 def _channel(name: str, light: Solution) -> SurfaceChannel:
-    """Return the record of one colour."""
     record = light.record
     return SurfaceChannel(
         channel=name,
@@ -236,7 +223,6 @@ def _maps(
     unit: Literal["mm", "px", "relative"],
     bins: int,
 ) -> SurfaceMaps:
-    """Return what is known of each sample."""
     grid = plane_grid(elemental_set, 1.0)
     confidence = enlarged(estimate.confidence, grid.shape, bins).astype(np.float32)
     known = confidence >= UNKNOWN_BELOW

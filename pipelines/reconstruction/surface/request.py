@@ -65,10 +65,8 @@ class SurfaceSelection:
 def select_surface(options: Options) -> SurfaceSelection | None:
     """Return the surface that options select, None if they ask for none.
 
-    Raises
-    ------
-    WrongUsage
-        A range is no range, two are given, or one although no surface is wanted; or a prior does not suit.
+    Raises WrongUsage if a range is no range, two are given, or one although no surface is wanted; or a prior does not
+    suit.
     """
     depth_range_mm, disparity_range_px = options.depth_range_mm, options.disparity_range_px
     if not options.surface:
