@@ -22,19 +22,14 @@ logger = logging.getLogger("faintfield")
 # Wraps lines: messages in a frame would be cut off otherwise.
 framed_console = Console(stderr=True, highlight=False, emoji=False)
 
-
 # Off a terminal, seconds until the first line of what takes long, and from one line to the next.
 _FIRST_LINE_S, _NEXT_LINE_S = 2.0, 10.0
-
 
 # Reports of work under way, each part of the one before: one is silent while a part of it speaks for itself.
 _reports: list["_Report"] = []
 
-# Labels of the bars that are drawn.
+# Labels of the bars that are drawn, and words that no log may hold.
 _bars: list[str] = []
-
-
-# Words that no log may hold.
 _secrets: set[str] = set()
 
 
@@ -69,20 +64,17 @@ def inform(text: str) -> None:
 
 
 def progress[T](items: Iterable[T], label: str, total: int | None = None) -> Generator[T]:
-    """Yield `items`; on a terminal, draw a bar with the time left.
+    """Yield `items`; draw a bar with the time left on a terminal, else say every 10 s how many are done.
 
-    Parameters
-    ----------
-    items : iterable
-        The bar advances as each item is taken.
-    label : str
-        The work in a few words.
-    total : int, optional
-        The number of items, if `items` has no length.
+    `total` is the number of items, if they have no length.
     """
     # Redraw only on a terminal: the thread of a generator that its caller abandons would block the exit
     if not console.is_terminal:
-        yield from _in_lines(items, label, total if total is not None else _length(items))
+        report = _Report(label, len(items) if total is None and isinstance(items, Sized) else total)
+        with _said_while(report):
+            for item in items:
+                yield item
+                report.done += 1
         return
     with _bar() as bar:
         _bars.append(label)
@@ -93,26 +85,14 @@ def progress[T](items: Iterable[T], label: str, total: int | None = None) -> Gen
 
 
 def _bar() -> "Progress":
-    """Return a bar with steps and the time left, to be drawn."""
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from rich import progress as parts  # help loads this module, and draws no bar
 
-    return Progress(
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("to go"),
-        TimeRemainingColumn(),
-        console=console,
-        transient=True,
+    columns = (
+        parts.TextColumn("{task.description}", markup=False),
+        *(parts.BarColumn(), parts.MofNCompleteColumn(), parts.TimeElapsedColumn()),
+        *(parts.TextColumn("to go"), parts.TimeRemainingColumn()),
     )
+    return parts.Progress(*columns, console=console, transient=True)
 
 
 @contextmanager
@@ -129,17 +109,7 @@ def working(label: str) -> Iterator[None]:
 
 @dataclass(eq=False)
 class _Report:
-    """Lines about work that takes long: the first after 2 s, then one every 10 s.
-
-    Attributes
-    ----------
-    label : str
-        The work in a few words.
-    total, done : int
-        Number of its steps, and of those that are finished; no total if it is not known.
-    clock : callable
-        Returns the time in s.
-    """
+    """Lines about work that takes long: the first after 2 s, then one every 10 s, with the steps done if they count."""
 
     label: str
     total: int | None = None
@@ -171,11 +141,6 @@ class _Report:
 
 
 def _duration(seconds: float) -> str:
-    """Return a time in words, to the second, or to the minute from two minutes on.
-
-    >>> _duration(20.4), _duration(150)
-    ('20 s', '2 min')
-    """
     return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
 
 
@@ -203,20 +168,5 @@ def _said_while(report: _Report) -> Iterator[None]:
 
 
 def _parts_speak(report: _Report) -> bool:
-    """Return whether a part of the work has already said what it does."""
     parts = itertools.dropwhile(lambda other: other is not report, tuple(_reports))
     return any(part.spoke for part in parts if part is not report)
-
-
-def _in_lines[T](items: Iterable[T], label: str, total: int | None) -> Generator[T]:
-    """Yield items, and say every 10 s how many are done."""
-    report = _Report(label, total)
-    with _said_while(report):
-        for item in items:
-            yield item
-            report.done += 1
-
-
-def _length(items: Iterable[object]) -> int | None:
-    """Return the number of items if it is known."""
-    return len(items) if isinstance(items, Sized) else None

@@ -1,30 +1,4 @@
-"""The failures of files and folders that a command is given: one tree, `InputError` at its root.
-
-InputError
-├── MissingFile
-├── UnreadableImage
-│   └── UnknownFormat
-├── WrongSize
-├── WrongBitDepth
-├── BadValue
-│   └── UnknownKey
-├── ArrangementError
-│   ├── NotOneScene
-│   ├── CopiedPicture
-│   ├── AmbiguousOrder
-│   ├── ShuffledPictures
-│   └── CameraTurned
-├── ResultDamaged
-├── OutputExists
-├── OutputBusy
-├── MissingPackage
-├── ClusterFailed
-├── MemoryShort
-├── FileFailed
-└── CannotWrite
-    └── DiskFull
-
-WrongUsage
+"""The failures of files and folders that a command is given: `InputError` and its subclasses.
 
 Every message states what is wrong, the value found, its limit, and what to do.
 """

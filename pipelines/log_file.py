@@ -25,21 +25,10 @@ logger.addHandler(logging.NullHandler())  # without --log, nothing is printed
 
 @contextmanager
 def logged(path: Path | None, arguments: Sequence[str], one_line: tuple[type[BaseException], ...]) -> Iterator[None]:
-    """Record in a file what happens while the block runs; do nothing if `path` is None.
+    """Append to a file what happens while the block runs; do nothing if `path` is None.
 
-    Parameters
-    ----------
-    path : Path, optional
-        The file to append to; its folder must exist.
-    arguments : sequence of str
-        The command and its arguments.
-    one_line : tuple of exception types
-        Failures that are recorded by their message; any other is recorded with its traceback.
-
-    Raises
-    ------
-    CannotWrite
-        The file cannot be opened.
+    Failures of the types `one_line` are recorded by their message, any other with its traceback. Raises CannotWrite if
+    the file cannot be opened.
     """
     if path is None:
         yield

@@ -50,19 +50,15 @@ class Step:
 
     Attributes
     ----------
-    name : str
-        Its name in messages.
     results : dict of str to callable
-        Returns the options of each result file, a mapping or Struct, if it is up to date; None if it records none. It
-        is called when the file exists and the steps that this one needs are done.
-    make : callable
-        Does it.
+        Returns the options, a mapping or Struct, that each result file would have if it were up to date; None for a
+        file that records none. It is called when the file exists and the steps that this one needs are done.
     needs : tuple of str
         Names of the steps whose results it reads.
     inputs : callable
         Returns the names of all files that it reads.
     command : str, optional
-        Name of the command that does it alone, which its results record; by default that of the step.
+        The command that does it alone, which its results record; by default named as the step.
     """
 
     name: str
@@ -215,8 +211,9 @@ def session_steps(
     # Depths of the rig, not of the request: the geometry stays the same for other planes
     gated_mm = list(present_settings(session).scene.depth_mm or DEFAULT_DEPTHS_MM)
     opened = cache(lambda: open_set(session))  # not before it is calibrated
-    made = [*_steps_of_planes(session, opened, planes, runner), *_steps_of_surface(session, opened, surface)]
-
+    made = [] if planes is None else [_step_of_planes(session, opened, planes, runner)]
+    if surface is not None:
+        made.append(_step_of_surface(session, opened, surface))
     return [
         Step(
             "noise",
@@ -240,10 +237,7 @@ def session_steps(
     ]
 
 
-def _steps_of_planes(session: Path, opened: Opened, selection: Selection | None, runner: Runner | None) -> list[Step]:
-    """Return the step from a calibrated session to its planes, if any are asked for."""
-    if selection is None:
-        return []
+def _step_of_planes(session: Path, opened: Opened, selection: Selection, runner: Runner | None) -> Step:
     folders = {folder_of_method(Path(RECONSTRUCTIONS), name, selection.methods): name for name in selection.methods}
 
     def options(folder: Path) -> object:
@@ -255,23 +249,17 @@ def _steps_of_planes(session: Path, opened: Opened, selection: Selection | None,
         elemental_set, out = opened()
         return reconstruct_and_report(elemental_set, out, resolve(selection, elemental_set, out), runner)
 
-    return [
-        Step(
-            "reconstruct",
-            results={str(folder / RECONSTRUCTION_FILE): partial(options, folder) for folder in folders}
-            | {f"{RECONSTRUCTIONS}/{OVERVIEW_FILE}": None},
-            make=make,
-            needs=("noise", "geometry"),
-            inputs=lambda: files_of_scene(session, "dark_scene"),
-        )
-    ]
+    return Step(
+        "reconstruct",
+        results={str(folder / RECONSTRUCTION_FILE): partial(options, folder) for folder in folders}
+        | {f"{RECONSTRUCTIONS}/{OVERVIEW_FILE}": None},
+        make=make,
+        needs=("noise", "geometry"),
+        inputs=lambda: files_of_scene(session, "dark_scene"),
+    )
 
 
-def _steps_of_surface(session: Path, opened: Opened, selection: SurfaceSelection | None) -> list[Step]:
-    """Return the step from a calibrated session to its surface, if one is asked for."""
-    if selection is None:
-        return []
-
+def _step_of_surface(session: Path, opened: Opened, selection: SurfaceSelection) -> Step:
     def options() -> object:
         elemental_set, _ = opened()
         return selection.resolve(elemental_set).options(elemental_set.poses)
@@ -280,16 +268,14 @@ def _steps_of_surface(session: Path, opened: Opened, selection: SurfaceSelection
         elemental_set, out = opened()
         return surface_and_report(elemental_set, out / SURFACE_FOLDER, selection.resolve(elemental_set), page_in=out)
 
-    return [
-        Step(
-            "surface",
-            command="reconstruct",
-            results={f"{RECONSTRUCTIONS}/{SURFACE_FOLDER}/{SURFACE_FILE}": options},
-            make=make,
-            needs=("noise", "geometry"),
-            inputs=lambda: files_of_scene(session, "dark_scene"),
-        )
-    ]
+    return Step(
+        "surface",
+        command="reconstruct",
+        results={f"{RECONSTRUCTIONS}/{SURFACE_FOLDER}/{SURFACE_FILE}": options},
+        make=make,
+        needs=("noise", "geometry"),
+        inputs=lambda: files_of_scene(session, "dark_scene"),
+    )
 
 
 def _frames(session: Path, *kinds: str) -> list[str]:
