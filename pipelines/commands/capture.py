@@ -6,15 +6,12 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from faintfield.pipelines.arguments import Count, PaperName, Positive
-from faintfield.pipelines.console import inform
-from faintfield.pipelines.errors import OutputExists
 from faintfield.pipelines.planning.options import PlanOptions
 
 if TYPE_CHECKING:
     from faintfield.pipelines.planning.prediction import PredictionRecord
-    from faintfield.pipelines.workflows.board import BoardSheets
-    from faintfield.pipelines.workflows.capture import Captured
-    from faintfield.pipelines.workflows.check import RigCheck
+    from faintfield.pipelines.workflows.capture import Captured, RigCheck
+    from faintfield.pipelines.workflows.preparation import BoardSheets
     from faintfield.pipelines.workflows.verify import Verified
 
 _PLAN = PlanOptions()
@@ -34,14 +31,9 @@ def init(rig: Path = Path("rig.toml"), /) -> dict[str, str]:
     rig
         File to write; an existing one is left alone.
     """
-    from faintfield.pipelines.formats.files import write_whole
-    from faintfield.pipelines.formats.toml_files import rig_template
+    from faintfield.pipelines.workflows.capture import write_template
 
-    if rig.exists():
-        raise OutputExists(f"{rig}: exists and is not overwritten; name another file, or edit this one")
-    write_whole(rig, rig_template())
-    inform(f"wrote {rig}; describe your rig in it, then: faintfield check {rig}")
-    return {"rig": str(rig)}
+    return write_template(rig)
 
 
 def check(rig: Path, /, *, remember: bool = False, session: Path | None = None) -> Check:
@@ -56,7 +48,7 @@ def check(rig: Path, /, *, remember: bool = False, session: Path | None = None) 
     session
         Folder of a session: also say which settings have changed since it was begun, and whether it can be resumed.
     """
-    from faintfield.pipelines.workflows.check import check_rig
+    from faintfield.pipelines.workflows.capture import check_rig
 
     return check_rig(rig, remember, session)
 
@@ -73,7 +65,7 @@ def plan(rig: Path, /, *, options: PlanOptions = _PLAN) -> Prediction:
     rig
         The rig.toml.
     """
-    from faintfield.pipelines.workflows.plan import predict_capture
+    from faintfield.pipelines.workflows.preparation import predict_capture
 
     return predict_capture(rig, options)
 
@@ -111,7 +103,7 @@ def board(
     dictionary
         OpenCV's dictionary of the markers.
     """
-    from faintfield.pipelines.workflows.board import write_boards
+    from faintfield.pipelines.workflows.preparation import write_boards
 
     return write_boards(out, paper, boards, columns, rows, square_mm, dictionary)
 
@@ -157,14 +149,9 @@ def capture(
     """
     from faintfield.pipelines.workflows.capture import capture_or_resume
 
+    known = (noise, geometry, fx_px)
     return capture_or_resume(
-        rig,
-        session,
-        yes=yes,
-        page=page,
-        live_depth_mm=live_depth_mm,
-        live_sweep_mm=live_sweep_mm,
-        known=(noise, geometry, fx_px),
+        rig, session, yes=yes, page=page, live_depth_mm=live_depth_mm, live_sweep_mm=live_sweep_mm, known=known
     )
 
 

@@ -1,10 +1,9 @@
 """Planes of a folder as layers of napari, in the units of their set and on one grey scale."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from msgspec import UNSET
@@ -26,12 +25,8 @@ _MIN_DEPTHS_OF_A_STACK = 3
 _UNITS = {"mm": "mm", "px": "pixel", "": "pixel"}
 
 
-@dataclass(frozen=True)
-class Layer:
-    """An image layer, by the parameters of `napari.Viewer.add_image`.
-
-    `data` holds one plane (row, column[, colour]) or several (plane, row, column[, colour]).
-    """
+class _Layer(NamedTuple):
+    """An image layer of one or several planes, by the parameters of `napari.Viewer.add_image`."""
 
     data: NDArray[Any]
     name: str
@@ -45,12 +40,7 @@ class Layer:
 def show_planes(directory: Path) -> list[str]:
     """Show the planes below a folder in napari until its window is closed, and return the names of the layers.
 
-    Raises
-    ------
-    MissingFile, BadValue
-        There is no result in the folder, or one that cannot be read.
-    MissingPackage
-        napari is not installed.
+    Raises MissingFile or BadValue without a result that can be read, and MissingPackage without napari.
     """
     by_method = [_layers(directory, folder, result) for folder, result in planes_below(directory).items()]
     try:
@@ -65,12 +55,12 @@ def show_planes(directory: Path) -> list[str]:
     layers = list(chain.from_iterable(by_method))
     for index, layer in enumerate(layers):
         limits = (0.0, max(white, 1e-6))
-        viewer.add_image(**vars(layer), contrast_limits=limits, colormap="gray", visible=index == 0)
+        viewer.add_image(**layer._asdict(), contrast_limits=limits, colormap="gray", visible=index == 0)
     napari.run()
     return [layer.name for layer in layers]
 
 
-def _layers(directory: Path, folder: Path, result: ReconstructionRecord) -> list[Layer]:
+def _layers(directory: Path, folder: Path, result: ReconstructionRecord) -> list[_Layer]:
     planes = planes_in_order(result.planes)
     tilted = {record.file: record for record in result.planes if record.rt_ref_plane is not UNSET}.values()
     method = result.planes[0].method
@@ -87,27 +77,22 @@ def _layers(directory: Path, folder: Path, result: ReconstructionRecord) -> list
     return layers + [_plane_layer(folder, plane, f"{name}, {plane.name}", units) for plane in tilted]
 
 
-def _plane_layer(folder: Path, plane: PlaneRecord, name: str, units: StatedUnits) -> Layer:
+def _plane_layer(folder: Path, plane: PlaneRecord, name: str, units: StatedUnits) -> _Layer:
     pixels = _pixels(folder, plane)
     (x, y), pitch = plane.origin_mm, plane.pitch_mm
     unit = _UNITS[units.length]
-    return Layer(pixels, name, pixels.ndim == 3, (pitch, pitch), (y, x), (unit, unit), ("y", "x"))
+    return _Layer(pixels, name, pixels.ndim == 3, (pitch, pitch), (y, x), (unit, unit), ("y", "x"))
 
 
-def _stack_layer(folder: Path, planes: Sequence[PlaneRecord], name: str, step_mm: float, units: StatedUnits) -> Layer:
+def _stack_layer(folder: Path, planes: Sequence[PlaneRecord], name: str, step_mm: float, units: StatedUnits) -> _Layer:
     """Return planes at equal steps of depth as one layer."""
     pixels = np.stack([_pixels(folder, plane) for plane in planes])
     scale = stack_scale(planes, units)
     across = _UNITS.get(scale.unit, scale.unit)
-    return Layer(
-        data=pixels,
-        name=name,
-        rgb=pixels.ndim == 4,
-        scale=(step_mm, scale.across, scale.across),
-        translate=(planes[0].depth_mm, scale.origin[1], scale.origin[0]),
-        units=(_UNITS[units.length], across, across),
-        axis_labels=(units.quantity, "y", "x"),
-    )
+    units_of_axes = (_UNITS[units.length], across, across)
+    spacing = (step_mm, scale.across, scale.across)
+    start = (planes[0].depth_mm, scale.origin[1], scale.origin[0])
+    return _Layer(pixels, name, pixels.ndim == 4, spacing, start, units_of_axes, (units.quantity, "y", "x"))
 
 
 def _pixels(folder: Path, plane: PlaneRecord) -> NDArray[Any]:

@@ -59,17 +59,8 @@ class Origin(NamedTuple):
 def write_report(directory: Path, *, noise: Path | None = None, geometry: Path | None = None) -> Path:
     """Write report.html into a folder of results and return its path.
 
-    Parameters
-    ----------
-    directory : Path
-        The folder.
-    noise, geometry : Path, optional
-        noise.json and geometry.json; by default searched for in the folder, the two above and those within.
-
-    Raises
-    ------
-    MissingFile, BadValue
-        There is no result in the folder, or one that cannot be read.
+    noise.json and geometry.json are by default searched for in the folder, the two above and those within. Raises
+    MissingFile or BadValue if there is no result in the folder, or one that cannot be read.
     """
     surfaces = surfaces_below(directory)
     results = results_below(directory, required=not surfaces)
@@ -129,7 +120,6 @@ def _links(directory: Path) -> list[tuple[str, str]]:
 
 
 def _origin(directory: Path, path: Path, method: str, record: ReconstructionRecord | SurfaceFileRecord) -> Origin:
-    """Return the origin of a result in a file; its options have the names of the file."""
     units = units_of(record)
     best_focus = record.best_focus if isinstance(record, ReconstructionRecord) else None
     return Origin(

@@ -1,7 +1,6 @@
 """The sets of a report: each distinct set once, with its pictures as they were recorded, and its light."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -51,19 +50,8 @@ class PhotonBudget(NamedTuple):
     shares: dict[str, float]
 
 
-@dataclass(frozen=True)
-class SetSection:
-    """Part of the page about one set.
-
-    Attributes
-    ----------
-    noise_free : bool
-        True if the set has no read noise.
-    pictures : dict of str to str
-        Data URIs, None if the file is missing: all views (`integral`), the bright view (`bright`) and the object region
-        outlined in it (`region`), the middle of the reference view (`pixels`) and of the noise reference (`no_light`)
-        pixel for pixel, and the reference view (`view`).
-    """
+class SetSection(NamedTuple):
+    """Part of the page about one set, whose pictures are data URIs, None if the file is missing."""
 
     overview: Overview
     noise_free: bool
@@ -74,8 +62,7 @@ class SetSection:
 def set_sections(overviews: list[Path]) -> list[SetSection]:
     """Return the part of the page about each set, sets with noise first; sets with equal pictures are one set.
 
-    A set may have been reconstructed with several kinds of poses; of every overview.json, that of the preferred ones
-    is shown.
+    Of a set that was reconstructed with several kinds of poses, the overview.json with the preferred ones is shown.
     """
     distinct: dict[tuple[bytes, ...], tuple[Path, Overview]] = {}
     for path in overviews:
@@ -127,10 +114,7 @@ def _thinned(path: Path) -> str:
 
 
 def photon_budget(overview: Overview) -> PhotonBudget | None:
-    """Return the photon budget of a set, None without light or electrons, or if its dark level is not recorded.
-
-    Light is in electrons, and in photons too if the quantum efficiency is known.
-    """
+    """Return the photon budget of a set, None without light or electrons, or if its dark level is not recorded."""
     light, dark_e = overview.brightness, overview.dark_e
     signal_e = light.mean_signal_e
     if dark_e is UNSET or signal_e <= 0 or units_of(overview).light != "electrons":

@@ -1,7 +1,6 @@
 """Surfaces and depth maps in a report: pictures, known share, and prediction of views that were left out."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,8 +19,7 @@ _FILMS = (".webp", ".png")
 _SIGNIFICANT = 3.0
 
 
-@dataclass(frozen=True)
-class Figure:
+class Figure(NamedTuple):
     """A picture as data URI with its name and caption; `moving` is a film of it, if there is one."""
 
     src: str
@@ -38,8 +36,7 @@ class Prediction(NamedTuple):
     best: bool
 
 
-@dataclass(frozen=True)
-class DepthSection:
+class DepthSection(NamedTuple):
     """A depth map with its pictures as data URIs; None if the file is missing."""
 
     title: str
@@ -65,18 +62,10 @@ def depth_sections(directory: Path, results: dict[Path, ReconstructionRecord]) -
     ]
 
 
-@dataclass(frozen=True)
-class SurfaceSection:
-    """Part of the page about one surface.
+class SurfaceSection(NamedTuple):
+    """Part of the page about one surface; a row of its table is name, value and meaning of a number.
 
-    Attributes
-    ----------
-    picture : str, optional
-        The picture as data URI; None if the file is missing.
-    rows : list of (str, str, str)
-        Name, value and meaning of each number in the table.
-    predictions, verdict : list of Prediction, str
-        Predictions of the views that were left out, by it and by other ways, and what follows; empty if none were.
+    Predictions, and the verdict that follows from them, are of views that were left out; empty if none were.
     """
 
     title: str
@@ -90,22 +79,16 @@ class SurfaceSection:
 
 def surface_sections(directory: Path, surfaces: dict[Path, SurfaceFileRecord]) -> list[SurfaceSection]:
     """Return the part of the page about each surface."""
-    sections = []
-    for folder, made in surfaces.items():
-        surface = made.surface
-        predictions = _predictions(surface.held_out) if surface.held_out else []
-        sections.append(
-            SurfaceSection(
-                title=folder.relative_to(directory).as_posix(),
-                made=made,
-                picture=_embedded(folder / preview_name(surface.picture)),
-                figures=_figures(folder, surface, units_of(made)),
-                rows=_rows(surface),
-                predictions=predictions,
-                verdict=_verdict(surface.held_out, predictions) if surface.held_out else "",
-            )
-        )
-    return sections
+    return [_section(folder.relative_to(directory).as_posix(), folder, made) for folder, made in surfaces.items()]
+
+
+def _section(title: str, folder: Path, made: SurfaceFileRecord) -> SurfaceSection:
+    surface = made.surface
+    predictions = _predictions(surface.held_out) if surface.held_out else []
+    verdict = _verdict(surface.held_out, predictions) if surface.held_out else ""
+    picture = _embedded(folder / preview_name(surface.picture))
+    figures = _figures(folder, surface, units_of(made))
+    return SurfaceSection(title, made, picture, figures, _rows(surface), predictions, verdict)
 
 
 def _figures(folder: Path, surface: SurfaceRecord, units: StatedUnits) -> list[Figure]:
@@ -164,7 +147,7 @@ def _quantity(surface: SurfaceRecord) -> str:
 
 
 def _tolerance(surface: SurfaceRecord) -> str:
-    """Return the largest error of a depth that counts as right: 2 %, which is a difference of disparities."""
+    """Return the largest error of a depth that counts as right."""
     return "2 % of its difference from that of infinity" if surface.unit == "px" else "2 %"
 
 
