@@ -15,8 +15,8 @@ from faintfield.pipelines.formats.files import write_whole
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE
 from faintfield.pipelines.formats.results.noise import NOISE_FILE
 from faintfield.pipelines.formats.results.noise_fit import Measured
-from faintfield.pipelines.formats.toml_files import read_rig
 from faintfield.pipelines.formats.sets.board_set import BoardEntry
+from faintfield.pipelines.formats.toml_files import read_rig
 from faintfield.pipelines.planning.known import calibration_file, known_lens, known_pace, known_sensor, planned_light
 from faintfield.pipelines.planning.options import PlanOptions
 from faintfield.pipelines.planning.predict import Predictor, parse_grids, scene_view

@@ -242,7 +242,7 @@ def test_folder_with_surface_alone_has_report(surface: Path, done: Command) -> N
     assert "What all views show, sharp everywhere." in page
     assert "The planes below" not in page
     assert "within 0.40 % of the optimum" in page  # in the provenance
-    assert "total variation" in page
+    assert "poisson-gaussian" in page
 
 
 def test_pictures_are_those_of_folder(surface: Path, done: Command) -> None:
