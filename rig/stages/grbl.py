@@ -47,7 +47,7 @@ class GrblController:
         self._offset_mm: tuple[float, ...] | None = None
         self._alarm: int | None = None
         self._count_lost = False  # since the stage was homed
-        self._homing = False  # by the last command
+        self._homing = False
 
     def connect(self, wait_s: float = 0.0) -> None:
         """Open the connection, waiting up to `wait_s` for its port, and wait for the banner, as most boards restart."""
@@ -84,7 +84,7 @@ class GrblController:
     def home(self, axis: AxisIndex | None, bound_s: float) -> AnswerTime:
         """Home within `bound_s`: GRBL answers nothing until the switches are found."""
         self._command("$H" if axis is None else f"$H{self._axes[axis]}", bound_s)
-        time = self._line.answer_time
+        time, self._homing = self._line.answer_time, False
         self._wait_until_still(0.0)
         self._alarm, self._count_lost = None, False
         return time
@@ -114,14 +114,8 @@ class GrblController:
         pins = self._poll().pins
         return frozenset(index for index in (0, 1) if self._axes[index] in pins)
 
-    def stop(self) -> bool:
-        """Cancel the jog: GRBL slows down within its acceleration and keeps its count."""
-        self._line.send(_CANCEL_JOG)
-        self._wait_until_still(self._braking_s)
-        return True
-
     def abort(self) -> bool:
-        """Cancel the jog, or reset while homing, which nothing else interrupts; reset what does not end."""
+        """Cancel the jog, which keeps the count; reset what does not end, and homing, which nothing else stops."""
         with suppress(StageError):  # a stage that cannot be reached cannot be stopped
             self._line.send(_RESET if self._homing else _CANCEL_JOG)
             if not self._homing:

@@ -94,14 +94,8 @@ class MarlinController:
         closed = {switch.name[0].upper() for switch in switches if switch.closed}
         return frozenset(index for index in (0, 1) if self._axes[index] in closed)
 
-    def stop(self) -> bool:
-        """Stop dead: Marlin does not slow down, so steps may be lost."""
-        self.abort()
-        self._command("M400")
-        return False
-
     def abort(self) -> bool:
-        """Send the emergency stop, which firmware with an emergency parser obeys at once."""
+        """Send the emergency stop, which firmware with an emergency parser obeys at once, perhaps losing steps."""
         with suppress(StageLost):  # a stage that cannot be reached cannot be stopped
             self._line.send(b"M410\n")
             self._discard_input()  # its ok belongs to no numbered line and must not be taken for the next answer

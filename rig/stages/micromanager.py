@@ -162,14 +162,8 @@ class MicroManagerController:
             raise StageLost("the stage is not connected; connect it first")
         return frozenset()
 
-    def stop(self) -> bool:
-        """Stop and wait for rest. The position counts as lost, since adapters differ in how abruptly they stop."""
-        self._run(lambda: self._core.stop(self._label), "stopping")
-        self.read_position()
-        return False
-
     def abort(self) -> bool:
-        """Tell the stage to stop; the position counts as lost."""
+        """Tell the stage to stop; the position counts as lost, since adapters differ in how abruptly they stop."""
         with suppress(StageError):
             self._run(lambda: self._core.stop(self._label), "stopping", answer_s=min(_ABORT_S, self._options.answer_s))
         return False
