@@ -4,6 +4,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from ctypes import c_double, c_int
+from typing import Any
 
 from faintfield.rig.cameras.aravis_frames import FrameTimes, Moment, PixelFormat, Stamps
 from faintfield.rig.cameras.aravis_library import AravisError, AravisLibrary, Reference
@@ -13,8 +14,7 @@ from faintfield.rig.errors import CameraError, CameraTimeout
 
 # The most frequent ArvBufferStatus, in words; 0 is success.
 _STATUS = {1: "no data came", 2: "its packets did not all come in time", 3: "packets are missing"}
-# No sensor has more rows or columns, and no frame more bytes.
-_MAX_SIDE_PX = 65_536
+# No frame has more bytes.
 _MAX_PAYLOAD = 2_000_000_000
 # ARV_GV_STREAM_OPTION_PACKET_SOCKET_DISABLED, and ARV_AUTO_OFF
 _NO_PACKET_SOCKET = 1
@@ -69,7 +69,7 @@ class AravisDevice:
                 **self._settings.features,
             }
             if self._call("arv_camera_is_gain_available"):
-                settings["Gain"] = f"{self._library.call('arv_camera_get_gain', self._camera.pointer):g}"
+                settings["Gain"] = f"{self._call('arv_camera_get_gain'):g}"
             return CameraReport(
                 self._name,
                 width * height * (1 if self._format.bits == 8 else 2) + 512,
@@ -89,10 +89,8 @@ class AravisDevice:
             self._set_exposure(exposure_s)
         payload = self._call("arv_camera_get_payload")
         if not self._format.frame_bytes(*self._region[2:]) <= payload <= _MAX_PAYLOAD:
-            raise CameraError(
-                f"the camera announces frames of {payload} bytes for the region {list(self._region)} in "
-                f"{self._format.name}; open it again"
-            )
+            problem = f"the camera announces frames of {payload} bytes for the region {list(self._region)}"
+            raise CameraError(f"{problem} in {self._format.name}; open it again")
         stream = library.reference("arv_camera_create_stream", self._camera.pointer, None, None)
         buffer = library.reference("arv_buffer_new_allocate", payload)
         if stream is None or buffer is None:
@@ -132,19 +130,16 @@ class AravisDevice:
             self._call("arv_camera_set_exposure_time_auto", _AUTO_OFF)
         if self._call("arv_camera_is_gain_auto_available"):
             self._call("arv_camera_set_gain_auto", _AUTO_OFF)
-        if settings.gain is not None:
-            self._set_gain(settings.gain)
-
-    def _set_gain(self, gain: float) -> None:
-        self._call("arv_camera_set_gain", gain)
-        kept = self._library.call("arv_camera_get_gain", self._camera.pointer)
-        if abs(kept - gain) > max(0.01, 0.01 * abs(gain)):
-            raise CameraError(f"the camera keeps gain {kept:g} instead of camera.gain = {gain:g}; choose {kept:g}")
+        if (gain := settings.gain) is not None:
+            self._call("arv_camera_set_gain", gain)
+            kept = self._call("arv_camera_get_gain")
+            if abs(kept - gain) > max(0.01, 0.01 * abs(gain)):
+                raise CameraError(f"the camera keeps gain {kept:g} instead of camera.gain = {gain:g}; choose {kept:g}")
 
     def _set_format(self) -> int:
         name = self._format.name
         self._call("arv_camera_set_pixel_format_from_string", name.encode())
-        kept, code = self._text("arv_camera_get_pixel_format_as_string"), self._call("arv_camera_get_pixel_format")
+        kept, code = self._text("arv_camera_get_pixel_format_as_string"), int(self._call("arv_camera_get_pixel_format"))
         if kept != name or code >> 16 & 0xFF != self._format.stored_bits:
             raise CameraError(f"the camera keeps pixel format {kept} (0x{code:08x}) instead of {name}; choose another")
         return code
@@ -153,26 +148,22 @@ class AravisDevice:
         region_px = self._settings.region_px
         if region_px is not None:
             left, upper, width, height = region_px
-            sensor = self._library.numbers("arv_camera_get_sensor_size", c_int, 2, self._camera.pointer)
-            if left + width > sensor[0] or upper + height > sensor[1]:
-                size = f"{sensor[0]} x {sensor[1]}"
-                raise CameraError(f"camera.region_px = {region_px} leaves the sensor of {size} pixels; correct it")
+            columns, rows = self._numbers("arv_camera_get_sensor_size", c_int, 2)
+            if left + width > columns or upper + height > rows:
+                problem = f"camera.region_px = {region_px} leaves the sensor of {columns} x {rows} pixels"
+                raise CameraError(f"{problem}; correct it")
             self._call("arv_camera_set_region", *region_px)
-        region = self._library.numbers("arv_camera_get_region", c_int, 4, self._camera.pointer)
+        region = self._numbers("arv_camera_get_region", c_int, 4)
         if region_px is not None and region != region_px:
             raise CameraError(f"the camera reads the region {list(region)} instead of {list(region_px)}; set another")
-        left, upper, width, height = region
-        if not (0 < width <= _MAX_SIDE_PX and 0 < height <= _MAX_SIDE_PX):
-            raise CameraError(f"the camera reports a frame of {width} x {height} pixels; set camera.region_px")
+        left, upper = region[:2]
         if self._format.mosaic is not None and (left % 2 or upper % 2):
-            raise CameraError(
-                f"the camera's region begins at column {left}, row {upper}, which shifts its mosaic; set "
-                "camera.region_px with an even column and row"
-            )
+            problem = f"the camera's region begins at column {left}, row {upper}, which shifts its mosaic"
+            raise CameraError(f"{problem}; set camera.region_px with an even column and row")
         return region
 
     def _exposure_range_s(self) -> tuple[float, float]:
-        bounds_us = self._library.numbers("arv_camera_get_exposure_time_bounds", c_double, 2, self._camera.pointer)
+        bounds_us = self._numbers("arv_camera_get_exposure_time_bounds", c_double, 2)
         return 1e-6 * bounds_us[0], 1e-6 * bounds_us[1]
 
     def _set_exposure(self, exposure_s: float) -> None:
@@ -182,7 +173,7 @@ class AravisDevice:
             limits = f"{shortest_s:g} to {longest_s:g}"
             raise CameraError(f"exposure_s = {exposure_s:g} is not among the camera's, {limits}; choose one of them")
         self._call("arv_camera_set_exposure_time", 1e6 * exposure_s)
-        set_s = 1e-6 * self._library.call("arv_camera_get_exposure_time", self._camera.pointer)
+        set_s = 1e-6 * self._call("arv_camera_get_exposure_time")
         if abs(set_s - exposure_s) > 0.01 * exposure_s:
             raise CameraError(f"the camera exposes {set_s:g} s for exposure_s = {exposure_s:g}; choose {set_s:g}")
         self._exposure_s = exposure_s
@@ -235,15 +226,16 @@ class AravisDevice:
 
     def temperature_c(self) -> float | None:
         """Return the temperature in °C, None if the camera does not measure it."""
-        if not self._has_temperature:
-            return None
-        return float(self._library.call("arv_camera_get_float", self._camera.pointer, b"DeviceTemperature"))
+        return float(self._call("arv_camera_get_float", b"DeviceTemperature")) if self._has_temperature else None
 
     def _text(self, name: str) -> str:
         return self._library.text(name, self._camera.pointer)
 
-    def _call(self, name: str, *arguments: object) -> int:
-        return int(self._library.call(name, self._camera.pointer, *arguments) or 0)
+    def _numbers(self, name: str, kind: type[c_int | c_double], count: int) -> tuple[Any, ...]:
+        return self._library.numbers(name, kind, count, self._camera.pointer)
+
+    def _call(self, name: str, *arguments: object) -> Any:
+        return self._library.call(name, self._camera.pointer, *arguments)
 
 
 class AravisCamera:
