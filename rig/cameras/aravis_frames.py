@@ -69,10 +69,8 @@ class PixelFormat:
         """
         needed = self.frame_bytes(width, height)
         if min(width, height) < 1 or len(content) < needed:
-            raise CameraError(
-                f"a frame of {width} x {height} pixels in {self.name} has {needed} bytes, the camera sent "
-                f"{len(content)}; check its region and pixel format"
-            )
+            problem = f"a frame of {width} x {height} in {self.name} has {needed} bytes, the camera sent {len(content)}"
+            raise CameraError(f"{problem}; check its region and pixel format")
         stored = np.frombuffer(content, np.uint8, needed)
         match self.packing:
             case "p":

@@ -122,10 +122,8 @@ class FolderCamera:
         new = sorted(set(self._files()) - known)
         if len(new) > 1:
             known.update(new)
-            raise CameraError(
-                f"{self._folder}: {len(new)} files came for one frame ({new[0].name}, {new[1].name}); "
-                "save one file a frame, then take this one again"
-            )
+            problem = f"{self._folder}: {len(new)} files came for one frame ({new[0].name}, {new[1].name})"
+            raise CameraError(f"{problem}; save one file a frame, then take this one again")
         if not new:
             return None
         try:
@@ -195,10 +193,8 @@ class FolderCamera:
         except OSError as failure:
             if not self._folder.is_dir():
                 raise self._gone() from failure
-            raise CameraError(
-                f"{failure.filename or self._folder}: cannot be read ({failure.strerror}); check the disk or the "
-                "network, and take this frame again"
-            ) from failure
+            problem = f"{failure.filename or self._folder}: cannot be read ({failure.strerror})"
+            raise CameraError(f"{problem}; check the disk or the network, and take this frame again") from failure
 
     def _gone(self) -> CameraError:
         return CameraError(f"{self._folder}: the folder is gone; mount it again, and take this frame again")

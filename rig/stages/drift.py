@@ -140,10 +140,8 @@ class DriftWatch:
         """Raise unless the stage can move to where a switch closes if its axis has drifted by the limit."""
         pull_off_mm = self._stage.identify().pull_off_mm
         if pull_off_mm <= self._limit_mm:
-            raise PlanRefused(
-                f"drift limit {self._limit_mm:g} mm, but homing pulls off the switches by only {pull_off_mm:g} mm; "
-                "pull off farther ($27) or lower the limit"
-            )
+            problem = f"drift limit {self._limit_mm:g} mm, but homing pulls off the switches by only {pull_off_mm:g} mm"
+            raise PlanRefused(f"{problem}; pull off farther ($27) or lower the limit")
         if not self._stage.travel().holds(self._inward_point(self._limit_mm - pull_off_mm)):
             raise PlanRefused(
                 f"drift of {self._limit_mm:g} mm cannot be seen: homing pulls off by {pull_off_mm:g} mm, and the "
@@ -163,10 +161,8 @@ class DriftWatch:
             time = self._time_homing(axis, distance_mm)
             if time.late_s == 0.0:
                 return time.taken_s
-        raise DriftUnknown(
-            f"the end of homing was read late {_MAX_TIMINGS} times in a row, the last time by {time.late_s:.3f} s; "
-            "give this computer less to do, or set check = false in [drift]"
-        )
+        problem = f"the end of homing was read late {_MAX_TIMINGS} times in a row, the last time by {time.late_s:.3f} s"
+        raise DriftUnknown(f"{problem}; give this computer less to do, or set check = false in [drift]")
 
     def _inward_point(self, distance_mm: float) -> Point:
         """Return the point that lies `distance_mm` from where homing ends, along both axes."""
@@ -190,10 +186,8 @@ class DriftWatch:
             raise PlanRefused("homing takes no longer from farther away, which shows no drift; set drift.check = false")
         speed = 0.5 * _RUN_UP_MM / difference_s
         if speed * _JITTER_S > self._limit_mm:
-            raise PlanRefused(
-                f"homing at {speed:.0f} mm/s resolves {speed * _JITTER_S:.2f} mm, coarser than the drift limit "
-                f"{self._limit_mm:g} mm; home more slowly or raise the limit"
-            )
+            problem = f"homing at {speed:.0f} mm/s resolves {speed * _JITTER_S:.2f} mm"
+            raise PlanRefused(f"{problem}, not the limit of {self._limit_mm:g} mm; home more slowly or raise the limit")
         return speed
 
     def _take_unchecked(self) -> tuple[object, ...]:

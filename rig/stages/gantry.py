@@ -189,10 +189,8 @@ class Gantry:
         """Record `point` as the stage's position and return it; raise `PositionLost` unless it is at `target`."""
         tolerance = self.identify().tolerance_mm
         if not Position(point, tolerance, trusted=True).is_at(target):
-            raise PositionLost(
-                f"the stage reports {point} instead of {target}, more than {max(tolerance):.4f} mm off; "
-                "look for an obstacle or a disturbed cable, then home it"
-            )
+            problem = f"the stage reports {point} instead of {target}, more than {max(tolerance):.4f} mm off"
+            raise PositionLost(f"{problem}; look for an obstacle or a disturbed cable, then home it")
         self._here = point
         return point
 

@@ -65,10 +65,8 @@ class GrblController:
             reported = reported or isinstance(grbl.parse(text), grbl.Report)
         # A reset ends what an earlier program may have left, and revives a GRBL that an alarm has silenced.
         if not self._reset(_FIRST_REPORT_S) and not reported:
-            raise StageTimeout(
-                f"no answer as from GRBL within {_BOOT_S + 2.0 * _FIRST_REPORT_S:g} s, and none to a reset; "
-                "check power, baud rate and protocol of the controller"
-            )
+            problem = f"no answer as from GRBL within {_BOOT_S + 2.0 * _FIRST_REPORT_S:g} s, and none to a reset"
+            raise StageTimeout(f"{problem}; check power, baud rate and protocol of the controller")
 
     def identify(self) -> Identity:
         """Read build information and settings, the settings twice since the line has no checksum."""

@@ -190,7 +190,7 @@ class MarlinController:
             if isinstance(message, marlin.Busy):
                 limit_s = started_s + bound_s + (_MAX_PAUSED_S if message.for_user else _MAX_BUSY_S)
                 deadline_s = max(deadline_s, min(self._clock.now_s() + _BUSY_S, limit_s))
-                why = "it waits for its button to be pressed" if message.for_user else "it says that it is busy"
+                why = ", it waits for its button to be pressed" if message.for_user else ", it says that it is busy"
             if isinstance(message, Ok) or (isinstance(message, marlin.PositionReport) and message.is_ok):
                 if any(isinstance(earlier, marlin.Resend) for earlier in messages):
                     return None
@@ -198,18 +198,14 @@ class MarlinController:
                 if refusals:
                     raise StageRejected(f"the controller refused {command!r}: {refusals[0].text}; home the stage first")
                 return messages
-        raise StageTimeout(
-            f"no answer to {command!r} within {self._clock.now_s() - started_s:.1f} s{why and ', ' + why}; "
-            "look whether the stage still moves, check cable and power, then recover and home it"
-        )
+        problem = f"no answer to {command!r} within {self._clock.now_s() - started_s:.1f} s{why}"
+        raise StageTimeout(f"{problem}; look whether the stage still moves, check cable and power, then home it")
 
     def _check(self, message: marlin.Message, command: str) -> None:
         if isinstance(message, marlin.Start):
             raise restart_failure()
         if isinstance(message, marlin.Resend) and message.number != self._line_number:
-            raise StageLost(
-                f"the controller waits for line {message.number} and was sent {self._line_number}: it has restarted, "
-                "and its position is lost; recover and home it"
-            )
+            problem = f"the controller waits for line {message.number} and was sent {self._line_number}"
+            raise StageLost(f"{problem}: it has restarted, and its position is lost; recover and home it")
         if isinstance(message, marlin.ErrorText) and not message.in_transmission:
             raise StageAlarm(f"{command!r} was answered by {message.text!r}; find the cause, recover and home it")

@@ -256,19 +256,15 @@ class MicroManagerController:
                 result_within(min(_ABORT_S, self._options.answer_s), stop, "stage")
             self._core = None
             self._shared.abandon("stage")
-            raise StageTimeout(
-                f"the stage did not finish {what} within {bound_s:g} s, and its adapter hangs; check its power and "
-                "cable, and end the program if it hangs again"
-            ) from failure
+            problem = f"the stage did not finish {what} within {bound_s:g} s, and its adapter hangs"
+            raise StageTimeout(f"{problem}; check power and cable, end the program if it hangs again") from failure
         except NotOffered as failure:
             raise PlanRefused(f"[stage]: {failure}") from failure
         except (RuntimeError, OSError) as failure:
             reason = in_one_line(failure)
             if waits_s and self._clock.now_s() - begun_s >= waits_s:
-                raise StageTimeout(
-                    f"the stage did not finish {what} within {waits_s:.1f} s ({reason}); look for an obstacle, or "
-                    "lower stage.rate_mm_per_s, then home it"
-                ) from failure
+                problem = f"the stage did not finish {what} within {waits_s:.1f} s ({reason})"
+                raise StageTimeout(f"{problem}; look for an obstacle, or lower stage.rate_mm_per_s") from failure
             raise StageLost(
                 f"the stage failed at {what}: {reason}; check its cable, its power and the configuration, then home it"
             ) from failure

@@ -57,10 +57,8 @@ class SerialPort:
             )
         except (OSError, ValueError) as failure:
             present = ", ".join(port.device for port in comports()) or "none"
-            raise StageLost(
-                f"{url}: cannot be opened ({in_one_line(failure)}); serial ports here: {present}; "
-                "check the cable, the name and that no other program has it"
-            ) from failure
+            problem = f"{url}: cannot be opened ({in_one_line(failure)}); serial ports here: {present}"
+            raise StageLost(f"{problem}; check the cable, the name and that no other program has it") from failure
 
     def write(self, data: bytes) -> None:
         """Send `data`."""
