@@ -33,6 +33,8 @@ _KEYS = {"go": "g", "again": "a", "keep": "k", "retake": "r", "skip": "s", "stop
 # Widths of the frame's picture and histogram in characters.
 _PICTURE_COLUMNS, _HISTOGRAM_COLUMNS = 48, 24
 _BARS = " ▁▂▃▄▅▆▇█"
+# Longest wait in s between two looks at the keyboard.
+_LOOK_S = 0.1
 
 
 class TerminalView:
@@ -129,14 +131,13 @@ def _keys(panel: CapturePanel) -> Iterator[None]:
         yield
         return
     before = termios.tcgetattr(sys.stdin)
-    wake_read, wake_write = os.pipe()
+    ended = threading.Event()
     words = {key: word for word, key in _KEYS.items()}
 
     def listen() -> None:
-        while True:
-            ready, _, _ = select.select([sys.stdin, wake_read], [], [])
-            if wake_read in ready:
-                return
+        while not ended.is_set():
+            if not select.select([sys.stdin], [], [], _LOOK_S)[0]:
+                continue
             key = os.read(sys.stdin.fileno(), 1).decode(errors="ignore").lower()
             asked = panel.asked
             if key in "\r\n" and asked is not None:
@@ -150,8 +151,6 @@ def _keys(panel: CapturePanel) -> Iterator[None]:
     try:
         yield
     finally:
-        os.write(wake_write, b"x")
+        ended.set()
         listener.join()
-        os.close(wake_read)
-        os.close(wake_write)
         termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)

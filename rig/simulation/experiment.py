@@ -15,20 +15,9 @@ from faintfield.rig.simulation.surfaces import Surface, render_surfaces
 
 @dataclass(frozen=True)
 class SimulatedExperiment:
-    """A scene, a camera and a grid of nodes.
+    """A scene of planes before a black background, or of surfaces, a camera and a grid of nodes.
 
-    Parameters
-    ----------
-    planes : tuple of TexturedPlane
-        The scene, before a black background; none if it consists of surfaces.
-    optics, sensor : SimulatedOptics, SimulatedSensor
-        The camera.
-    rows, columns, pitch_mm : int, int, float
-        The grid.
-    exposure_s : float
-        Exposure time of one view of the dark scene.
-    surfaces : tuple of Surface
-        The scene, if it is not flat.
+    `exposure_s` is the exposure time of one view of the dark scene.
     """
 
     planes: tuple[TexturedPlane, ...]
@@ -83,11 +72,7 @@ def surface_experiment(width_px: int = 640, height_px: int = 480) -> SimulatedEx
 
 
 def _paper_optics(width_px: int, height_px: int) -> SimulatedOptics:
-    """Return the paper's lens for a detector.
-
-    It has the field of view of 800 px focal length at 640 px width, slight barrel distortion, and a principal point off
-    the centre, as real lenses have.
-    """
+    """Return the paper's lens: the view of 800 px focal length at 640 px width, slight barrel distortion, off centre."""
     f_px = 800.0 * width_px / 640.0
     return SimulatedOptics(
         size_px=(width_px, height_px),

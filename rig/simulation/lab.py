@@ -60,14 +60,9 @@ _SWING_MM, _SWING_HZ, _SWING_DECAY_S = 1.5, 7.0, 0.25
 
 
 class SimulatedLab:
-    """Scene, light and sensor around a simulated stage.
+    """Scene, light and sensor around a simulated stage, whose position of the reference pose is `centre`.
 
-    Parameters
-    ----------
-    centre, true_position, still_s : Point, callable, callable
-        Stage position of the reference pose; the true position of the carriages, and the time since they stopped.
-    boards, settings : tuple of BoardSettings, SimulatedSettings
-        Boards of the charuco sweeps; the camera, the light and the errors of the rails.
+    The callables return the true position of the carriages, and the time since they stopped.
     """
 
     def __init__(

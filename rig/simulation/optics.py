@@ -16,12 +16,8 @@ type Points = NDArray[np.float64]
 class SimulatedOptics:
     """A lens and its detector, of width and height `size_px`; the centre of the first pixel is (0, 0).
 
-    Parameters
-    ----------
-    distortion : tuple of float
-        Up to eight coefficients in OpenCV's order k1, k2, p1, p2, k3, k4, k5, k6.
-    vignetting : bool
-        Whether light falls off with the fourth power of the cosine of the field angle.
+    `distortion` has up to eight coefficients in OpenCV's order k1, k2, p1, p2, k3, k4, k5, k6. With vignetting, light
+    falls off with the fourth power of the cosine of the field angle.
     """
 
     size_px: tuple[int, int]
@@ -101,23 +97,11 @@ def _undistort(x_image: Points, y_image: Points, distortion: tuple[float, ...]) 
 
 @dataclass(frozen=True)
 class SimulatedSensor:
-    """Converts light to DN, with the noise of eq. (6) of the paper; the defaults are those of the paper's camera.
-
-    Parameters
-    ----------
-    offset_dn, gain_dn_per_e : float
-        DN without electrons, and DN per electron.
-    read_noise_e : float
-        Standard deviation; the paper's variance is 12 e⁻².
-    dark_current_e_per_s, quantum_efficiency : float
-        Electrons per pixel and second without light; electrons per photon.
-    saturation_dn : int
-        Highest value of the converter.
-    """
+    """Converts light to DN, with the noise of eq. (6) of the paper; the defaults are those of the paper's camera."""
 
     offset_dn: float = 100.0
     gain_dn_per_e: float = 2.0
-    read_noise_e: float = 12.0**0.5
+    read_noise_e: float = 12.0**0.5  # standard deviation
     dark_current_e_per_s: float = 0.2
     quantum_efficiency: float = 0.5
     saturation_dn: int = 65535

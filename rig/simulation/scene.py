@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -16,12 +17,8 @@ class TexturedPlane:
 
     Parameters
     ----------
-    name : str
-        Name of the object.
-    reflectance : float array (row, column) or (row, column, 3)
-        Reflectance 0…1, grey or red, green, blue.
-    opacity : float array (row, column)
-        1 on the object, 0 outside it, between them at its edge.
+    reflectance, opacity : float array (row, column[, 3]), float array (row, column)
+        Reflectance 0…1, grey or red, green, blue; 1 on the object, 0 outside it, between them at its edge.
     pitch_mm : float
         Distance of neighbouring texture samples.
     rt_ref_plane : (float, …) of six
@@ -51,12 +48,8 @@ class TexturedPlane:
 class RenderedView:
     """One rendered view.
 
-    Attributes
-    ----------
-    light : float array (row, column) or (row, column, 3)
-        Mean reflectance in each pixel, times the relative illumination of the lens.
-    visible : dict of float array (row, column)
-        Share of each pixel in which a plane is visible, by the plane's name.
+    `light` (row, column[, 3]) is the mean reflectance in each pixel, times the relative illumination of the lens;
+    `visible` (row, column) is the share of each pixel in which an object is visible, by its name.
     """
 
     light: NDArray[np.float32]
@@ -74,40 +67,35 @@ def render(
 
     Parameters
     ----------
-    planes : sequence of TexturedPlane
-        Either all grey or all in colour. They must not intersect, since they are ordered by the depth of their centres.
-    optics : SimulatedOptics
-        Optics of the camera.
+    planes, optics : sequence of TexturedPlane, SimulatedOptics
+        Planes, all grey or all in colour, which must not intersect, since they are ordered by the depth of their
+        centres; optics of the camera.
     poses_rt_cam_ref : array (view, 6)
         Poses of the camera, Rodrigues rad and mm.
     samples_per_px : int
         Rays per pixel and axis, whose mean is the pixel; several reduce aliasing.
     """
     rays = optics.rays(samples_per_px)
-    illumination = optics.relative_illumination()
+    colours = planes[0].reflectance.shape[2:]
+    illumination = _for_colours(optics.relative_illumination(), colours)
     for pose in poses_rt_cam_ref:
-        yield _render_view(planes, rays, illumination, pose, samples_per_px)
+        light = np.zeros((*rays.shape[:2], *colours), np.float32)
+        unhidden = np.ones(rays.shape[:2], np.float32)
+        visible = {}
+        for plane in sorted(planes, key=partial(_depth_in_camera_mm, pose)):
+            reflected, opacity = _sample(plane, rays, pose)
+            light += reflected * _for_colours(unhidden, colours)
+            visible[plane.name] = pixel_means(opacity * unhidden, samples_per_px)
+            unhidden *= 1 - opacity
+        yield RenderedView(pixel_means(light, samples_per_px) * illumination, visible)
 
 
-def _render_view(
-    planes: Sequence[TexturedPlane],
-    rays: NDArray[np.float32],
-    illumination: NDArray[np.float32],
-    rt_cam_ref: NDArray[np.float64],
-    samples_per_px: int,
-) -> RenderedView:
-    """Composite the planes from front to back along every ray, and average the rays of each pixel."""
-    colours = () if planes[0].reflectance.ndim == 2 else (3,)
-    light = np.zeros((*rays.shape[:2], *colours), np.float32)
-    unhidden = np.ones(rays.shape[:2], np.float32)
-    visible = {}
-    for plane in sorted(planes, key=lambda plane: _plane_in_camera(plane, rt_cam_ref)[0][2]):
-        reflected, opacity = _sample(plane, rays, rt_cam_ref)
-        light += reflected * (unhidden if not colours else unhidden[:, :, np.newaxis])
-        visible[plane.name] = pixel_means(opacity * unhidden, samples_per_px)
-        unhidden *= 1 - opacity
-    light = pixel_means(light, samples_per_px)
-    return RenderedView(light * (illumination if not colours else illumination[:, :, np.newaxis]), visible)
+def _depth_in_camera_mm(rt_cam_ref: NDArray[np.float64], plane: TexturedPlane) -> float:
+    return float(_plane_in_camera(plane, rt_cam_ref)[0][2])
+
+
+def _for_colours(grey: NDArray[np.float32], colours: tuple[int, ...]) -> NDArray[np.float32]:
+    return grey.reshape(grey.shape + (1,) * len(colours))
 
 
 def _sample(
@@ -127,20 +115,10 @@ def _sample(
     with np.errstate(divide="ignore", invalid="ignore"):
         columns = np.where(in_front, x / scale / plane.pitch_mm + (plane.opacity.shape[1] - 1) / 2, -10)
         rows = np.where(in_front, y / scale / plane.pitch_mm + (plane.opacity.shape[0] - 1) / 2, -10)
-    texture = np.dstack(
-        [
-            plane.reflectance * plane.opacity.reshape(plane.opacity.shape + (1,) * (plane.reflectance.ndim - 2)),
-            plane.opacity,
-        ]
-    )
-    samples = cv2.remap(
-        texture.astype(np.float32),
-        columns.astype(np.float32),
-        rows.astype(np.float32),
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_CONSTANT,
-        borderValue=0,
-    )
+    reflected_light = plane.reflectance * _for_colours(plane.opacity, plane.reflectance.shape[2:])
+    texture = np.dstack([reflected_light, plane.opacity]).astype(np.float32)
+    place = columns.astype(np.float32), rows.astype(np.float32)
+    samples = cv2.remap(texture, *place, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
     reflected = samples[:, :, :-1]
     return (reflected if plane.reflectance.ndim == 3 else reflected[:, :, 0]), samples[:, :, -1]
 

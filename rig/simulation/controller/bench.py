@@ -7,7 +7,6 @@ import time
 import tty
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
 
 from faintfield.rig.errors import StageLost
 from faintfield.rig.simulation.controller.firmware import SimulatedFirmware, Wire
@@ -23,31 +22,8 @@ type MakeFirmware = Callable[[SimulatedClock, Wire], SimulatedFirmware]
 """Makes a controller: `SimulatedGrbl` or `SimulatedMarlin`, possibly with options."""
 
 
-class Link(Protocol):
-    """A cable from the host's port to the controller's."""
-
-    @property
-    def url(self) -> str:
-        """URL that the driver opens."""
-
-    def open(self) -> Port:
-        """Open the host's end."""
-
-    def receive(self, count: int) -> bytes:
-        """Return `count` bytes that the host has written."""
-
-    def send(self, data: bytes) -> None:
-        """Write bytes for the host to read."""
-
-    def plug(self) -> None:
-        """Plug the cable in."""
-
-    def unplug(self) -> None:
-        """Pull the cable out."""
-
-
-class DirectLink:
-    """A link within the program, and the host's end of it."""
+class Link:
+    """A cable from the host's port to the controller's, within the program; it is the host's end as well."""
 
     url = "simulated:"
 
@@ -99,7 +75,7 @@ class DirectLink:
             raise StageLost("simulated: the connection is lost (unplugged); check cable and power")
 
 
-class PtyLink:
+class PtyLink(Link):
     """A pseudo-terminal, which is a serial port to the driver.
 
     Its name is a symbolic link, so that it stays the same when the cable is plugged in again.
@@ -172,7 +148,7 @@ class Bench:
         self.clock = SimulatedClock()
         self.wire = Wire(self.clock)
         self.firmware = firmware(self.clock, self.wire)
-        self.link = link or DirectLink()
+        self.link = link or Link()
         self.resets_on_open = resets_on_open
         self.host_busy_until_s = 0.0
 

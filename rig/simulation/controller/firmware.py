@@ -144,28 +144,22 @@ class SimulatedFirmware(ABC):
             self.wire.to_host(text.encode("ascii", errors="replace") + self._line_end)
 
     @abstractmethod
-    def _reset_state(self) -> None:
-        """Set the state that a restart leaves until `_booted`."""
+    def _reset_state(self) -> None: ...
 
     @abstractmethod
-    def _booted(self) -> None:
-        """Finish the restart."""
+    def _booted(self) -> None: ...
 
     @abstractmethod
-    def _motion_ended(self) -> None:
-        """React to the end of the last motion."""
+    def _motion_ended(self) -> None: ...
 
     @abstractmethod
-    def _ready(self) -> bool:
-        """Return whether the next line can be run."""
+    def _ready(self) -> bool: ...
 
     @abstractmethod
-    def _run_line(self, line: str) -> None:
-        """Run a line, and answer it."""
+    def _run_line(self, line: str) -> None: ...
 
     @abstractmethod
-    def _homed(self, axes: Iterable[int]) -> None:
-        """Note that axes were homed."""
+    def _homed(self, axes: Iterable[int]) -> None: ...
 
     def _run_lines(self) -> None:
         while self._waiting and self._ready() and self.mechanics.queued() < _PLANNER_BLOCKS:

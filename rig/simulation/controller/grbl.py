@@ -32,35 +32,6 @@ DEFAULTS = {
 }  # fmt: skip
 
 
-class StoredSettings(dict[int, str]):
-    """Values by `$` number, as text."""
-
-    def number(self, setting: int) -> float:
-        """Return a setting as a number."""
-        return float(self[setting])
-
-    def travel_mm(self) -> tuple[float, float]:
-        """Return the lengths of both axes."""
-        return self.number(130), self.number(131)
-
-    def allows(self, target: Sequence[float], margin_mm: float) -> bool:
-        """Return whether the soft limits, which keep a margin from the ends if they are enabled, allow a position."""
-        ways = zip(self.travel_mm(), target, strict=True)
-        return all(margin_mm - length <= value <= -margin_mm for length, value in ways) or not self.number(20)
-
-    def speed_and_acceleration(
-        self, start: Sequence[float], target: Sequence[float], feed_mm_per_min: float
-    ) -> tuple[float, float]:
-        """Return the requested speed, limited by the axes' rates, and their highest acceleration (mm, s)."""
-        speed = min(feed_mm_per_min, along((self.number(110), self.number(111)), start, target)) / 60.0
-        return speed, along((self.number(120), self.number(121)), start, target)
-
-    def homing_s(self, distance_mm: float) -> float:
-        """Return the time to seek a switch `distance_mm` away, back off, and find it again slowly."""
-        seek, locate, pull_off = self.number(25) / 60.0, self.number(24) / 60.0, self.number(27)
-        return distance_mm / seek + 2.0 * pull_off / seek + pull_off / locate + 4.0 * self.number(26) / 1000.0
-
-
 class SimulatedGrbl(SimulatedFirmware):
     """Firmware, settings and mechanics of a GRBL stage.
 
@@ -92,7 +63,7 @@ class SimulatedGrbl(SimulatedFirmware):
         boot_s: float = 1.0,
         play_mm: float = 0.0,
     ) -> None:
-        self.settings = StoredSettings(self._defaults | (settings or {}))
+        self.settings = self._defaults | (settings or {})
         self._realtime: dict[int, Callable[[], None]] = {
             ord("?"): self._report,
             ord("!"): self._hold,
@@ -101,9 +72,15 @@ class SimulatedGrbl(SimulatedFirmware):
             0x84: self.open_door,
             0x85: self._cancel_jog,
         }
-        x, y = (Axis(-length - 5.0, 2.0, -0.5 * length, play_mm) for length in self.settings.travel_mm())
-        mechanics = Mechanics(clock, (x, y), 1.0 / self.settings.number(100), 1.0, on_switch=self._switch_hit)
+        x, y = (Axis(-length - 5.0, 2.0, -0.5 * length, play_mm) for length in self._travel_mm())
+        mechanics = Mechanics(clock, (x, y), 1.0 / self._number(100), 1.0, on_switch=self._switch_hit)
         super().__init__(clock, wire, mechanics, boot_s)
+
+    def _number(self, setting: int) -> float:
+        return float(self.settings[setting])
+
+    def _travel_mm(self) -> tuple[float, float]:
+        return self._number(130), self._number(131)
 
     def _reset_state(self) -> None:
         self.work_offset, self._reports_to_offset = (0.0, 0.0, 0.0), 0
@@ -145,7 +122,7 @@ class SimulatedGrbl(SimulatedFirmware):
             self._greet()
 
     def _booted(self) -> None:
-        self.state = "Alarm" if self.settings.number(22) else "Idle"
+        self.state = "Alarm" if self._number(22) else "Idle"
         self._greet()
 
     def _greet(self) -> None:
@@ -205,7 +182,7 @@ class SimulatedGrbl(SimulatedFirmware):
         self._run_lines()
 
     def _switch_hit(self) -> None:
-        if self.settings.number(21):
+        if self._number(21):
             self.alarm(1)
 
     def _report(self) -> None:
@@ -217,7 +194,7 @@ class SimulatedGrbl(SimulatedFirmware):
             self._reports_to_offset = _OFFSET_EVERY_BUSY if busy else _OFFSET_EVERY_IDLE
         self._reports_to_offset -= 1
         here = (*self.mechanics.commanded_mm(), 0.0)
-        is_machine = int(self.settings.number(10)) & 1 == 1
+        is_machine = int(self._number(10)) & 1 == 1
         values = here if is_machine else tuple(map(sub, here, self.work_offset))
         fields = [self._reported_state(), f"{'MPos' if is_machine else 'WPos'}:{_vector(values)}", "FS:0,0"]
         if pins := self._pins():
@@ -293,6 +270,12 @@ class SimulatedGrbl(SimulatedFirmware):
         """Return how far from the ends of the travel the soft limits lie."""
         return 0.0
 
+    def _allows(self, target: Sequence[float]) -> bool:
+        """Return whether the soft limits, if enabled, allow a machine position."""
+        margin_mm = self._margin_mm()
+        ways = zip(self._travel_mm(), target, strict=True)
+        return all(margin_mm - length <= value <= -margin_mm for length, value in ways) or not self._number(20)
+
     def _jog(self, text: str) -> int:
         if self.state not in ("Idle", "Jog"):
             return 9
@@ -304,7 +287,7 @@ class SimulatedGrbl(SimulatedFirmware):
         if not parsed.keys() & {"X", "Y"}:
             return 16
         target = self._target(parsed, relative="G91" in text, machine="G53" in text)
-        if not self.settings.allows(target, self._margin_mm()):
+        if not self._allows(target):
             return 15
         self._queue(target, parsed["F"], "Jog")
         return 0
@@ -321,7 +304,7 @@ class SimulatedGrbl(SimulatedFirmware):
         if not parsed.keys() & {"X", "Y"}:
             return 26
         target = self._target(parsed, relative=False, machine="G53" in line)
-        if not self.settings.allows(target, self._margin_mm()):
+        if not self._allows(target):
             self.alarm(2)
         else:
             self._queue(target, parsed.get("F", _RAPID_MM_PER_MIN), "Run")
@@ -335,19 +318,22 @@ class SimulatedGrbl(SimulatedFirmware):
 
     def _queue(self, target: Vector, feed_mm_per_min: float, state: str) -> None:
         start = self.mechanics.planned_mm()
-        self.mechanics.queue(target, *self.settings.speed_and_acceleration(start, target, feed_mm_per_min))
+        speed = min(feed_mm_per_min, along((self._number(110), self._number(111)), start, target)) / 60.0
+        self.mechanics.queue(target, speed, along((self._number(120), self._number(121)), start, target))
         self.state = state if self.mechanics.moving else "Idle"
 
     def _home(self, axes: Sequence[int]) -> int | None:
         """Start homing: the axes seek at once, back off, and find the switch again slowly."""
-        if not self.settings.number(22):
+        if not self._number(22):
             return 5
-        reach_mm = 1.5 * max(self.settings.travel_mm())
+        reach_mm = 1.5 * max(self._travel_mm())
         farthest_mm = max(self._distances_to_switches(axes, reach_mm))
+        seek, locate, pull_off = self._number(25) / 60.0, self._number(24) / 60.0, self._number(27)
+        seek_s = min(farthest_mm, reach_mm) / seek + 2.0 * pull_off / seek
+        duration_s = seek_s + pull_off / locate + 4.0 * self._number(26) / 1000.0
         self.state = "Home"
         fail = (lambda: self.alarm(9)) if farthest_mm == math.inf else None
-        position_mm = -self.settings.number(27)
-        self._start_homing(axes, position_mm, self.settings.homing_s(min(farthest_mm, reach_mm)), fail)
+        self._start_homing(axes, -pull_off, duration_s, fail)
         return None
 
     def _homed(self, axes: Iterable[int]) -> None:

@@ -54,7 +54,7 @@ class SimulatedGrblHal(SimulatedGrbl):
     def _booted(self) -> None:
         self.state = "Idle"
         self._greet()
-        if int(self.settings.number(22)) & 4:
+        if int(self._number(22)) & 4:
             self.alarm(_HOMING_REQUIRED)
         if self.emergency_stop:
             self.alarm(10)
@@ -73,10 +73,10 @@ class SimulatedGrblHal(SimulatedGrbl):
         return ("[VER:1.1f.20250225:]", f"[OPT:VNM{single}L,100,1024,3,0]", "[AXS:3:XYZ]", "[FIRMWARE:grblHAL]")
 
     def _homes_singly(self) -> bool:
-        return bool(int(self.settings.number(22)) & 2)
+        return bool(int(self._number(22)) & 2)
 
     def _margin_mm(self) -> float:
-        return self.settings.number(27) if int(self.settings.number(21)) & 1 else 0.0
+        return self._number(27) if int(self._number(21)) & 1 else 0.0
 
     def _reported_state(self) -> str:
         return f"Alarm:{self._alarm}" if self.state == "Alarm" and self._alarm else self.state

@@ -128,21 +128,10 @@ def interpolate(start: Vector, end: Vector, share: float) -> Vector:
 
 @dataclass
 class Axis:
-    """One drive and its carriage, in coordinates whose origin is at the switch.
+    """One drive and its carriage, between two ends of the travel, in coordinates whose origin is at the switch.
 
-    Parameters
-    ----------
-    low_mm, high_mm, carriage_mm : float
-        Ends of the mechanical travel, and position of the carriage.
-    play_mm : float
-        Distance that the motor turns after a reversal before the carriage follows.
-
-    Attributes
-    ----------
-    slip_mm : float
-        Position of the carriage minus the count, without play; the controller does not know it.
-    stuck : bool
-        Whether the carriage stays in place when the motor turns.
+    The motor turns by `play_mm` after a reversal before the carriage follows; if the axis is stuck, it does not.
+    `slip_mm` is the position of the carriage minus the count, without play, which the controller does not know.
     """
 
     low_mm: float
@@ -171,18 +160,9 @@ class Axis:
 class Mechanics:
     """The mechanics of a stage with two axes, whose motions are queued and run one by one, each from rest to rest.
 
-    Parameters
-    ----------
-    clock, axes : SimulatedClock, (Axis, Axis)
-        The simulated time; x and y.
-    step_mm : float
-        Distance of one motor step.
-    switch_sign : float
-        1 if the homing switches, which close at 0 mm, are at the upper ends of the travel, −1 if at the lower ends.
-    on_idle, on_switch : callable
-        Called when the last motion ends, and when a motion closes a switch.
-    endless : bool
-        Whether motions never end, as a fault.
+    `switch_sign` is 1 if the homing switches, which close at 0 mm, are at the upper ends of the travel, −1 if at the
+    lower ends. `on_idle` is called when the last motion ends, `on_switch` when a motion closes a switch. With the fault
+    `endless`, motions never end.
     """
 
     clock: SimulatedClock

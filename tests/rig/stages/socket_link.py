@@ -2,11 +2,12 @@
 
 import socket
 
+from faintfield.rig.simulation.controller.bench import Link
 from faintfield.rig.stages.transport import Port, SerialPort
 from tests.patience import HANG_S
 
 
-class SocketLink:
+class SocketLink(Link):
     """A TCP connection on this computer, as to a serial device server; pyserial opens it by `socket://`."""
 
     def __init__(self) -> None:
@@ -14,12 +15,6 @@ class SocketLink:
         self._far: socket.socket | None = None
         self._address = ("127.0.0.1", 0)
         self.plug()
-
-    @property
-    def url(self) -> str:
-        """URL that the driver opens."""
-        host, port = self._address
-        return f"socket://{host}:{port}"
 
     def open(self) -> Port:
         """Open the host's end with pyserial."""
@@ -49,6 +44,7 @@ class SocketLink:
             self._listener = socket.create_server(self._address, reuse_port=True)
             self._listener.settimeout(HANG_S)
             self._address = self._listener.getsockname()[:2]
+            self.url = "socket://{}:{}".format(*self._address)
 
     def unplug(self) -> None:
         """Pull the cable out."""

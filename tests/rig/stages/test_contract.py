@@ -7,7 +7,7 @@ import pytest
 
 from faintfield.rig.devices import open_stage
 from faintfield.rig.plan import Grid
-from faintfield.rig.simulation.controller.bench import Bench, DirectLink, Link, PtyLink
+from faintfield.rig.simulation.controller.bench import Bench, Link, PtyLink
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.stages.conformance import check_conformance
 from faintfield.rig.stages.gantry import Gantry
@@ -19,7 +19,7 @@ from tests.rig.stages.socket_link import SocketLink
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)
-@pytest.mark.parametrize("make_link", [DirectLink, PtyLink, SocketLink])
+@pytest.mark.parametrize("make_link", [Link, PtyLink, SocketLink])
 def test_contract(controller: Controller, make_link: Callable[[], Link]) -> None:
     link = make_link()
     stage_contract(Bench(controller, link).stage())

@@ -7,7 +7,7 @@ import pytest
 
 from faintfield.rig.devices import open_stage
 from faintfield.rig.errors import StageLost, StageTimeout
-from faintfield.rig.simulation.controller.bench import Bench, DirectLink, PtyLink
+from faintfield.rig.simulation.controller.bench import Bench, Link, PtyLink
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.kinematics import SimulatedClock
 from faintfield.rig.stages.protocol import StageSettings
@@ -23,8 +23,8 @@ def pty() -> Iterator[PtyLink]:
     link.close()
 
 
-def open_line() -> tuple[DirectLink, LineTransport]:
-    link = DirectLink()
+def open_line() -> tuple[Link, LineTransport]:
+    link = Link()
     line = LineTransport(link.open, SimulatedClock())
     line.open()
     return link, line
