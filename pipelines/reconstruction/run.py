@@ -3,7 +3,6 @@
 import shutil
 import time
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -32,17 +31,13 @@ from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, in_uni
 from faintfield.pipelines.formats.sets.ground_truth import read_truth
 from faintfield.pipelines.formats.units import StatedUnits
 from faintfield.pipelines.reconstruction.accuracy import assess, write_depth_errors
-from faintfield.pipelines.reconstruction.channels import SHARE_OF_DISK, channel_layouts, keeping_frames
-from faintfield.pipelines.reconstruction.depth.depth_map import (
-    check_light,
-    check_sweep,
-    kept_depth_map,
-    write_depth_map,
-)
+from faintfield.pipelines.reconstruction.channels import SHARE_OF_DISK, channel_layouts
+from faintfield.pipelines.reconstruction.depth.depth_map import kept_depth_map, write_depth_map
+from faintfield.pipelines.reconstruction.depth.search import check_overlap, check_views, default_bins, depths_of_set
 from faintfield.pipelines.reconstruction.operators import default_pitch_px, plane_grid, tilted_grid
 from faintfield.pipelines.reconstruction.overview import look_at, write_overview
 from faintfield.pipelines.reconstruction.planes.sweep import Runner, Sweep, run_serially
-from faintfield.pipelines.reconstruction.request import Request, distinct_depths, folder_of_method
+from faintfield.pipelines.reconstruction.request import Request, folder_of_method
 from faintfield.recon.operator.grid import PlaneGrid
 
 # Planes whose mean is at most this, in electrons per pixel, count as black.
@@ -71,25 +66,26 @@ def reconstruct_set(elemental_set: ElementalSet, out: Path, request: Request, ru
     depth map is asked for, and a folder of planes holds a surface, whose files have the same names.
     """
     started = time.monotonic()
-    depths, methods = distinct_depths(request.depths_mm, elemental_set), list(dict.fromkeys(request.methods))
     found = in_units(elemental_set, request.found) if request.found else None
-    request = replace(request, depths_mm=depths, methods=methods)
-    elemental_set = keeping_frames(elemental_set, out)
     _refuse_pitch(elemental_set, request)
-    folders = {name: folder_of_method(out, name, methods) for name in methods}
+    folders = {name: folder_of_method(out, name, request.methods) for name in request.methods}
+    range_mm = min(request.depths_mm, default=0.0), max(request.depths_mm, default=0.0)
     if request.with_depth_map:
         _refuse_surfaces(list(folders.values()))
-        check_sweep(elemental_set, depths)
+        check_views(elemental_set, "a depth map")
+        check_overlap(elemental_set, range_mm)
     sweep = _sweep(elemental_set, folders, request)
-    glance = look_at(elemental_set)  # here, as what is wrong with a set is to be found before its planes are made
+    overview = look_at(elemental_set)  # here, as what is wrong with a set is to be found before its planes are made
     read_truth(elemental_set.folder)
-    if request.with_depth_map and kept_depth_map(folders, sweep.origins) is None:
-        check_light(elemental_set, depths, out)
+    depth_map = kept_depth_map(folders, sweep.origins) if request.with_depth_map else None
+    estimate = None
+    if request.with_depth_map and depth_map is None:
+        _, estimate = depths_of_set(elemental_set, default_bins(elemental_set), range_mm, out)
     _make_planes(sweep, folders, out, runner)
-    write_overview(glance, out)
-    depth_map = None
-    if request.with_depth_map:
-        depth_map = write_depth_map(elemental_set, sweep.written, request.disparities_px, sweep.origins)
+    write_overview(overview, out)
+    if estimate is not None:
+        depth_map = write_depth_map(elemental_set, estimate, sweep.written, request.disparities_px, sweep.origins)
+    if depth_map is not None:
         for folder in folders.values():
             write_depth_errors(elemental_set, folder, depth_map.file, depth_map.unit)
     metrics = assess(elemental_set, sweep.written)

@@ -148,12 +148,6 @@ def views_of_search(elemental_set: ElementalSet, range_mm: tuple[float, float], 
         return binned_views(elemental_set, _searched_depths(range_mm)[_DEPTHS // 2], out, min_bins_px=least_px)
 
 
-def imported_range_px(elemental_set: ElementalSet) -> tuple[float, float] | None:
-    """Return the range of disparities that an import found, None if it found none."""
-    arrangement = elemental_set.settings.arrangement
-    return None if arrangement is None else arrangement.disparity_range_px
-
-
 def searched_range_mm(elemental_set: ElementalSet) -> tuple[float, float]:
     """Return the nearest and farthest depth at which a set can show anything.
 
@@ -164,9 +158,9 @@ def searched_range_mm(elemental_set: ElementalSet) -> tuple[float, float]:
     baseline_mm = float(np.linalg.norm(elemental_set.poses_rt_cam_ref[:, 3:], axis=1).max())
     if baseline_mm <= 0:
         raise NothingInFocus("all views were taken from one place, which tells no depths apart; give --depth")
-    imported_px = imported_range_px(elemental_set)
-    if imported_px is not None:
-        return _range_of_disparities(elemental_set, *imported_px)
+    arrangement = elemental_set.settings.arrangement
+    if arrangement is not None and arrangement.disparity_range_px is not None:
+        return _range_of_disparities(elemental_set, *arrangement.disparity_range_px)
     depths = np.geomspace(0.3 * baseline_mm, 1000 * baseline_mm, _OVERLAP_DEPTHS)
     shared = np.array([overlap(elemental_set, depth) for depth in depths])
     best = int(shared.argmax())

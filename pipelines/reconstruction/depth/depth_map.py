@@ -2,7 +2,6 @@
 
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -16,7 +15,10 @@ from faintfield.pipelines.formats.image_files import ONE_PIXEL, encoded, grey_le
 from faintfield.pipelines.formats.results.plane_files import Origin, read_current
 from faintfield.pipelines.formats.results.records import DEPTH_MAP_FILE, DepthMapFileRecord, DepthMapRecord, Method
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, unit_of_maps
+from faintfield.pipelines.reconstruction.depth.search import default_bins, enlarged, in_unit
 from faintfield.pipelines.reconstruction.operators import plane_grid
+from faintfield.recon.surface.confidence import SURE
+from faintfield.recon.surface.estimate import SurfaceEstimate
 
 # The file of the depths by their unit.
 _FILES = {"mm": "depth_mm.tiff", "px": "disparity_px.tiff", "relative": "depth.tiff"}
@@ -39,44 +41,6 @@ _QUANTILES = (0.01, 0.99)
 _MIN_RANGE = 1e-3
 
 
-@dataclass(frozen=True)
-class _Map:
-    """A depth map on the samples of the reference view, each array (row, column).
-
-    `limits` are those of the sweep in the unit of the record, ascending. `index` says between which planes each sample
-    lies, even where nothing is known. `values` are in the unit of the record, NaN where nothing is known, and
-    `confidence` is the probability that they are right.
-    """
-
-    record: DepthMapRecord
-    limits: tuple[float, float]
-    index: NDArray[np.float64]
-    values: NDArray[np.float64]
-    confidence: NDArray[np.float64]
-
-
-def check_sweep(elemental_set: ElementalSet, depths_mm: Sequence[float]) -> None:
-    """Refuse a set or a sweep that can have no depth map, before its planes are made.
-
-    Raises BadValue for too few or too small views, GeometryMismatch if they share too little at the depths of the
-    sweep, and NothingInFocus if all were taken from one place.
-    """
-    from faintfield.pipelines.reconstruction.depth.search import check_overlap, check_views
-
-    check_views(elemental_set, "a depth map")
-    check_overlap(elemental_set, (min(depths_mm), max(depths_mm)))
-
-
-def check_light(elemental_set: ElementalSet, depths_mm: Sequence[float], out: Path) -> None:
-    """Refuse views that agree no better than shuffled ones in a sweep (NothingInFocus).
-
-    `out` is for a temporary file if memory is short.
-    """
-    from faintfield.pipelines.reconstruction.depth.search import check_agreement
-
-    check_agreement(elemental_set, (min(depths_mm), max(depths_mm)), out)
-
-
 def kept_depth_map(folders: Mapping[Method, Path], origins: Mapping[Method, Origin]) -> DepthMapRecord | None:
     """Return the record of the maps if each method's folder has those of its provenance."""
     kept = [
@@ -87,38 +51,43 @@ def kept_depth_map(folders: Mapping[Method, Path], origins: Mapping[Method, Orig
 
 def write_depth_map(
     elemental_set: ElementalSet,
+    estimate: SurfaceEstimate,
     planes: Mapping[tuple[Method, float], Path],
     disparities_px: Mapping[float, float],
     origins: Mapping[Method, Origin],
 ) -> DepthMapRecord:
     """Write the maps and the all-in-focus picture into each folder of planes, and return their record.
 
-    Depths and their confidence are those of `reconstruct --surface` in the range of the sweep; in px if all depths have
-    a disparity. Maps of the same provenance are kept. Raises GeometryMismatch if the range is too wide, or views, poses
-    and range do not fit together.
+    The estimate is that of `depths_of_set` in the range of the sweep; maps are in px if all depths have a disparity.
     """
-    folders = {method: path.parent for (method, _), path in planes.items()}
-    kept = kept_depth_map(folders, origins)
-    if kept is not None:
-        return kept
     depths = sorted({depth for _, depth in planes})
-    found = _map_of(elemental_set, depths, disparities_px)
-    for method, folder in folders.items():
+    record, index, pictures = _maps(elemental_set, estimate, depths, disparities_px)
+    for method, folder in {method: path.parent for (method, _), path in planes.items()}.items():
         remove(folder / DEPTH_MAP_FILE)
-        sharp = _all_in_focus([planes[method, depth] for depth in depths], found.index)
-        hashes = _write_maps(folder, found, sharp)
-        vouching = DepthMapFileRecord(1, found.record, hashes, **msgspec.structs.asdict(origins[method]))
+        sharp = _all_in_focus([planes[method, depth] for depth in depths], index)
+        preview = encoded(grey_levels(sharp, white_level(sharp)), ".png")
+        hashes: dict[str, str] = {}
+        for name, (values, picture) in (pictures | {record.all_in_focus: (sharp, preview)}).items():
+            path = folder / name
+            write_plane(path, values, ONE_PIXEL)
+            write_whole(path.with_suffix(".png"), picture)
+            hashes |= {written.name: sha256(written) for written in (path, path.with_suffix(".png"))}
+        vouching = DepthMapFileRecord(1, record, hashes, **msgspec.structs.asdict(origins[method]))
         write_record(folder / DEPTH_MAP_FILE, vouching)
-    return found.record
+    return record
 
 
-def _map_of(elemental_set: ElementalSet, depths_mm: Sequence[float], disparities_px: Mapping[float, float]) -> _Map:
-    # Here, because planes need none of it
-    from faintfield.pipelines.reconstruction.depth.search import default_bins, depths_of_set, enlarged, in_unit
-    from faintfield.recon.surface.confidence import SURE
+def _maps(
+    elemental_set: ElementalSet,
+    estimate: SurfaceEstimate,
+    depths_mm: Sequence[float],
+    disparities_px: Mapping[float, float],
+) -> tuple[DepthMapRecord, NDArray[np.float64], dict[str, tuple[NDArray[np.floating], bytes]]]:
+    """Return the record, between which planes each sample (row, column) lies, and depths and confidence by file name.
 
+    Each map has its preview. Depths are NaN where they are not known.
+    """
     bins, shape = default_bins(elemental_set), plane_grid(elemental_set, 1.0).shape
-    _, estimate = depths_of_set(elemental_set, bins, (depths_mm[0], depths_mm[-1]), find_range=False)
     inverse_depth, confidence = (enlarged(part, shape, bins) for part in (estimate.inverse_depth, estimate.confidence))
     unit = unit_of_maps(elemental_set.units, as_px=bool(disparities_px))
     scale = [
@@ -136,27 +105,13 @@ def _map_of(elemental_set: ElementalSet, depths_mm: Sequence[float], disparities
         sure_share=float(known.mean()),
         median=float(np.median(values[known])) if known.any() else None,
     )
-    index = np.interp(-inverse_depth, -1 / np.asarray(depths_mm), np.arange(len(depths_mm)))
-    return _Map(record, (min(scale), max(scale)), index, np.where(known, values, np.nan), confidence)
-
-
-def _write_maps(folder: Path, depth_map: _Map, sharp: NDArray[np.float32]) -> dict[str, str]:
-    """Write the maps and the all-in-focus picture with their previews; return their hashes by file name."""
-    record = depth_map.record
-    label = "disparity (px)" if record.unit == "px" else f"depth ({record.unit})"
+    values = np.where(known, values, np.nan)
+    label = "disparity (px)" if unit == "px" else f"depth ({unit})"
     pictures: dict[str, tuple[NDArray[np.floating], bytes]] = {
-        record.file: (depth_map.values, map_picture(depth_map.values, label, *depth_map.limits)),
-        record.confidence: (
-            depth_map.confidence,
-            map_picture(depth_map.confidence, "probability of the depth", 0.0, 1.0),
-        ),
-        record.all_in_focus: (sharp, encoded(grey_levels(sharp, white_level(sharp)), ".png")),
+        record.file: (values, map_picture(values, label, min(scale), max(scale))),
+        record.confidence: (confidence, map_picture(confidence, "probability of the depth", 0.0, 1.0)),
     }
-    for name, (values, picture) in pictures.items():
-        write_plane(folder / name, values, ONE_PIXEL)
-        write_whole((folder / name).with_suffix(".png"), picture)
-    files = [path for name in pictures for path in (folder / name, (folder / name).with_suffix(".png"))]
-    return {path.name: sha256(path) for path in files}
+    return record, np.interp(-inverse_depth, -1 / np.asarray(depths_mm), np.arange(len(depths_mm))), pictures
 
 
 def _all_in_focus(paths: Sequence[Path], index: NDArray[np.floating]) -> NDArray[np.float32]:

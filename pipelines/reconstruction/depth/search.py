@@ -19,7 +19,7 @@ from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.frames import Lattice
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.channels import ChannelLayout, channel_layouts, lattice_noise, view_electrons
-from faintfield.pipelines.reconstruction.depth.autofocus import overlap, searched_range_mm, views_of_search
+from faintfield.pipelines.reconstruction.depth.autofocus import overlap, views_of_search
 from faintfield.pipelines.reconstruction.depth.comparison import BETWEEN_PIXELS, check_places
 from faintfield.pipelines.reconstruction.operators import plane_grid, principal_shift, response_of
 from faintfield.recon.errors import GeometryMismatch, NothingInFocus
@@ -177,25 +177,6 @@ def check_views(elemental_set: ElementalSet, purpose: str) -> None:
         )
 
 
-def limits_mm(elemental_set: ElementalSet, range_mm: tuple[float, float] | None) -> tuple[float, float]:
-    """Return the nearest and farthest depth to consider: those of a range, or where the views overlap.
-
-    Raises GeometryMismatch if the views share too little in a given range, NothingInFocus if they overlap nowhere.
-    """
-    if range_mm is None:
-        return searched_range_mm(elemental_set)
-    check_overlap(elemental_set, range_mm)
-    return range_mm
-
-
-def check_agreement(elemental_set: ElementalSet, range_mm: tuple[float, float], out: Path) -> None:
-    """Refuse views that agree no better than shuffled ones in a range of depths (NothingInFocus).
-
-    `out` is for a temporary file if memory is short.
-    """
-    check_places(views_of_search(elemental_set, range_mm, out), range_mm)
-
-
 def check_overlap(elemental_set: ElementalSet, range_mm: tuple[float, float]) -> None:
     """Refuse a range of depths, nearest and farthest, at which the views share too little (GeometryMismatch)."""
     near_mm, far_mm = range_mm
@@ -214,16 +195,15 @@ def depths_of_set(
     elemental_set: ElementalSet,
     bins: int,
     range_mm: tuple[float, float],
+    out: Path,
     *,
-    find_range: bool,
-    out: Path | None = None,
+    find_range: bool = False,
 ) -> tuple[NDArray[np.float64], SurfaceEstimate]:
     """Return the 1/depths that are compared, ascending, and the depth of each sample of the bins by them.
 
     The samples are those of `between_pixels`; `enlarged` brings their maps to the pixels. With `find_range` the range
-    of the scene is searched first. With `out`, the views must agree better than shuffled ones; by default
-    `check_agreement` tested that. Raises GeometryMismatch if the range is too wide, or views, poses and range do not
-    fit together, and NothingInFocus if nothing is found.
+    of the scene is searched first. `out` is for a temporary file. Raises GeometryMismatch if the range is too wide, or
+    views, poses and range do not fit together, and NothingInFocus if nothing is found, or shuffled views agree as well.
     """
     nodes, views = nodes_of(elemental_set), between_pixels(luminance(elemental_set, bins))
     near, far = 1 / range_mm[0], 1 / range_mm[1]
@@ -233,8 +213,7 @@ def depths_of_set(
                 far, near = found_range(views, nodes, far, near)
         depths = equal_steps(views, far, near)
         _check_steps(views, depths)
-    if out is not None:
-        check_agreement(elemental_set, range_mm, out)
+    check_places(views_of_search(elemental_set, range_mm, out), range_mm)
     with naming_range(elemental_set, far, near):
         inform(f"surface {_between(elemental_set, far, near)}: comparing {len(depths)} depths")
         with working("finding the depths of the surface"):

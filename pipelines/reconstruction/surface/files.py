@@ -75,11 +75,6 @@ class SurfaceMaps:
     picture_proposal: NDArray[np.floating] | None = None
     picture_moved: NDArray[np.floating] | None = None
 
-    def __post_init__(self) -> None:
-        for name, values in vars(self).items():
-            if isinstance(values, np.ndarray) and values.shape[:2] != self.grid.shape:
-                raise ValueError(f"{name} has shape {values.shape}, the grid has {self.grid.shape}")
-
 
 def write_surface(
     folder: Path, maps: SurfaceMaps, facts: SurfaceFacts, origin: Provenance[SurfaceOptions]

@@ -31,17 +31,16 @@ from faintfield.pipelines.reconstruction.channels import (
     SHARE_OF_DISK,
     ChannelLayout,
     channel_layouts,
-    keeping_frames,
     load_channel,
 )
-from faintfield.pipelines.reconstruction.depth.autofocus import imported_range_px
+from faintfield.pipelines.reconstruction.depth.autofocus import searched_range_mm
 from faintfield.pipelines.reconstruction.depth.search import (
+    check_overlap,
     check_views,
     default_bins,
     depths_of_set,
     enlarged,
     in_unit,
-    limits_mm,
     naming_range,
 )
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
@@ -82,8 +81,11 @@ def reconstruct_surface(
         The views tell no depths, agree no better than shuffled ones, or show nothing in the range.
     """
     started = time.monotonic()
-    _check(elemental_set, out)
-    elemental_set = keeping_frames(elemental_set, out)
+    check_views(elemental_set, "a surface")
+    if (out / DEPTH_MAP_FILE).exists():
+        raise OutputExists(
+            f"{out}: holds the depth map of a sweep, whose files have the names of the surface's; give another --out"
+        )
     unit = unit_of_maps(elemental_set.units, as_px=request.unit == "px")
     options = in_units(elemental_set, request.options(elemental_set.poses))
     origin = provenance("reconstruct", options, elemental_set.input_hashes(), elemental_set.units)
@@ -94,11 +96,15 @@ def reconstruct_surface(
     grid = plane_grid(elemental_set, 1.0)
     needed_bytes = _needed_bytes(grid.shape, len(layouts), proposal=request.solver.proposal)
     require_room(out, int(needed_bytes / (1 - SHARE_OF_DISK)))  # decoded frames take the rest
-    range_mm = limits_mm(elemental_set, request.depth_range_mm)
-    find_range = request.depth_range_mm is None and imported_range_px(elemental_set) is None
+    range_mm, arrangement = request.depth_range_mm, elemental_set.settings.arrangement
+    find_range = range_mm is None and (arrangement is None or arrangement.disparity_range_px is None)
+    if range_mm is None:
+        range_mm = searched_range_mm(elemental_set)
+    else:
+        check_overlap(elemental_set, range_mm)
     remove_leftovers(out)
     bins = default_bins(elemental_set)
-    depths, estimate = depths_of_set(elemental_set, bins, range_mm, find_range=find_range, out=out)
+    depths, estimate = depths_of_set(elemental_set, bins, range_mm, out, find_range=find_range)
     far, near = float(depths[0]), float(depths[-1])
     inverse_depth = enlarged(estimate.inverse_depth, grid.shape, bins)
     with naming_range(elemental_set, far, near):
@@ -124,14 +130,6 @@ def reconstruct_surface(
     record = write_surface(out, maps, facts, origin)
     write_depth_errors(elemental_set, out, record.depth, record.unit)
     return record
-
-
-def _check(elemental_set: ElementalSet, out: Path) -> None:
-    check_views(elemental_set, "a surface")
-    if (out / DEPTH_MAP_FILE).exists():
-        raise OutputExists(
-            f"{out}: holds the depth map of a sweep, whose files have the names of the surface's; give another --out"
-        )
 
 
 def _needed_bytes(shape: tuple[int, int], colours: int, *, proposal: bool) -> int:

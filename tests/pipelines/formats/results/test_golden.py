@@ -11,7 +11,6 @@ from faintfield.pipelines.formats.results.geometry import GeometryRecord
 from faintfield.pipelines.formats.results.noise import NoiseRecord
 from faintfield.pipelines.formats.results.records import DepthMapFileRecord, PlaneFileRecord, ReconstructionRecord
 from faintfield.pipelines.formats.results.surface import SurfaceFileRecord
-from faintfield.recon.surface import confidence
 from tests.pipelines.conftest import Command
 from tests.pipelines.forms import GOLDEN as GOLDEN
 from tests.pipelines.forms import form_of_result
@@ -56,7 +55,7 @@ def test_golden_file_is_written_as_it_was_read(path: Path, tmp_path: Path) -> No
 def test_fresh_results_have_the_form_of_golden_ones(
     call: str, seen: Searches, bright_scene: Path, tmp_path: Path, done: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(confidence, "SURE", 0.9 * FOUND_CONFIDENCE)
+    monkeypatch.setattr("faintfield.pipelines.reconstruction.depth.depth_map.SURE", 0.9 * FOUND_CONFIDENCE)
     options, names = FRESH[call]
     done("reconstruct", bright_scene, "--out", tmp_path, *options)
     for name in names:

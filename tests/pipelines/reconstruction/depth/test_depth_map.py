@@ -26,7 +26,6 @@ from faintfield.pipelines.reconstruction.accuracy import write_depth_errors
 from faintfield.pipelines.reconstruction.depth.autofocus import searched_range_mm
 from faintfield.pipelines.reconstruction.depth.comparison import binned_views
 from faintfield.recon.depth.focus import SURE
-from faintfield.recon.surface import confidence
 from tests.pipelines.conftest import Command, Edit, SetMaker, assert_refused, run_undrawn
 from tests.pipelines.forms import read_record
 from tests.pipelines.surfaces import FOUND_CONFIDENCE, FOUND_MM, Searches
@@ -119,7 +118,7 @@ def test_only_damaged_maps_are_made_again(seen: Searches, simulated_scene: Path,
 def test_disparities_and_colours_are_kept(
     seen: Searches, colour_set: Path, tmp_path: Path, done: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(confidence, "SURE", 0.9 * FOUND_CONFIDENCE)
+    monkeypatch.setattr("faintfield.pipelines.reconstruction.depth.depth_map.SURE", 0.9 * FOUND_CONFIDENCE)
     out = tmp_path / "out"
     done("reconstruct", colour_set, "--out", out, "--sweep-px", "-9:-5:5", *SWEEP[2:])
     assert read_frame(out / "all_in_focus.tiff").pixels_dn.shape == (48, 64, 3)
@@ -273,7 +272,7 @@ def test_reconstruction_with_depth_writes_its_errors(
 ) -> None:  # fmt: skip
     out = tmp_path / "out"
     bring_truth(scene, np.full((72, 96), FOUND_MM * 1.25))
-    monkeypatch.setattr(confidence, "SURE", 0.9 * FOUND_CONFIDENCE)
+    monkeypatch.setattr("faintfield.pipelines.reconstruction.depth.depth_map.SURE", 0.9 * FOUND_CONFIDENCE)
     message = done("reconstruct", scene, "--out", out, *options).stderr
     assert seen
     written = json.loads((out / "depth_errors.json").read_text())
