@@ -182,7 +182,7 @@ def _pages(panel: CapturePanel, frames: SessionFrames | None, planes: PlanesClie
         status, row, column = panel.status, request.path_params["row"], request.path_params["column"]
         if frames is None or status is None:
             return Response(status_code=404)
-        return _json(msgspec.to_builtins(frames.at(status.step - 1, (row, column))))
+        return _json(frames.at(status.step - 1, (row, column)))
 
     async def press(request: Request) -> Response:
         try:

@@ -8,7 +8,7 @@ import itertools
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from queue import Empty, SimpleQueue
-from typing import get_args
+from typing import Any, get_args
 
 from msgspec import Struct
 
@@ -102,26 +102,21 @@ class CapturePanel:
             callback()
 
 
-class FrameSummary(Struct, frozen=True):
-    """A frame that was taken: its name, position of the stage in mm, and time of writing in s since 1970."""
-
-    name: str
-    position_mm: tuple[float, float]
-    exposure_s: float
-    written_s: float | None
-    values: dict[str, float]
-
-
 class SessionFrames:
     """The valid frames of an open session, whose capture goes on in another thread."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
 
-    def at(self, step: int, node: tuple[int, int]) -> list[FrameSummary]:
-        """Return the frames of a step at a node, in the order of the plan."""
+    def at(self, step: int, node: tuple[int, int]) -> list[dict[str, Any]]:
+        """Return the frames of a step at a node, in the order of the plan, as JSON objects."""
         return [
-            self._summary(frame, planned)
+            {
+                "name": planned.name,
+                "position_mm": list(frame.record.position_mm),
+                "exposure_s": frame.record.exposure_s,
+                "written_s": self._written_s(frame),
+            }
             for frame, planned in self._valid()
             if planned.step == step and planned.stop.node == node
         ]
@@ -140,9 +135,8 @@ class SessionFrames:
         frames = sorted(self._session.valid().values(), key=lambda frame: frame.frame)
         return [(frame, self._session.frames[frame.frame]) for frame in frames]
 
-    def _summary(self, frame: CommittedFrame, planned: PlannedFrame) -> FrameSummary:
-        x_mm, y_mm = frame.record.position_mm
-        written_s = None
+    def _written_s(self, frame: CommittedFrame) -> float | None:
+        """Return when the file of a frame was written, in s since 1970."""
         with suppress(OSError):
-            written_s = self._session.path_of(frame).stat().st_mtime
-        return FrameSummary(planned.name, (x_mm, y_mm), frame.record.exposure_s, written_s, dict(frame.record.checks))
+            return self._session.path_of(frame).stat().st_mtime
+        return None

@@ -170,8 +170,7 @@ class Capture:
         device = "camera" if isinstance(failure, CameraError) else "stage"
         self._failures += 1
         self._pace.here = None
-        event = {"error": type(failure).__name__, "message": str(failure)}
-        self._session.journal.event(f"{device}_failed", frame=frame.number, **event)
+        self._record_failure(f"{device}_failed", frame, failure)
         self._dialogue.warn(f"{frame.name}: {failure}")
         unattended: Answer = "again" if self._failures < MAX_UNATTENDED_TRIES else "stop"
         answers: tuple[Answer, ...] = ("again", "skip", "stop")
@@ -194,9 +193,12 @@ class Capture:
                 self._rig.camera.open()
         except (StageError, CameraError, NotHomed, PlanRefused) as failure:
             self._unrecovered = failure
-            event = {"error": type(failure).__name__, "message": str(failure)}
-            self._session.journal.event("recovery_failed", frame=frame.number, device=device, **event)
+            self._record_failure("recovery_failed", frame, failure, device=device)
             self._dialogue.warn(f"{frame.name}: the {device} was not recovered: {failure}")
+
+    def _record_failure(self, kind: str, frame: PlannedFrame, failure: Exception, **detail: str) -> None:
+        detail |= {"error": type(failure).__name__, "message": str(failure)}
+        self._session.journal.event(kind, frame=frame.number, **detail)
 
     def _mark_unchecked(self, event: str) -> None:
         """Mark the frames at nodes that no drift check will confirm, since `event` came before it."""

@@ -16,7 +16,7 @@ from pathlib import Path
 import msgspec
 
 from faintfield.rig.errors import SessionCorrupt, SessionUnreadable, SessionUnwritable, in_one_line
-from faintfield.rig.session.disk import require_kind, translate_errors, translate_read_errors, write_new
+from faintfield.rig.session.disk import require_kind, translate_errors, write_new
 
 # Format of the sessions that are begun now. In format 1 the tables are not strict; format 2 has a chain of hashes over
 # all rows, which is not read any more.
@@ -89,7 +89,7 @@ def connect(path: Path, *, read_only: bool) -> sqlite3.Connection:
     Raises `SessionCorrupt` if it is missing, not a file of its own, or larger than any journal.
     """
     wal, shared_memory, rollback = _companions(path)
-    with translate_read_errors(path) if read_only else translate_errors(path):
+    with translate_errors(path, read_only=read_only):
         for file in (path, wal, shared_memory):
             require_kind(file, stat.S_ISREG, "file")
         if not path.exists():

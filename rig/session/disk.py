@@ -86,7 +86,7 @@ def list_names(folder: Path) -> list[str]:
 
     Raises `SessionCorrupt` if it is no folder, or a link, and `SessionUnreadable` if it cannot be listed.
     """
-    with translate_read_errors(folder):
+    with translate_errors(folder, read_only=True):
         require_kind(folder, stat.S_ISDIR, "folder")
         return sorted(os.listdir(folder)) if os.path.lexists(folder) else []
 
@@ -109,13 +109,12 @@ def lock_session(folder: Path, *, shared: bool = False) -> Iterator[None]:
     `SessionUnwritable` or, if shared, `SessionUnreadable` if it cannot be locked.
     """
     path = folder / "lock"
-    translated = translate_read_errors if shared else translate_errors
-    with translated(path):
+    with translate_errors(path, read_only=shared):
         require_kind(path, stat.S_ISREG, "file")
         access = os.O_RDONLY if shared else os.O_RDWR | os.O_CREAT
         descriptor = os.open(path, access | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
     try:
-        with translated(path):
+        with translate_errors(path, read_only=shared):
             try:
                 fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
             except BlockingIOError as failure:
@@ -131,25 +130,18 @@ def lock_session(folder: Path, *, shared: bool = False) -> Iterator[None]:
 
 
 @contextmanager
-def translate_errors(path: Path) -> Iterator[None]:
-    """Raise `SessionUnwritable` for an error of the operating system."""
+def translate_errors(path: Path, *, read_only: bool = False) -> Iterator[None]:
+    """Raise `SessionUnwritable`, or `SessionUnreadable` if `read_only`, for an error of the operating system."""
     try:
         yield
     except OSError as failure:
+        place, words = failure.filename or path, failure.strerror or failure
+        if read_only:
+            raise SessionUnreadable(
+                f"{place}: cannot be read ({words}); allow it to be read, or check the disk, and run the same command "
+                "again"
+            ) from failure
         remedy = _REMEDIES.get(failure.errno or 0, "see that the disk is whole and the path leads to a folder")
         raise SessionUnwritable(
-            f"{failure.filename or path}: {failure.strerror or failure}; what was committed is safe: {remedy}, and "
-            "run the same command again"
-        ) from failure
-
-
-@contextmanager
-def translate_read_errors(path: Path) -> Iterator[None]:
-    """Raise `SessionUnreadable` for an error of the operating system."""
-    try:
-        yield
-    except OSError as failure:
-        raise SessionUnreadable(
-            f"{failure.filename or path}: cannot be read ({failure.strerror or failure}); allow it to be read, or "
-            "check the disk, and run the same command again"
+            f"{place}: {words}; what was committed is safe: {remedy}, and run the same command again"
         ) from failure

@@ -18,7 +18,6 @@ from faintfield.rig.session.disk import (
     lock_session,
     set_aside,
     translate_errors,
-    translate_read_errors,
     write_new,
 )
 from faintfield.rig.session.journal import Begun, CommittedFrame, Journal
@@ -237,7 +236,7 @@ def _reconcile(session: Session, names: list[str], progress: Progress) -> None:
 
 def _is_intact(path: Path, digest: str) -> bool:
     """Return whether a frame's file is what was written; one that cannot be read may be, and is an error."""
-    with translate_read_errors(path):
+    with translate_errors(path, read_only=True):
         try:
             return sha256(path) == digest
         except OSError as failure:

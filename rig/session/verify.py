@@ -9,7 +9,7 @@ from msgspec import Struct
 
 from faintfield.rig.files import read_regular, sha256
 from faintfield.rig.plan import planned_frames
-from faintfield.rig.session.disk import list_names, lock_session, translate_read_errors
+from faintfield.rig.session.disk import list_names, lock_session, translate_errors
 from faintfield.rig.session.journal import Begun, CommittedFrame, Sealed, Suspect
 from faintfield.rig.session.session import (
     FRAMES,
@@ -130,7 +130,7 @@ def _compare(committed: list[CommittedFrame], digests: _Digests, foreign: Iterab
 
 def _compare_sums(folder: Path, committed: list[CommittedFrame], digests: _Digests) -> Iterator[str]:
     """Yield the disagreements between SHA256SUMS and the files; no file is opened because it is named there."""
-    with translate_read_errors(folder / SUMS):
+    with translate_errors(folder / SUMS, read_only=True):
         lines = read_regular(folder / SUMS, _MAX_SUMS_BYTES).decode(errors="backslashreplace").splitlines()
     sums = {name: digest for digest, _, name in (line.partition("  ") for line in lines)}
     frames = {

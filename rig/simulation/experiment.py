@@ -72,7 +72,7 @@ def surface_experiment(width_px: int = 640, height_px: int = 480) -> SimulatedEx
 
 
 def _paper_optics(width_px: int, height_px: int) -> SimulatedOptics:
-    """Return the paper's lens: the view of 800 px focal length at 640 px width, slight barrel distortion, off centre."""
+    """Return the paper's lens: the view of 800 px focal length at 640 px width, slight distortion, off centre."""
     f_px = 800.0 * width_px / 640.0
     return SimulatedOptics(
         size_px=(width_px, height_px),
