@@ -91,10 +91,7 @@ class CameraPoses(Struct, frozen=True, kw_only=True):
                     if start == here and end not in known:
                         known[end] = known[here] + sign * np.array(homing.shift_mm)
                         waiting.append(end)
-        if after not in known:
-            return None
-        x, y, z = known[after].tolist()
-        return x, y, z
+        return (*known[after].tolist(),) if after in known else None
 
 
 class PosesOfSession(CameraPoses, frozen=True, kw_only=True):

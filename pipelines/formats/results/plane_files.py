@@ -156,8 +156,7 @@ class PlaneFiles:
         """Return whether a record has an entry for each colour of this plane, and vouches for the files of each."""
         stated = [(plane.method, plane.channel, plane.file) for plane in record.planes]
         expected = [(self.method, channel, self.path.name) for channel in self.channels]
-        named = {name for plane in record.planes for name in plane.files}
-        return stated == expected and len(record.focus) == len(expected) and named <= record.sha256.keys()
+        return stated == expected and len(record.focus) == len(expected) and {*record.files} <= record.sha256.keys()
 
 
 def read_current[Record: (PlaneFileRecord, DepthMapFileRecord, SurfaceFileRecord, _Part)](

@@ -265,6 +265,11 @@ class PlaneFileRecord(Provenance[ReconstructionOptions], frozen=True):
     def __post_init__(self) -> None:
         check_depths(self.planes, self.units)
 
+    @property
+    def files(self) -> list[str]:
+        """Names of the files of the plane, beside the record."""
+        return [name for plane in self.planes for name in plane.files]
+
 
 class DepthMapFileRecord(Provenance[ReconstructionOptions], frozen=True):
     """`depth_map.json`, which vouches for the maps beside it."""
@@ -272,6 +277,11 @@ class DepthMapFileRecord(Provenance[ReconstructionOptions], frozen=True):
     format: Literal[1]
     depth_map: DepthMapRecord
     sha256: dict[FileName, Sha256]
+
+    @property
+    def files(self) -> list[str]:
+        """Names of the maps, beside the record."""
+        return self.depth_map.files
 
 
 class ReconstructionRecord(Struct, frozen=True, kw_only=True):

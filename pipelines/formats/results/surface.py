@@ -132,16 +132,9 @@ class SurfaceRecord(SurfaceFacts, frozen=True, kw_only=True):
     @property
     def maps(self) -> list[str]:
         """Names of the TIFFs, each of which has a preview."""
-        proposed = [name for name in (self.picture_proposal, self.picture_moved) if name is not UNSET]
-        return [
-            self.picture,
-            self.picture_sigma,
-            *proposed,
-            self.depth,
-            self.depth_sigma,
-            self.depth_confidence,
-            self.visibility,
-        ]
+        pictures = (self.picture, self.picture_sigma, self.picture_proposal, self.picture_moved)
+        depths = (self.depth, self.depth_sigma, self.depth_confidence, self.visibility)
+        return [name for name in (*pictures, *depths) if name is not UNSET]
 
     @property
     def files(self) -> list[str]:
@@ -151,7 +144,7 @@ class SurfaceRecord(SurfaceFacts, frozen=True, kw_only=True):
 
 
 class SurfaceFileRecord(Provenance[SurfaceOptions], frozen=True):
-    """`surface.json`, which vouches for the files beside it."""
+    """`surface.json`, which vouches for its `files`."""
 
     format: Literal[1]
     surface: SurfaceRecord
@@ -175,28 +168,27 @@ def planes_below(directory: Path) -> dict[Path, ReconstructionRecord]:
 
 def surfaces_below(directory: Path) -> dict[Path, SurfaceFileRecord]:
     """Return each surface.json in a folder and below it, by its folder; BadValue if it names a file outside."""
-    if not directory.is_dir():
-        raise MissingFile(f"{directory}: no such folder; name one that `faintfield reconstruct` wrote")
-    paths = files_below(directory, SURFACE_FILE)
-    surfaces = {path.parent: read_result(path, SurfaceFileRecord) for path in paths}
-    for folder, record in surfaces.items():
-        for name in record.files:
-            file_within(folder, name)
-    return surfaces
+    return _records_below(directory, SURFACE_FILE, SurfaceFileRecord)
 
 
 def results_below(directory: Path, *, required: bool = True) -> dict[Path, ReconstructionRecord]:
     """Return each reconstruction.json in a folder and below it, by its folder; MissingFile if one is `required`."""
+    results = _records_below(directory, RECONSTRUCTION_FILE, ReconstructionRecord)
+    if not results and required:
+        raise MissingFile(f"{directory}: holds no {RECONSTRUCTION_FILE}; run `faintfield reconstruct` first")
+    return results
+
+
+def _records_below[Record: (SurfaceFileRecord, ReconstructionRecord)](
+    directory: Path, name: str, kind: type[Record]
+) -> dict[Path, Record]:
     if not directory.is_dir():
         raise MissingFile(f"{directory}: no such folder; name one that `faintfield reconstruct` wrote")
-    paths = files_below(directory, RECONSTRUCTION_FILE)
-    if not paths and required:
-        raise MissingFile(f"{directory}: holds no {RECONSTRUCTION_FILE}; run `faintfield reconstruct` first")
-    results = {path.parent: read_result(path, ReconstructionRecord) for path in paths}
-    for folder, result in results.items():
-        for name in result.files:
-            file_within(folder, name)
-    return results
+    records = {path.parent: read_result(path, kind) for path in files_below(directory, name)}
+    for folder, record in records.items():
+        for file in record.files:
+            file_within(folder, file)
+    return records
 
 
 def read_result[Record](path: Path, kind: type[Record]) -> Record:

@@ -73,7 +73,7 @@ type FindInputs = Callable[[Path, Mapping[str, str]], Path | None]
 
 def is_record(path: Path) -> bool:
     """Return whether a file has the name of a record that can be verified."""
-    return bool(_kinds_of(path))
+    return any(fnmatchcase(path.name, pattern) for pattern in _KINDS)
 
 
 def records_below(folder: Path) -> list[Path]:
@@ -116,20 +116,22 @@ def verify_results(
     work = _Verification()
     for path in records:
         work.read(path)
-    work.compare_records()
+    for path, record in work.content.items():
+        if isinstance(record, ReconstructionRecord):
+            work.compare_repeated(path, record)
     if find_inputs is not None:
         work.look_for_inputs(find_inputs)
-    named = work.named
-    for entry, path in zip(named, progress([entry.folder / entry.name for entry in named]), strict=True):
-        work.compare(entry, path, hashed)
-    inputs = sum(entry.is_input for entry in named)
-    return ResultVerdict(
-        records=len(work.content),
-        files=len(named) - inputs,
-        inputs=inputs,
-        problems=tuple(work.problems),
-        unchecked=tuple(work.unchecked),
-    )
+    named = [*work.named.values()]
+    for file, path in zip(named, progress([file.folder / file.name for file in named]), strict=True):
+        if fault := problem_of_file(path, file.folder, file.sha256, hashed):
+            work.problems.append(
+                f"{file.record}: {path} {fault} since it was made from it, or is another input of that name"
+                if file.is_input
+                else f"{path}: {fault}"
+            )
+    inputs = sum(file.is_input for file in named)
+    found = (len(work.content), len(named) - inputs, inputs)
+    return ResultVerdict(*found, tuple(work.problems), tuple(work.unchecked))
 
 
 class _Verification:
@@ -137,7 +139,7 @@ class _Verification:
 
     def __init__(self) -> None:
         self.content: dict[Path, Struct] = {}
-        self._named: dict[tuple[Path, str], _Named] = {}  # each file is compared once, though many records name it
+        self.named: dict[tuple[Path, str], _Named] = {}  # each file is compared once, though many records name it
         self.problems: list[str] = []
         self.unchecked: list[str] = []
         self._vouching: set[Path] = set()
@@ -146,7 +148,7 @@ class _Verification:
         """Read a record, compare it with its digest, and note the files beside it."""
         try:
             text = read_content(path)
-            self.content[path] = record = _decoded(text, _kinds_of(path))
+            self.content[path] = record = _decoded(path, text)
             holds = digest_holds(text)
         except MissingFile as failure:
             self.problems.append(f"{path}: cannot be read ({failure.__cause__})")
@@ -162,28 +164,29 @@ class _Verification:
             self.problems.append(f"{path}: was altered after it was written")
         beside = _hashes_beside(record)
         self._name(path, path.parent, beside, is_input=False)
-        self.problems += [f"{path}: has no SHA-256 of {name}" for name in _named_by(record) if name not in beside]
+        if isinstance(record, PlaneFileRecord | DepthMapFileRecord | SurfaceFileRecord):
+            self.problems += [f"{path}: has no SHA-256 of {name}" for name in record.files if name not in beside]
 
-    def compare_records(self) -> None:
-        """Compare each reconstruction.json with the records of its planes and of its depth map, which it repeats."""
-        for path, record in self.content.items():
-            if isinstance(record, ReconstructionRecord):
-                for name, part in _repeated(record).items():
-                    self._compare_part(path, path.with_name(name), part)
-
-    def _compare_part(self, path: Path, own: Path, part: object) -> None:
-        if own in self.content and msgspec.json.encode(_own_part(self.content[own])) != msgspec.json.encode(part):
-            self.problems.append(f"{path}: does not say what {own.name} says")
-        elif path in self._vouching and own not in self._vouching:
-            self.problems.append(f"{path}: {own.name}, which it repeats, is missing, damaged, or has no digest")
-        elif own not in self.content:
-            self.unchecked.append(f"{path}: {own.name}, which it repeats, is missing or damaged")
+    def compare_repeated(self, path: Path, record: ReconstructionRecord) -> None:
+        """Compare a reconstruction.json with the records of its planes and of its depth map, which it repeats."""
+        for name, part in _repeated(record).items():
+            own = path.with_name(name)
+            says = self.content.get(own)
+            said = says.planes if isinstance(says, PlaneFileRecord) else getattr(says, "depth_map", None)
+            if says is not None and msgspec.json.encode(said) != msgspec.json.encode(part):
+                self.problems.append(f"{path}: does not say what {own.name} says")
+            elif path in self._vouching and own not in self._vouching:
+                self.problems.append(f"{path}: {own.name}, which it repeats, is missing, damaged, or has no digest")
+            elif says is None:
+                self.unchecked.append(f"{path}: {own.name}, which it repeats, is missing or damaged")
 
     def look_for_inputs(self, find: FindInputs) -> None:
         """Note the inputs of every record that are found, and name the others."""
         folders: dict[tuple[object, ...], Path | None] = {}
         for path, record in self.content.items():
-            if not (inputs := _inputs_of(record)):
+            made = record.provenance if isinstance(record, NoiseRecord) else record
+            inputs: Mapping[str, str] = getattr(made, "inputs", {})
+            if not inputs:
                 continue
             key = (path.parent, *next(iter(inputs.items())))
             if key not in folders:
@@ -198,22 +201,7 @@ class _Verification:
 
     def _name(self, record: Path, folder: Path, sha256_by_name: Mapping[str, str], *, is_input: bool) -> None:
         for name, known in sha256_by_name.items():
-            self._named.setdefault((folder / name, known), _Named(record, folder, name, known, is_input))
-
-    @property
-    def named(self) -> list[_Named]:
-        """All files that are to be compared."""
-        return list(self._named.values())
-
-    def compare(self, entry: _Named, path: Path, hashed: Callable[[Path], str]) -> None:
-        """Compare one file with the SHA-256 by which a record names it."""
-        fault = problem_of_file(path, entry.folder, entry.sha256, hashed)
-        if fault and entry.is_input:
-            self.problems.append(
-                f"{entry.record}: {path} {fault} since it was made from it, or is another input of that name"
-            )
-        elif fault:
-            self.problems.append(f"{path}: {fault}")
+            self.named.setdefault((folder / name, known), _Named(record, folder, name, known, is_input))
 
 
 def inputs_in(folder: Path) -> FindInputs:
@@ -244,46 +232,19 @@ def inputs_around(record: Path, inputs: Mapping[str, str]) -> Path | None:
     return beside[0] if beside else None
 
 
-def _decoded(text: bytes, kinds: Sequence[type[Struct]]) -> Struct:
-    for kind in kinds[:-1]:
+def _decoded(path: Path, text: bytes) -> Struct:
+    *others, last = next(kinds for pattern, kinds in _KINDS.items() if fnmatchcase(path.name, pattern))
+    for kind in others:
         with suppress(msgspec.ValidationError):
             return record_of(text, kind)
-    return record_of(text, kinds[-1])
-
-
-def _kinds_of(path: Path) -> tuple[type[Struct], ...]:
-    return next((kinds for pattern, kinds in _KINDS.items() if fnmatchcase(path.name, pattern)), ())
+    return record_of(text, last)
 
 
 def _hashes_beside(record: Struct) -> Mapping[str, str]:
-    match record:
-        case PlaneFileRecord() | DepthMapFileRecord() | SurfaceFileRecord():
-            return record.sha256
-        case GeometryRecord():
-            return record.sha256 or {}
-        case NoiseRecord() if record.maps_sha256:
-            return {record.maps: record.maps_sha256}
-        case _:
-            return {}
-
-
-def _named_by(record: Struct) -> list[str]:
-    """Return the names of the files for which a record of a plane, a depth map or a surface has to vouch."""
-    match record:
-        case PlaneFileRecord():
-            return [name for plane in record.planes for name in plane.files]
-        case DepthMapFileRecord():
-            return record.depth_map.files
-        case SurfaceFileRecord():
-            return record.files
-        case _:
-            return []
-
-
-def _inputs_of(record: Struct) -> Mapping[str, str]:
-    made = record.provenance if isinstance(record, NoiseRecord) else record
-    inputs: Mapping[str, str] = getattr(made, "inputs", {})
-    return inputs
+    if isinstance(record, NoiseRecord):
+        return {record.maps: record.maps_sha256} if record.maps_sha256 else {}
+    hashes: Mapping[str, str] = getattr(record, "sha256", {}) or {}  # it may be UNSET
+    return hashes
 
 
 def _repeated(record: ReconstructionRecord) -> dict[str, object]:
@@ -292,10 +253,6 @@ def _repeated(record: ReconstructionRecord) -> dict[str, object]:
     for file in dict.fromkeys(plane.file for plane in record.planes):
         parts[record_name(file)] = [plane for plane in record.planes if plane.file == file]
     return parts if record.depth_map is None else parts | {DEPTH_MAP_FILE: record.depth_map}
-
-
-def _own_part(record: Struct) -> object:
-    return record.planes if isinstance(record, PlaneFileRecord) else getattr(record, "depth_map", None)
 
 
 def _exists(path: Path) -> bool:
