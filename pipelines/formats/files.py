@@ -16,7 +16,7 @@ import msgspec
 
 from faintfield.pipelines.errors import BadValue, CannotWrite, DiskFull, MissingFile, OutputBusy, OutputExists
 from faintfield.pipelines.formats.provenance import with_digest
-from faintfield.pipelines.formats.reading import naming_unreadable
+from faintfield.pipelines.formats.reading import MAX_TEXT_BYTES, naming_unreadable
 from faintfield.pipelines.formats.units import json_of
 from faintfield.rig import files as rig_files
 
@@ -30,9 +30,6 @@ _NO_LOCKS = {errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS, errno.EBADF, errno.EINVA
 UNFINISHED = ".unfinished"
 
 CACHE_FILE = ".hashes.json"
-
-# A cache of a hundred thousand files is smaller.
-_MAX_CACHE_BYTES = 64_000_000
 
 # Folders of results lie at most this far below the folder that is shown.
 _MAX_LEVELS_BELOW = 3
@@ -163,17 +160,14 @@ def exclusive(folder: Path) -> Iterator[None]:
         descriptor = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as failure:
-        os.close(descriptor)
-        raise OutputBusy(
-            f"{folder}: another faintfield command is writing there; wait for it, or give another --out"
-        ) from failure
     except OSError as failure:
         if failure.errno not in _NO_LOCKS:
             os.close(descriptor)
-            raise CannotWrite(
-                f"{folder}: cannot be locked ({failure.strerror}); name a place that can be written"
-            ) from failure
+            if isinstance(failure, BlockingIOError):
+                busy = f"{folder}: another faintfield command is writing there; wait for it, or give another --out"
+                raise OutputBusy(busy) from failure
+            locked = f"{folder}: cannot be locked ({failure.strerror}); name a place that can be written"
+            raise CannotWrite(locked) from failure
     try:
         remove_leftovers(folder)
         yield
@@ -258,7 +252,7 @@ class Hashes:
         self._changed = False
         # Without a whole file everything is hashed
         with suppress(OSError, msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
-            content = rig_files.read_regular(folder / CACHE_FILE, _MAX_CACHE_BYTES)
+            content = rig_files.read_regular(folder / CACHE_FILE, MAX_TEXT_BYTES)
             self._known = msgspec.json.decode(content, type=dict[str, _Known])
 
     def of(self, name: str) -> str:

@@ -41,7 +41,6 @@ type Shift = tuple[_Length, _Length, _Length]
 
 type DepthUnit = Literal["mm", "relative", "disparity_px"]
 type LightUnit = Literal["electrons", "dn", "relative"]
-type ExposureUnit = Literal["s", "unknown"]
 
 # Keys that state a depth, a length across the planes, or light (squared if they end with 2).
 DEPTH_KEYS = ("depth_mm", "sharp_mm", "searched_mm", "depth_range_mm")
@@ -90,15 +89,13 @@ class Units(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
     light: LightUnit = "electrons"
 
 
-class StatedUnits(msgspec.Struct, frozen=True):
+class StatedUnits(Units, frozen=True, forbid_unknown_fields=False, omit_defaults=False):
     """The `units` of a record: those of its set, and whether its exposure is known.
 
     A record without them, of an earlier version, has these defaults.
     """
 
-    depth: DepthUnit = "mm"
-    light: LightUnit = "electrons"
-    exposure: ExposureUnit = "s"
+    exposure: Literal["s", "unknown"] = "s"
 
     @property
     def quantity(self) -> str:

@@ -15,12 +15,12 @@ from faintfield.pipelines.formats.files import write_whole
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE
 from faintfield.pipelines.formats.results.noise import NOISE_FILE
 from faintfield.pipelines.formats.results.noise_fit import Measured
-from faintfield.pipelines.formats.sets.board_set import BoardEntry
 from faintfield.pipelines.formats.toml_files import read_rig
 from faintfield.pipelines.planning.known import calibration_file, known_lens, known_pace, known_sensor, planned_light
 from faintfield.pipelines.planning.options import PlanOptions
 from faintfield.pipelines.planning.predict import Predictor, parse_grids, scene_view
 from faintfield.pipelines.planning.prediction import PredictionRecord, print_prediction
+from faintfield.rig.settings import BoardSettings
 
 # Width and height, the long side across.
 _PAPERS_MM = {"A4": (297.0, 210.0), "A3": (420.0, 297.0), "A2": (594.0, 420.0), "letter": (279.4, 215.9)}
@@ -34,7 +34,7 @@ class BoardSheets(msgspec.Struct, frozen=True):
 
     out: str
     paper: str
-    board: list[BoardEntry]
+    board: list[BoardSettings]
 
 
 def write_boards(
@@ -51,7 +51,7 @@ def write_boards(
     made = _boards(boards, across, down, square_mm, dictionary)
     write_whole(out, board_pdf(made, _PAPERS_MM[paper]))
     inform(f"{out}: {boards} board(s) of {across} x {down} squares; print at 100 % and measure the scale bar")
-    entries = [BoardEntry(**asdict(each)) for each in made]
+    entries = [BoardSettings(**asdict(each)) for each in made]
     return BoardSheets(str(out), paper, entries)
 
 

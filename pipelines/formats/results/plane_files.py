@@ -86,11 +86,22 @@ class PlaneFiles:
     def finished(self) -> PlaneFileRecord | None:
         """Return the record of the plane, None unless it and its files are whole and current."""
         record = read_current(self.path.with_suffix(".json"), PlaneFileRecord, self.origin)
-        return record if record is not None and self._is_of(record) else None
+        if record is None:
+            return None
+        stated = [(plane.method, plane.channel, plane.file) for plane in record.planes]
+        expected = [(self.method, channel, self.path.name) for channel in self.channels]
+        alike = stated == expected and len(record.focus) == len(expected)
+        return record if alike and {*record.files} <= record.sha256.keys() else None
 
     def missing(self) -> list[str]:
         """Return the colours that are still to be reconstructed."""
-        return [channel for channel in self.channels if not self._has(channel)]
+        missing = []
+        for channel in self.channels:
+            path = self._part(channel)
+            part = read_current(path.with_suffix(".json"), _Part, self.origin)
+            if part is None or list(part.sha256) != [path.name] or part.record.channel != channel:
+                missing.append(channel)
+        return missing
 
     def save_part(
         self, channel: str, arrays: Mapping[str, NDArray[np.floating]], record: PlaneRecord, focus: FocusPoint | None
@@ -101,10 +112,8 @@ class PlaneFiles:
             for array in arrays.values():
                 file.write(np.ascontiguousarray(array, _STORED).data)
         hashes = {path.name: sha256(path)}
-        write_record(
-            path.with_suffix(".json"),
-            _Part(record, focus, list(arrays), hashes, **msgspec.structs.asdict(self.origin)),
-        )
+        part = _Part(record, focus, list(arrays), hashes, **msgspec.structs.asdict(self.origin))
+        write_record(path.with_suffix(".json"), part)
 
     def finish(self) -> PlaneFileRecord:
         """Write the plane and its preview from its colours, then the record that vouches for them, and return that."""
@@ -112,7 +121,7 @@ class PlaneFiles:
         entries = [read_json(path.with_suffix(".json"), _Part, what=_A_COLOUR, remedy=_ANEW) for path in paths]
         parts = [_arrays(path, entry, entries[0].record.shape) for path, entry in zip(paths, entries, strict=True)]
         plane = _joined(parts, "plane")
-        spacing = _spacing(entries[0])
+        spacing = Spacing(entries[0].record.pitch_mm, in_mm=units_of(entries[0]).depth == "mm")
         write_plane(self.path, plane, spacing)
         preview = self.path.with_suffix(".png")
         write_png(preview, grey_levels(plane, white_level(plane)))
@@ -146,17 +155,6 @@ class PlaneFiles:
 
     def _part(self, channel: str) -> Path:
         return self.folder / PARTS / f"{self.name}_{channel}{_SUFFIX_OF_PARTS}"
-
-    def _has(self, channel: str) -> bool:
-        path = self._part(channel)
-        part = read_current(path.with_suffix(".json"), _Part, self.origin)
-        return part is not None and list(part.sha256) == [path.name] and part.record.channel == channel
-
-    def _is_of(self, record: PlaneFileRecord) -> bool:
-        """Return whether a record has an entry for each colour of this plane, and vouches for the files of each."""
-        stated = [(plane.method, plane.channel, plane.file) for plane in record.planes]
-        expected = [(self.method, channel, self.path.name) for channel in self.channels]
-        return stated == expected and len(record.focus) == len(expected) and {*record.files} <= record.sha256.keys()
 
 
 def read_current[Record: (PlaneFileRecord, DepthMapFileRecord, SurfaceFileRecord, _Part)](
@@ -194,11 +192,6 @@ def _arrays(path: Path, part: _Part, shape: tuple[int, int]) -> dict[str, NDArra
         )
     arrays = np.frombuffer(read_content(path, needed), _STORED).reshape(-1, *shape)
     return dict(zip(part.arrays, arrays, strict=True))
-
-
-def _spacing(part: _Part) -> Spacing:
-    units = units_of(part)
-    return Spacing(part.record.pitch_mm, in_mm=units.depth == "mm")
 
 
 def _joined(parts: list[dict[str, NDArray[Any]]], name: str) -> NDArray[Any]:

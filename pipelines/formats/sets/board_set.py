@@ -21,6 +21,7 @@ from faintfield.pipelines.formats.units import MAX_NODE
 from faintfield.rig.plan import centre_node
 from faintfield.rig.session.homings import read_homing_groups
 from faintfield.rig.session.session import PLAN, has_session, read_plan, taken_frames
+from faintfield.rig.settings import BoardSettings
 
 FILE_NAME = "charuco.toml"
 
@@ -28,22 +29,6 @@ FILE_NAME = "charuco.toml"
 _QUANTILE_PX = 4_000_000
 
 type _Index = Annotated[int, Meta(ge=0, le=MAX_NODE)]
-
-
-class BoardEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One `[[board]]`."""
-
-    name: str
-    columns: int
-    rows: int
-    square_mm: float
-    marker_mm: float
-    dictionary: str
-    first_marker_id: int = 0
-
-    def board(self) -> Board:
-        """Return the board; ValueError if it is impossible."""
-        return Board(**msgspec.structs.asdict(self))
 
 
 class ImageEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -62,8 +47,8 @@ class BoardSetFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
     """`charuco.toml`; `pitch_mm`, the commanded distance of nodes, is needed for the scale of the stage only."""
 
     format: Literal[1]
-    board: list[BoardEntry]
-    image: list[ImageEntry]
+    board: list[BoardSettings]
+    image: Annotated[list[ImageEntry], Meta(min_length=1)]
     pitch_mm: Annotated[float, Meta(gt=0)] | None = None
 
 
@@ -121,8 +106,6 @@ def load_board_set(folder: Path) -> BoardSet:
     path = folder if is_file(folder) else folder / FILE_NAME
     settings = read_toml(path, BoardSetFile)
     boards = _boards(path, settings.board)
-    if not settings.image:
-        raise BadValue(f"{path}: names no [[image]]; give each its file, node and sweep")
     files: dict[tuple[Node, int, int], list[Path]] = {}
     for index, entry in enumerate(settings.image):
         file = inside(path.parent, entry.file, f"{path}: image[{index}].file")
@@ -144,12 +127,10 @@ def _of_session(folder: Path) -> BoardSet:
             files.setdefault((planned.stop.node, planned.sweep, homings.groups.get(taken.intent) or 0), []).append(path)
     if not files:
         raise BadValue(f"{folder}: the session has no charuco frame yet; capture its charuco steps first")
-    boards = _boards(folder / PLAN, [BoardEntry(**msgspec.structs.asdict(board)) for board in frozen.rig.board])
-    views = _views(files, frozen.rig.mosaic)
-    one_sided = frozen.plan.approach_mm > 0
-    return BoardSet(
-        folder / PLAN, boards, views, frozen.plan.centre.node, frozen.rig.grid.pitch_mm, one_sided, homings.repeat()
-    )
+    boards = _boards(folder / PLAN, frozen.rig.board)
+    rig, plan = frozen.rig, frozen.plan
+    placed = (plan.centre.node, rig.grid.pitch_mm, plan.approach_mm > 0, homings.repeat())
+    return BoardSet(folder / PLAN, boards, _views(files, rig.mosaic), *placed)
 
 
 def _views(files: dict[tuple[Node, int, int], list[Path]], mosaic: tuple[str, ...] | None = None) -> list[BoardView]:
@@ -177,14 +158,14 @@ def _without_filters(pixels: NDArray[np.float32], mosaic: tuple[str, ...] | None
     return grey
 
 
-def _boards(path: Path, entries: Sequence[BoardEntry]) -> dict[str, Board]:
+def _boards(path: Path, entries: Sequence[BoardSettings]) -> dict[str, Board]:
     """Return the boards by name; two that share a name or a marker are refused."""
     if not entries:
         raise BadValue(f"{path}: names no [[board]]; give what `faintfield board` printed beneath the board")
     boards: dict[str, Board] = {}
     for entry in entries:
         try:
-            board = entry.board()
+            board = Board(**msgspec.structs.asdict(entry))
         except ValueError as failure:
             raise BadValue(f"{path}: {failure}") from failure
         for other in boards.values():
