@@ -9,6 +9,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from faintfield.calib.estimate import Estimate
 from faintfield.calib.noise.change import chance, compare_maps, difference_in_sigma
 from faintfield.pipelines.errors import BadValue, WrongSize
 from faintfield.pipelines.formats.frames import at_phase, mosaic_period
@@ -21,7 +22,6 @@ from faintfield.pipelines.formats.results.noise import (
     read_maps,
     read_noise,
 )
-from faintfield.pipelines.formats.results.noise_fit import Measured
 
 # Probability that any quantity at all is called changed though nothing has.
 CHANCE = 0.05
@@ -165,17 +165,17 @@ def _quantities(first: NoiseRecord, second: NoiseRecord) -> Iterator[Change]:
             yield _change(name, plane, known[0][name], known[1][name])
 
 
-def _measured(quantities: Quantities) -> dict[str, Measured]:
+def _measured(quantities: Quantities) -> dict[str, Estimate]:
     """Return the quantities to compare, by name; a reason stands for those that an older file lacks."""
-    lacking = Measured(None, why="not in this file: it is of an older version")
+    lacking = Estimate(None, why="not in this file: it is of an older version")
     fit, emva = getattr(quantities, "fit", None), getattr(quantities, "emva1288", None)
     found = {name: getattr(quantities, name) for name in Quantities.__struct_fields__}
     found |= {name: getattr(fit, name) if fit else lacking for name in _OF_FIT}
     found |= {name: getattr(emva, name) if emva else lacking for name in _OF_EMVA}
-    return {name: value if isinstance(value, Measured) else Measured(value) for name, value in found.items()}
+    return {name: value if isinstance(value, Estimate) else Estimate(value) for name, value in found.items()}
 
 
-def _change(name: str, plane: str, first: Measured, second: Measured) -> Change:
+def _change(name: str, plane: str, first: Estimate, second: Estimate) -> Change:
     """Return one quantity of both."""
     whys = [
         f"{which}: {quantity.why or 'no reason stated'}"

@@ -13,7 +13,7 @@ from faintfield.calib.noise.emva.nonuniformity import Nonuniformity, TemporalNoi
 from faintfield.calib.noise.emva.quantities import derived_quantities, gather_inputs
 from faintfield.calib.noise.fit.temperature import dark_current_doubling
 from faintfield.calib.noise.strips import map_of, mean_over
-from faintfield.pipelines.formats.results.noise_fit import EmvaImageRecord, EmvaRecord
+from faintfield.pipelines.formats.results.noise import EmvaImageRecord, EmvaRecord
 
 # The bright image is the series of the most frames within so much of half of saturation, or else the nearest to it.
 _BRIGHT_SHARE, _BRIGHT_WITHIN = 0.5, 0.1

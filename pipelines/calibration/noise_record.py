@@ -15,8 +15,16 @@ from faintfield.calib.noise.strips import release
 from faintfield.pipelines.calibration.noise import Readout, SensorCalibration
 from faintfield.pipelines.formats.files import sha256
 from faintfield.pipelines.formats.provenance import provenance
-from faintfield.pipelines.formats.results.noise import CovarianceRecord, NoiseRecord, PhaseRecord, Quantities
-from faintfield.pipelines.formats.results.noise_fit import FitRecord, GoodnessRecord, ResponseRecord, SaturationRecord
+from faintfield.pipelines.formats.results.noise import (
+    CovarianceRecord,
+    FitRecord,
+    GoodnessRecord,
+    NoiseRecord,
+    PhaseRecord,
+    Quantities,
+    ResponseRecord,
+    SaturationRecord,
+)
 
 # Maps by their name in the file, with the fill for pixels that were not calibrated; these are masked anyway.
 _MAPS = {

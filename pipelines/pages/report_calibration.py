@@ -8,11 +8,12 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from faintfield.calib.estimate import Estimate
 from faintfield.pipelines.formats.files import file_within, sha256
 from faintfield.pipelines.formats.provenance import Provenance
 from faintfield.pipelines.formats.reading import read_content
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_PAGE, GeometryRecord, read_geometry
-from faintfield.pipelines.formats.results.noise import Measured, NoiseRecord, read_noise
+from faintfield.pipelines.formats.results.noise import NoiseRecord, read_noise
 from faintfield.pipelines.formats.units import MAX_PREVIEW_BYTES
 from faintfield.pipelines.pages.geometry_page import node_drawing, sigma_maps, stage_rows
 from faintfield.pipelines.pages.page import Row, smaller_uri
@@ -72,13 +73,13 @@ def noise_section(directory: Path, path: Path, inputs: Set[str]) -> NoiseSection
         rows=[
             _noise_row(measured, words, unit)
             for name, words, unit in _NOISE_ROWS
-            if isinstance(measured := getattr(record, name), Measured)
+            if isinstance(measured := getattr(record, name), Estimate)
         ],
         unusable={kind: len(getattr(record, f"{kind}_pixels")) for kind in ("hot", "noisy", "dead")},
     )
 
 
-def _noise_row(measured: Measured, words: str, unit: str) -> Row:
+def _noise_row(measured: Estimate, words: str, unit: str) -> Row:
     if measured.value is None:
         return Row(words, why=measured.why or "no reason stated")
     # As many decimals as the standard error deserves

@@ -8,19 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintfield.calib.estimate import Estimate
 from faintfield.calib.noise_model import NoiseModel
 from faintfield.pipelines.errors import BadValue, WrongUsage
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.reading import is_file, is_folder
 from faintfield.pipelines.formats.results.geometry import CameraPoses, read_geometry
-from faintfield.pipelines.formats.results.noise import (
-    NOISE_MAPS,
-    NoiseRecord,
-    read_fitted_noise,
-    read_maps,
-    read_noise,
-)
-from faintfield.pipelines.formats.results.noise_fit import Measured
+from faintfield.pipelines.formats.results.noise import NOISE_MAPS, NoiseRecord, read_fitted_noise, read_maps, read_noise
 from faintfield.pipelines.planning.options import PlanOptions
 from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.devices import open_rig
@@ -53,10 +47,10 @@ class Sensor:
     """Numbers of a sensor's noise, their `source` in words, and the calibration or the simulated camera's model."""
 
     source: str
-    read_noise_e: Measured
-    dark_current_e_per_s: Measured
-    gain_dn_per_e: Measured
-    quantum_efficiency: Measured
+    read_noise_e: Estimate
+    dark_current_e_per_s: Estimate
+    gain_dn_per_e: Estimate
+    quantum_efficiency: Estimate
     record: NoiseRecord | None = None
     path: Path | None = None
     model: NoiseModel | None = None
@@ -69,17 +63,17 @@ def known_sensor(settings: RigSettings, noise: Path | None, **options: float | N
     elif isinstance(settings.camera, SimulatedSettings):
         sensor = _simulated_sensor(settings.camera)
     else:
-        unknown = Measured(None, why=_NOT_MEASURED)
+        unknown = Estimate(None, why=_NOT_MEASURED)
         sensor = Sensor("no calibration", unknown, unknown, unknown, unknown)
-    numbers: dict[str, Any] = {name: Measured(value) for name, value in options.items() if value is not None}
+    numbers: dict[str, Any] = {name: Estimate(value) for name, value in options.items() if value is not None}
     return replace(sensor, source=f"options and {sensor.source}", **numbers) if numbers else sensor
 
 
 def _measured_sensor(path: Path) -> Sensor:
     record = read_noise(path)
     efficiency = record.quantum_efficiency
-    if not isinstance(efficiency, Measured):  # a record holds it with or without its error
-        efficiency = Measured(efficiency, why="not stated" if efficiency is None else None)
+    if not isinstance(efficiency, Estimate):  # a record holds it with or without its error
+        efficiency = Estimate(efficiency, why="not stated" if efficiency is None else None)
     return Sensor(
         str(path), record.read_noise_e, record.dark_current_e_per_s, record.gain_dn_per_e, efficiency, record, path
     )
@@ -90,7 +84,7 @@ def _simulated_sensor(settings: SimulatedSettings) -> Sensor:
     names = ("read_noise_e", "dark_current_e_per_s", "gain_dn_per_e", "quantum_efficiency")
     numbers = {name: getattr(sensor, name) for name in names}
     model = NoiseModel(sensor.offset_dn, saturation_dn=sensor.saturation_dn, **numbers)
-    measured: dict[str, Any] = {name: Measured(value) for name, value in numbers.items()}
+    measured: dict[str, Any] = {name: Estimate(value) for name, value in numbers.items()}
     return Sensor("the simulated camera", **measured, model=model)
 
 
@@ -98,7 +92,7 @@ def _simulated_sensor(settings: SimulatedSettings) -> Sensor:
 class KnownLens:
     """Focal length, width and height of a frame, the point where the axis meets it, and the relative response."""
 
-    f_px: Measured
+    f_px: Estimate
     size_px: tuple[int, int] | None
     centre_px: tuple[float, float] | None
     response: NDArray[np.floating] | None
@@ -132,12 +126,12 @@ def known_lens(settings: RigSettings, sensor: Sensor, geometry: Path | None, fx_
     simulated = _simulated_experiment(camera).optics if isinstance(camera, SimulatedSettings) else None
     size_px = sensor.record.size_px if sensor.record is not None else None
     centre_px = None
-    f_px = Measured(None, why="no focal length; give --fx-px, or the result of `faintfield geometry` as --geometry")
+    f_px = Estimate(None, why="no focal length; give --fx-px, or the result of `faintfield geometry` as --geometry")
     lens = simulated if geometry is None else read_geometry(geometry, CameraPoses).camera_lens()
     if lens is not None:
-        size_px, centre_px, f_px = lens.size_px, (lens.cx_px, lens.cy_px), Measured(lens.fx_px)
+        size_px, centre_px, f_px = lens.size_px, (lens.cx_px, lens.cy_px), Estimate(lens.fx_px)
     if fx_px is not None:
-        f_px = Measured(fx_px)
+        f_px = Estimate(fx_px)
     if centre_px is None and size_px is not None:
         centre_px = (size_px[0] - 1) / 2, (size_px[1] - 1) / 2
     response: NDArray[np.floating] | None = None
@@ -153,7 +147,7 @@ def known_lens(settings: RigSettings, sensor: Sensor, geometry: Path | None, fx_
 class Light:
     """Light of the scene in electrons per pixel and second, and where it is from."""
 
-    e_per_s: Measured
+    e_per_s: Estimate
     source: str
 
 
@@ -172,7 +166,7 @@ def planned_light(options: PlanOptions, exposure_s: float, sensor: Sensor) -> Li
         return _light_of_frame(path, options, sensor)
     if (options.frame_exposure_ms, options.region_px) != (None, None):
         raise WrongUsage("--frame-exposure-ms and --region-px are those of a frame; give --test-frame or --flat")
-    return Light(Measured(per_s if per_frame_e is None else per_frame_e / exposure_s), "as stated")
+    return Light(Estimate(per_s if per_frame_e is None else per_frame_e / exposure_s), "as stated")
 
 
 def _light_of_frame(path: Path, options: PlanOptions, sensor: Sensor) -> Light:
@@ -221,7 +215,7 @@ def _light_of_frame(path: Path, options: PlanOptions, sensor: Sensor) -> Light:
     exact = "" if sensor.record is not None else ", the sensor's numbers taken as exact"
     source = f"{path.name}, {1e3 * exposure_s:g} ms, mean of {part}{exact}"
     ends = low_e / exposure_s, high_e / exposure_s
-    return Light(Measured(light_e / exposure_s, margin_e / _Z95 / exposure_s, ends), source)
+    return Light(Estimate(light_e / exposure_s, margin_e / _Z95 / exposure_s, ends), source)
 
 
 def _region(path: Path, options: PlanOptions, width: int, height: int) -> tuple[slice, slice]:

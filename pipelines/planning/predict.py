@@ -12,8 +12,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from faintfield.calib.estimate import Estimate
 from faintfield.pipelines.errors import WrongUsage
-from faintfield.pipelines.formats.results.noise_fit import Measured
 from faintfield.pipelines.planning.known import KnownLens, KnownPace, Light, Sensor
 from faintfield.pipelines.planning.options import PlanOptions
 from faintfield.pipelines.planning.prediction import Alternative, DepthPrediction, FeaturePrediction, PredictionRecord
@@ -131,7 +131,7 @@ class Predictor:
             cheapest=min(reaching, key=lambda row: row.time_s.value or 0.0, default=None),
         )
 
-    def _from_light(self, view: View, compute: Callable[[float, float, float], float]) -> Measured:
+    def _from_light(self, view: View, compute: Callable[[float, float, float], float]) -> Estimate:
         """Return a number computed from light, dark electrons and read noise of a view, all in electrons."""
 
         def of_view(light_e_per_s: float, read_noise_e: float, dark_e_per_s: float) -> float:
@@ -143,17 +143,17 @@ class Predictor:
 
         return _with(of_view, self.light.e_per_s, self.sensor.read_noise_e, self.sensor.dark_current_e_per_s)
 
-    def _snr(self, view: View) -> Measured:
+    def _snr(self, view: View) -> Estimate:
         return _finite(self._from_light(view, _snr_by_powers))
 
     def _depth(self, depth_mm: float | None) -> DepthPrediction:
         grid = self.settings.grid
         centres_mm, response = self._views(grid, depth_mm)
-        depth = Measured(depth_mm) if depth_mm is not None else Measured(None, why=_NO_DEPTH)
+        depth = Estimate(depth_mm) if depth_mm is not None else Estimate(None, why=_NO_DEPTH)
         scale = _with(lambda z, f: z / f, depth, self.lens.f_px)
-        blur = Measured(self.options.blur_px, why=_NO_BLUR if self.options.blur_px is None else None)
+        blur = Estimate(self.options.blur_px, why=_NO_BLUR if self.options.blur_px is None else None)
         aperture_mm = grid.pitch_mm * (max(grid.rows, grid.columns) - 1)
-        step = Measured(None, why="one node has no aperture")
+        step = Estimate(None, why="one node has no aperture")
         if aperture_mm > 0:
             step = _with(lambda z, f: depth_resolution_mm(z, f, aperture_mm), depth, self.lens.f_px)
         return DepthPrediction(
@@ -167,13 +167,13 @@ class Predictor:
             features=[self._feature(centres_mm, response, side_px, depth) for side_px in self.sides_px],
         )
 
-    def _feature(self, centres_mm: Array, response: Array, side_px: float, depth: Measured) -> FeaturePrediction:
+    def _feature(self, centres_mm: Array, response: Array, side_px: float, depth: Estimate) -> FeaturePrediction:
         contrast = self._contrast(self.view, response, side_px)
         unknown = next((quantity for quantity in (depth, self.lens.f_px) if quantity.value is None), None)
         if unknown is None and len(np.unique(centres_mm[response > 0], axis=0)) < 2:
-            unknown = Measured(None, why="one view tells no depth")
+            unknown = Estimate(None, why="one view tells no depth")
         if unknown is None and contrast.value is not None and contrast.value > 1:
-            unknown = Measured(None, why="even a black square is not visible")
+            unknown = Estimate(None, why="even a black square is not visible")
 
         def depth_sigma(light_e: float, information: Array) -> float:
             black = {"side_px": side_px, "difference_e": light_e, "blur_px": self.options.blur_px or 0.0}
@@ -186,7 +186,7 @@ class Predictor:
             depth_sigma_mm=unknown or self._from_information(self.view, response, depth_sigma),
         )
 
-    def _contrast(self, view: View, response: Array, side_px: float) -> Measured:
+    def _contrast(self, view: View, response: Array, side_px: float) -> Estimate:
         k, blur_px = self.options.rose_k, self.options.blur_px or 0.0
 
         def contrast(light_e: float, information: Array) -> float:
@@ -194,7 +194,7 @@ class Predictor:
 
         return self._from_information(view, response, contrast)
 
-    def _sigma(self, view: View, response: Array, exposure_s: float | None = None) -> Measured:
+    def _sigma(self, view: View, response: Array, exposure_s: float | None = None) -> Estimate:
         """Return σ of a sample in electrons of a view, or of an exposure."""
         count = int(np.count_nonzero(response))
         unit = 1.0 if exposure_s is None else exposure_s / view.exposure_s
@@ -204,7 +204,7 @@ class Predictor:
 
         return self._from_information(view, response, sigma)
 
-    def _from_information(self, view: View, response: Array, compute: Callable[[float, Array], float]) -> Measured:
+    def _from_information(self, view: View, response: Array, compute: Callable[[float, Array], float]) -> Estimate:
         """Return a number computed from the light in electrons and the information of each view about a sample."""
 
         def of_view(light_e: float, dark_e: float, noise_e: float) -> float:
@@ -264,7 +264,7 @@ class Predictor:
             why_not=why_not,
         )
 
-    def _duration(self, grid: Grid, changes: dict[str, Any]) -> tuple[Measured, Measured, str | None]:
+    def _duration(self, grid: Grid, changes: dict[str, Any]) -> tuple[Estimate, Estimate, str | None]:
         """Return the duration of the session and of its dark scene with `changes`, and why it cannot be done."""
         settings, pace = self.settings, self.pace
         steps = [
@@ -274,11 +274,11 @@ class Predictor:
         ]
         plan = CapturePlan.of(grid, steps, approach_mm=settings.stage.approach_mm, frame_bytes=0)
         if isinstance(pace, str):
-            unknown = Measured(None, why=pace)
+            unknown = Estimate(None, why=pace)
             return unknown, unknown, None
         plan = msgspec.structs.replace(plan, settle_s=settings.settle.wait_s, readout_s=pace.readout_s)
         scene = msgspec.structs.replace(plan, steps=tuple(step for step in plan.steps if step.kind == "dark_scene"))
-        whole, part = (Measured(schedule.duration_s(pace.motion, pace.feed_mm_per_s)) for schedule in (plan, scene))
+        whole, part = (Estimate(schedule.duration_s(pace.motion, pace.feed_mm_per_s)) for schedule in (plan, scene))
         try:
             pace.workspace.check_path(plan.path())
         except (OutsideTravel, KeepOutCrossed) as failure:
@@ -310,11 +310,11 @@ def _snr_linear(light_e: float, _: float, noise_e: float) -> float:
     return light_e / noise_e**2 if noise_e > 0 else math.inf
 
 
-def _finite(snr: Measured) -> Measured:
-    return Measured(None, why="there is no noise to compare with") if snr.value == math.inf else snr
+def _finite(snr: Estimate) -> Estimate:
+    return Estimate(None, why="there is no noise to compare with") if snr.value == math.inf else snr
 
 
-def _with(compute: Callable[..., float], first: Measured, *further: Measured) -> Measured:
+def _with(compute: Callable[..., float], first: Estimate, *further: Estimate) -> Estimate:
     """Return a number computed from others, with the interval that the first one's gives it; unknown if any is."""
     for estimate in (first, *further):
         if estimate.value is None:
@@ -322,6 +322,6 @@ def _with(compute: Callable[..., float], first: Measured, *further: Measured) ->
     rest = [estimate.value for estimate in further]
     value = compute(first.value, *rest)
     if first.ci95 is None:
-        return Measured(value)
+        return Estimate(value)
     low, high = sorted(compute(end, *rest) for end in first.ci95)
-    return Measured(value, ci95=(low, high))
+    return Estimate(value, ci95=(low, high))

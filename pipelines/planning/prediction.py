@@ -7,8 +7,8 @@ import math
 
 from msgspec import Struct
 
+from faintfield.calib.estimate import Estimate
 from faintfield.pipelines.console import inform
-from faintfield.pipelines.formats.results.noise_fit import Measured
 from faintfield.rig.capture.guide import format_duration
 
 # Heads and widths of the table's columns.
@@ -25,9 +25,9 @@ class FeaturePrediction(Struct, frozen=True, kw_only=True):
     """
 
     side_px: float
-    side_mm: Measured
-    smallest_contrast: Measured
-    depth_sigma_mm: Measured
+    side_mm: Estimate
+    smallest_contrast: Estimate
+    depth_sigma_mm: Estimate
 
 
 class DepthPrediction(Struct, frozen=True, kw_only=True):
@@ -41,10 +41,10 @@ class DepthPrediction(Struct, frozen=True, kw_only=True):
     depth_mm: float | None
     views: int
     seen_by_all_mm: tuple[float, float] | None
-    sigma_e: Measured
-    mm_per_px: Measured
-    blur_mm: Measured
-    depth_step_mm: Measured
+    sigma_e: Estimate
+    mm_per_px: Estimate
+    blur_mm: Estimate
+    depth_step_mm: Estimate
     features: list[FeaturePrediction]
 
 
@@ -60,11 +60,11 @@ class Alternative(Struct, frozen=True, kw_only=True):
     rows: int
     columns: int
     frames_per_node: int
-    snr: Measured
-    sigma_e: Measured
-    smallest_contrast: Measured
-    scene_s: Measured
-    time_s: Measured
+    snr: Estimate
+    sigma_e: Estimate
+    smallest_contrast: Estimate
+    scene_s: Estimate
+    time_s: Estimate
     why_not: str | None = None
 
 
@@ -86,18 +86,18 @@ class PredictionRecord(Struct, frozen=True, kw_only=True):
     total_exposure_s: float
     frames_per_node: int
     noise_from: str
-    read_noise_e: Measured
-    dark_current_e_per_s: Measured
+    read_noise_e: Estimate
+    dark_current_e_per_s: Estimate
     light_from: str
-    light_e: Measured
-    photons: Measured
+    light_e: Estimate
+    photons: Estimate
     pixel_share: float
-    snr: Measured
-    snr_linear: Measured
+    snr: Estimate
+    snr_linear: Estimate
     vignetting: str | None
     rose_k: float
     depths: list[DepthPrediction]
-    time_s: Measured
+    time_s: Estimate
     alternatives: list[Alternative]
     wanted_sigma_e: float | None = None
     cheapest: Alternative | None = None
@@ -177,7 +177,7 @@ def _asked(row: Alternative) -> str:
     return f"{1e3 * row.exposure_s:>7g} ms {shape:>9} {row.frames_per_node:>6}"
 
 
-def _number_text(number: Measured, unit: str = "") -> str:
+def _number_text(number: Estimate, unit: str = "") -> str:
     """Return a number with its unit and interval, or why it is unknown."""
     if number.value is None:
         return f"unknown: {number.why}"
@@ -185,12 +185,12 @@ def _number_text(number: Measured, unit: str = "") -> str:
     return f"{number.value:.3g}{' ' if unit else ''}{unit}{ends}"
 
 
-def _cell(number: Measured) -> str:
+def _cell(number: Estimate) -> str:
     """Return a number in a column."""
     return f"{'unknown' if number.value is None else format(number.value, '.3g'):>8}"
 
 
-def _minutes(number: Measured) -> str:
+def _minutes(number: Estimate) -> str:
     """Return a duration in a column."""
     return f"{'unknown' if number.value is None else format(number.value / 60, '.1f') + ' min':>9}"
 

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from faintfield.calib.estimate import Estimate
 from faintfield.calib.noise.strips import maps_by
 from faintfield.pipelines.calibration.noise import calibrate_sensor
 from faintfield.pipelines.calibration.noise_comparison import CHANCE, MapChange, NoiseComparison, compare_noise
@@ -10,8 +11,7 @@ from faintfield.pipelines.console import inform, working
 from faintfield.pipelines.errors import MissingFile
 from faintfield.pipelines.formats.files import removed_if_empty
 from faintfield.pipelines.formats.large_arrays import maps_in_files
-from faintfield.pipelines.formats.results.noise import NOISE_FILE, STANDARD, NoiseRecord, write_noise
-from faintfield.pipelines.formats.results.noise_fit import FitRecord, Measured
+from faintfield.pipelines.formats.results.noise import NOISE_FILE, STANDARD, FitRecord, NoiseRecord, write_noise
 from faintfield.pipelines.formats.sets.noise_set import FILE_NAME, load_noise_set
 from faintfield.pipelines.pages.emva_page import EMVA_PAGE, emva_page
 from faintfield.pipelines.pages.noise_page import draw_page
@@ -55,7 +55,7 @@ def _inform_of(record: NoiseRecord) -> None:
     inform(f"{STANDARD}; likelihood: {record.likelihood}")
     explained: dict[str, str] = {}
     for name, label, unit in _SHOWN:
-        measured: Measured = getattr(record, name)
+        measured: Estimate = getattr(record, name)
         if measured.value is None or measured.ci95 is None:
             reason = measured.why or ""
             inform(f"  {label}: not identifiable: {'as for ' + explained[reason] if reason in explained else reason}")

@@ -7,6 +7,7 @@ from pathlib import Path
 import msgspec
 
 from faintfield.calib.board import Board
+from faintfield.calib.estimate import Estimate
 from faintfield.pipelines.arguments import PaperName
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import WrongUsage
@@ -14,7 +15,6 @@ from faintfield.pipelines.formats.board_pdf import FOOT_MM, MARGIN_MM, board_pdf
 from faintfield.pipelines.formats.files import write_whole
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE
 from faintfield.pipelines.formats.results.noise import NOISE_FILE
-from faintfield.pipelines.formats.results.noise_fit import Measured
 from faintfield.pipelines.formats.toml_files import read_rig
 from faintfield.pipelines.planning.known import calibration_file, known_lens, known_pace, known_sensor, planned_light
 from faintfield.pipelines.planning.options import PlanOptions
@@ -104,7 +104,7 @@ def predict_capture(rig: Path, options: PlanOptions) -> PredictionRecord:
     return record
 
 
-def _in_px(sides_mm: list[float], depths_mm: Sequence[float], f_px: Measured) -> list[float]:
+def _in_px(sides_mm: list[float], depths_mm: Sequence[float], f_px: Estimate) -> list[float]:
     """Return sides in pixels at the first depth."""
     if not sides_mm:
         return []

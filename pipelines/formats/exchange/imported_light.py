@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.errors import NotIdentifiable
+from faintfield.calib.estimate import Estimate
 from faintfield.calib.homography import rotation_matrix
 from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.errors import BadValue, WrongUsage
 from faintfield.pipelines.formats.exchange.options import GridOptions, ImportOptions
 from faintfield.pipelines.formats.frames import RAW_SUFFIXES, Frame, at_phase, mosaic_period, read_frame
 from faintfield.pipelines.formats.reading import opened
-from faintfield.pipelines.formats.results.noise_fit import Measured
 from faintfield.pipelines.formats.sets.elemental_file import Noise, View
 from faintfield.pipelines.formats.units import LightUnit
 
@@ -133,7 +133,7 @@ class NoiseOrigin(msgspec.Struct, frozen=True, omit_defaults=True):
     ----------
     how : {"stated", "estimated", "assumed"}
         By a person; from the residuals of neighbouring views; or neither, for the reason `why`.
-    gain_dn, read_noise_dn : Measured, optional
+    gain_dn, read_noise_dn : Estimate, optional
         The estimates in DN: variance over mean, and standard deviation without light. Their intervals hold the scatter
         of blocks only.
     mean_dn, variance_dn2 : tuple of float
@@ -144,8 +144,8 @@ class NoiseOrigin(msgspec.Struct, frozen=True, omit_defaults=True):
 
     how: Literal["stated", "estimated", "assumed"]
     why: str | None = None
-    gain_dn: Measured | None = None
-    read_noise_dn: Measured | None = None
+    gain_dn: Estimate | None = None
+    read_noise_dn: Estimate | None = None
     mean_dn: tuple[float, ...] = ()
     variance_dn2: tuple[float, ...] = ()
     blocks: int = 0
@@ -263,5 +263,5 @@ def _describe_variance(gain_dn: float, read_noise_dn: float, tone: Tone) -> str:
     return f"the variance of a pixel is {gain_dn * unit:.3g} · light + {read_noise_dn * unit:.3g}², in {words}"
 
 
-def _measured(quantity: "Estimated") -> Measured:
-    return Measured(quantity.value, quantity.se, quantity.ci95)
+def _measured(quantity: "Estimated") -> Estimate:
+    return Estimate(quantity.value, quantity.se, quantity.ci95)

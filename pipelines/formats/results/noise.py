@@ -15,6 +15,7 @@ from msgspec import UNSET, Struct, UnsetType
 from numpy.lib.format import write_array
 from numpy.typing import NDArray
 
+from faintfield.calib.estimate import Estimate
 from faintfield.calib.noise_model import BentResponse, NoiseModel
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue
@@ -22,8 +23,6 @@ from faintfield.pipelines.formats.files import exclusive, remove, sha256, write_
 from faintfield.pipelines.formats.frames import at_phase
 from faintfield.pipelines.formats.provenance import Provenance
 from faintfield.pipelines.formats.reading import is_file, read_arrays, read_json
-from faintfield.pipelines.formats.results.noise_fit import EmvaRecord, FitRecord
-from faintfield.pipelines.formats.results.noise_fit import Measured as Measured
 from faintfield.pipelines.formats.units import sound_mosaic
 
 NOISE_FILE, NOISE_MAPS = "noise.json", "noise_maps.npz"
@@ -32,8 +31,100 @@ STANDARD = "EMVA 1288 release 4.0"
 # The quantities that a reconstruction needs.
 _NEEDED = ("offset_dn", "gain_dn_per_e", "read_noise_e", "dark_current_e_per_s")
 
-# The maps that it takes, and the largest number of them that is written.
+# The maps that it takes, and the largest number of them that is written, of 8 bytes a pixel.
 _MAPS_TAKEN, _MAPS_WRITTEN = (*_NEEDED, "mask", "relative_response"), 12
+
+
+class ResponseRecord(Struct, frozen=True):
+    """The bend of the response: a signal of s DN is the charge (s/g)(1 + κ₁ s + κ₂ s² + …), κ₁ in 1/DN and so on."""
+
+    bends_per_dn: list[float]
+    up_to_dn: float
+
+
+class SaturationRecord(Struct, frozen=True):
+    """End of the range of the flats, and its reason."""
+
+    limit: Literal["ADC", "full well", "not reached"]
+    level_dn: float | None
+    interval_dn: tuple[float, float] | None
+
+
+class GoodnessRecord(Struct, frozen=True, omit_defaults=True):
+    """Goodness of fit of one series, or the reason why it was left out.
+
+    `noise_excess` is its variance over the model's, minus 1, with the error `noise_se` of Gaussian noise; the deviances
+    of blocks of pixels, rows, columns and frames are per degree of freedom, 1 where the noise is Gaussian.
+    """
+
+    kind: Literal["dark", "flat"]
+    exposure_s: float
+    level: int
+    frames: int
+    left_out: str | None = None
+    noise_excess: float | None = None
+    noise_se: float | None = None
+    level_residual_dn: float | None = None
+    blocks: float | None = None
+    rows: float | None = None
+    columns: float | None = None
+    by_frame: float | None = None
+
+
+class FitRecord(Struct, frozen=True):
+    """Saturation and response from the flats, how far series scatter about the model, and how well each fits.
+
+    `telegraph_pixels` is how many jump between two levels; `maps_absent` tells why there is no map of the gain per
+    pixel, or of the read noise.
+    """
+
+    saturation: SaturationRecord
+    saturation_e: Estimate
+    linearity_error: Estimate
+    response: ResponseRecord | None
+    noise_error: Estimate
+    drift_dn: Estimate
+    light_error: Estimate
+    lamp_flicker: Estimate
+    series: list[GoodnessRecord]
+    telegraph_pixels: int = 0
+    maps_absent: dict[str, str] = {}
+
+
+class EmvaImageRecord(Struct, frozen=True):
+    """The series whose mean image shows DSNU or PRNU; levels in DN above the dark of zero exposure."""
+
+    exposure_s: float
+    level: int
+    frames: int
+    signal_dn: float
+
+
+class EmvaRecord(Struct, frozen=True):
+    """Quantities of EMVA 1288 that follow from others, or from one mean image; docs/noise.md has the formulas.
+
+    `dark_noise_e` and the thresholds are those of an exposure of `dark_noise_exposure_s`; 0 is by extrapolation.
+    """
+
+    dark_noise_exposure_s: float
+    dark_noise_e: Estimate
+    responsivity_dn_per_photon: Estimate
+    threshold_e: Estimate
+    threshold_photons: Estimate
+    saturation_photons: Estimate
+    snr_max: Estimate
+    dynamic_range: Estimate
+    dsnu_total_e: Estimate
+    dsnu_row_e: Estimate
+    dsnu_column_e: Estimate
+    dsnu_pixel_e: Estimate
+    prnu_total: Estimate
+    prnu_row: Estimate
+    prnu_column: Estimate
+    prnu_pixel: Estimate
+    dark_current_doubling_k: Estimate
+    dark_image: EmvaImageRecord | None
+    bright_image: EmvaImageRecord | None
 
 
 class NoiseFrame(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -47,7 +138,7 @@ class NoiseFrame(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=
     photons: float | None = None
 
 
-_NOT_STATED = Measured(None, why="not stated")
+_NOT_STATED = Estimate(None, why="not stated")
 
 
 class Quantities(Struct, frozen=True, kw_only=True):
@@ -56,23 +147,23 @@ class Quantities(Struct, frozen=True, kw_only=True):
     A reconstruction needs the first four. Only noise.json files that were written by hand lack any of the others.
     """
 
-    offset_dn: Measured
-    gain_dn_per_e: Measured
-    read_noise_e: Measured
-    dark_current_e_per_s: Measured
-    read_noise_dn: Measured = _NOT_STATED
-    dark_signal_dn_per_s: Measured = _NOT_STATED
-    dsnu_dn: Measured = _NOT_STATED
-    dsnu_e: Measured = _NOT_STATED
-    dcnu_e_per_s: Measured = _NOT_STATED
-    frame_jitter_dn: Measured = _NOT_STATED
-    row_noise_dn: Measured = _NOT_STATED
-    column_noise_dn: Measured = _NOT_STATED
-    dsnu_row_dn: Measured = _NOT_STATED
-    dsnu_column_dn: Measured = _NOT_STATED
-    prnu: Measured = _NOT_STATED
-    nonlinearity_per_dn: Measured = _NOT_STATED
-    quantum_efficiency: Measured | float | None = _NOT_STATED
+    offset_dn: Estimate
+    gain_dn_per_e: Estimate
+    read_noise_e: Estimate
+    dark_current_e_per_s: Estimate
+    read_noise_dn: Estimate = _NOT_STATED
+    dark_signal_dn_per_s: Estimate = _NOT_STATED
+    dsnu_dn: Estimate = _NOT_STATED
+    dsnu_e: Estimate = _NOT_STATED
+    dcnu_e_per_s: Estimate = _NOT_STATED
+    frame_jitter_dn: Estimate = _NOT_STATED
+    row_noise_dn: Estimate = _NOT_STATED
+    column_noise_dn: Estimate = _NOT_STATED
+    dsnu_row_dn: Estimate = _NOT_STATED
+    dsnu_column_dn: Estimate = _NOT_STATED
+    prnu: Estimate = _NOT_STATED
+    nonlinearity_per_dn: Estimate = _NOT_STATED
+    quantum_efficiency: Estimate | float | None = _NOT_STATED
 
 
 class PhaseRecord(Quantities, frozen=True):
@@ -116,7 +207,7 @@ class NoiseRecord(_StandardQuantities, frozen=True, kw_only=True):
 
     covariance: CovarianceRecord = CovarianceRecord([], [])
     likelihood: str = ""
-    saturation_dn: Measured | float | None = None
+    saturation_dn: Estimate | float | None = None
     size_px: tuple[int, int] | None = None
     mosaic: tuple[str, ...] | UnsetType | None = UNSET
     planes: list[PhaseRecord] | UnsetType = UNSET
@@ -181,14 +272,10 @@ def read_fitted_noise(path: Path, size_px: tuple[int, int]) -> FittedNoise:
     is not known or out of its range.
     """
     record = read_noise(path)
-    values = _numbers(path, record)
-    shape = size_px[::-1]
-    outside = [pixel for pixel in record.hot_pixels if not (0 <= pixel[0] < shape[0] and 0 <= pixel[1] < shape[1])]
-    if outside:
-        raise BadValue(
-            f"{path}: hot pixel {list(outside[0])} is not one of {shape}; it seems to be another camera's; "
-            "measure this one"
-        )
+    values, shape = _numbers(path, record), size_px[::-1]
+    for row, column in record.hot_pixels:
+        if not (0 <= row < shape[0] and 0 <= column < shape[1]):
+            raise BadValue(f"{path}: hot pixel [{row}, {column}] is not one of {shape}; measure this camera")
     if record.mosaic and not sound_mosaic(record.mosaic, "RGB"):
         raise BadValue(f"{path}: mosaic = {list(record.mosaic)} is no colour filter; run `faintfield noise` again")
     unusable = np.zeros(shape, bool)
@@ -200,15 +287,15 @@ def read_fitted_noise(path: Path, size_px: tuple[int, int]) -> FittedNoise:
         # Pixels with no response are masked already; the operator takes no negative one
         response = np.where(unusable, 1, np.maximum(response, 0)).astype(np.float32)
         if not np.isfinite(response).all():
-            raise BadValue(
-                f"{path.with_name(NOISE_MAPS)}: relative_response is not finite; run `faintfield noise` again"
-            )
-    stated = {name: getattr(record, name) for name in ("quantum_efficiency", "saturation_dn")}
-    # Either number may be written with or without its error.
-    stated = {name: value.value if isinstance(value, Measured) else value for name, value in stated.items()}
-    known = {name: value for name, value in stated.items() if value is not None}
+            raise BadValue(f"{path}: relative_response of {NOISE_MAPS} is not finite; run `faintfield noise` again")
+    numbers: dict[str, Any] = values | maps
+    for name in ("quantum_efficiency", "saturation_dn"):
+        value = getattr(record, name)
+        value = value.value if isinstance(value, Estimate) else value  # written with or without its error
+        if value is not None:
+            numbers[name] = value
     try:
-        model = NoiseModel(**(values | maps), **known, response=_response(record, shape))
+        model = NoiseModel(**numbers, response=_response(record, shape))
     except ValueError as failure:
         raise BadValue(f"{path}: it or its maps: {failure}; run `faintfield noise` again") from failure
     return FittedNoise(model, unusable, response, record.mosaic or None)
@@ -237,10 +324,10 @@ def _numbers(path: Path, record: NoiseRecord) -> dict[str, float]:
     """Return the numbers that a reconstruction needs; an unknown dark current counts as none."""
     values: dict[str, float] = {}
     for name in _NEEDED:
-        measured: Measured = getattr(record, name)
-        why = measured.why or "no reason stated"
-        if measured.value is not None:
-            values[name] = measured.value
+        estimate: Estimate = getattr(record, name)
+        why = estimate.why or "no reason stated"
+        if estimate.value is not None:
+            values[name] = estimate.value
         elif name == "dark_current_e_per_s":
             inform(f"{path}: {name} is not known ({why}); 0 is taken, which is right for short exposures only")
             values[name] = 0.0
@@ -257,13 +344,8 @@ def read_maps(
     """Return the maps (row, column) that the file has, of those named; none without a file."""
     if not is_file(path):
         return {}
-    maps = read_arrays(
-        path,
-        names,
-        shape=shape,
-        max_bytes=_MAPS_WRITTEN * shape[0] * shape[1] * np.dtype(np.float64).itemsize,
-        remedy="run `faintfield noise` again for this camera",
-    )
+    remedy = "run `faintfield noise` again for this camera"
+    maps = read_arrays(path, names, shape=shape, max_bytes=_MAPS_WRITTEN * 8 * shape[0] * shape[1], remedy=remedy)
     if record.maps_sha256 and sha256(path) != record.maps_sha256:
         raise BadValue(f"{path}: is not the file that {NOISE_FILE} names by its SHA-256; run `faintfield noise` again")
     return maps

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from faintfield.calib.estimate import Estimate
 from faintfield.pipelines.commands.calibration import noise
 from faintfield.pipelines.errors import BadValue, MissingFile, WrongSize
 from faintfield.pipelines.formats.files import sha256, write_record
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, NOISE_MAPS, NoiseRecord, read_noise
-from faintfield.pipelines.formats.results.noise_fit import Measured
 from tests.calib.noise.darkroom import Chip, specimen
 from tests.pipelines.forms import GOLDEN
 from tests.pipelines.noise_sets import measure_sensor, take_set, write_frames
@@ -93,7 +93,7 @@ def of_a_mosaic(folder: Path, seed: int, **changes: Any) -> Path:
 def test_planes_of_a_mosaic_are_compared_separately(tmp_path: Path) -> None:
     """A step of one plane's offsets is no change of its map."""
     first = of_a_mosaic(tmp_path / "a", 1)
-    moved = of_a_mosaic(tmp_path / "b", 2, offset_dn=Measured(500.0, 0.1, (499.8, 500.2)))
+    moved = of_a_mosaic(tmp_path / "b", 2, offset_dn=Estimate(500.0, 0.1, (499.8, 500.2)))
     comparison = noise(compare=(first, moved))
     assert comparison.changed == ["G_r1c0: offset_dn"]
     assert [plane_map.plane for plane_map in comparison.maps] == ["R_r0c0", "G_r0c1", "G_r1c0", "B_r1c1"]

@@ -9,9 +9,9 @@ from unittest import mock
 import numpy as np
 import pytest
 
+from faintfield.calib.estimate import Estimate
 from faintfield.pipelines.commands.calibration import noise
-from faintfield.pipelines.formats.results.noise import NoiseRecord
-from faintfield.pipelines.formats.results.noise_fit import EmvaRecord, Measured
+from faintfield.pipelines.formats.results.noise import EmvaRecord, NoiseRecord
 from faintfield.pipelines.pages.emva_page import EMVA_PAGE
 from tests.calib.noise.darkroom import specimen
 from tests.pipelines.noise_sets import measure_sensor, take_set, write_frames
@@ -99,13 +99,13 @@ def test_efficiency_above_one_is_refused_with_reason(tmp_path: Path) -> None:
     chip = replace(chip, sensor=replace(chip.sensor, quantum_efficiency=1.0))
     frames = take_set(chip, rng, (0.1, 10.0), 2, (2000.0, 6000.0))
     measured = measure_sensor(write_frames(tmp_path / "all", frames)).quantum_efficiency
-    assert isinstance(measured, Measured)
+    assert isinstance(measured, Estimate)
     assert measured.value == pytest.approx(1.0, rel=0.1)
     for _, keys in frames[-4:]:
         keys["photons"] /= 4
     result = measure_sensor(write_frames(tmp_path / "quarter", frames))
     measured = result.quantum_efficiency
-    assert isinstance(measured, Measured)
+    assert isinstance(measured, Estimate)
     assert measured.value is None
     assert "the flats hold " in str(measured.why)
     assert [warning for warning in result.warnings if "the flats hold " in warning]

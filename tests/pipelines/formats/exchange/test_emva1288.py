@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import tifffile
 
+from faintfield.calib.estimate import Estimate
 from faintfield.pipelines.commands.exports import export_emva1288
 from faintfield.pipelines.commands.imports import import_emva1288
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.exchange.emva1288 import read_descriptor
 from faintfield.pipelines.formats.files import sha256
 from faintfield.pipelines.formats.frames import read_frame
-from faintfield.pipelines.formats.results.noise_fit import Measured
 from faintfield.pipelines.formats.sets.noise_set import load_noise_set
 from tests.calib.noise.darkroom import expose, specimen
 from tests.pipelines.noise_sets import measure_sensor, take_set, write_frames
@@ -64,7 +64,7 @@ def test_reference_data_become_a_noise_set(tmp_path: Path) -> None:
     assert [frame.exposure_s for frame in settings.frame if frame.kind == "dark"] == [0.1, 0.1, 30.0, 30.0]
     measured = measure_sensor(tmp_path / "set")
     assert measured.gain_dn_per_e.value == pytest.approx(0.5, rel=0.06)
-    assert isinstance(measured.quantum_efficiency, Measured)
+    assert isinstance(measured.quantum_efficiency, Estimate)
     assert measured.quantum_efficiency.value == pytest.approx(0.5, rel=0.06)
     inputs = json.loads((tmp_path / "set" / "provenance.json").read_text())["inputs"]
     assert len(inputs) == 9
