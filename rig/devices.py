@@ -17,7 +17,7 @@ from faintfield.rig.clock import Clock, WallClock
 from faintfield.rig.errors import PlanRefused
 from faintfield.rig.micromanager import SharedCore
 from faintfield.rig.plan import StepKind
-from faintfield.rig.plugins import checked_options, plugin_camera, plugin_controller
+from faintfield.rig.plugins import convert_options, plugin_camera, plugin_controller
 from faintfield.rig.settings import RigSettings
 from faintfield.rig.simulation.controller.bench import Bench, PtyLink
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
@@ -97,7 +97,7 @@ def _shared_core(settings: RigSettings) -> SharedCore | None:
 
 
 def _micromanager_stage(settings: StageSettings) -> MicroManagerStage:
-    return checked_options(settings.options, MicroManagerStage, "[stage] with protocol = 'micromanager'")
+    return convert_options(settings.options, MicroManagerStage, "[stage] with protocol = 'micromanager'")
 
 
 def open_stage(

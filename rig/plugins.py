@@ -84,10 +84,8 @@ def _with_options(table: dict[str, Any], kind: type[Struct]) -> dict[str, Any]:
 def plugin_camera(settings: PluginSettings, clock: Clock) -> Camera:
     """Return the camera that a plug-in makes; raises `PlanRefused` if its settings are wrong or it cannot be used."""
     plugin = _load(CAMERAS, settings.name, CameraPlugin)
-    options = checked_options(settings.options, plugin.settings, f"[camera] with backend = {settings.name!r}")
-    with _translated_failures(
-        PluginFailed, f"the plug-in {settings.name!r} failed", "correct its settings, or tell its authors"
-    ):
+    options = convert_options(settings.options, plugin.settings, f"[camera] with backend = {settings.name!r}")
+    with _raise_as(PluginFailed, f"the plug-in {settings.name!r} failed", "correct its settings, or tell its authors"):
         return PluginCamera(settings.name, plugin.make(options, clock))
 
 
@@ -100,47 +98,43 @@ class PluginCamera:
 
     def open(self) -> None:
         """Connect to the camera."""
-        with self._translated_failures():
+        with self._as_camera_errors():
             self._camera.open()
 
     def report(self) -> CameraReport:
         """Return the camera's name, limits and settings."""
-        with self._translated_failures():
+        with self._as_camera_errors():
             return self._camera.report()
 
     def expose(self, exposure_s: float, number: int) -> Exposure:
         """Take one frame."""
-        with self._translated_failures():
+        with self._as_camera_errors():
             return self._camera.expose(exposure_s, number)
 
     def temperature_c(self) -> float | None:
         """Return the temperature of the sensor in °C, None if the camera reports none."""
-        with self._translated_failures():
+        with self._as_camera_errors():
             return self._camera.temperature_c() if isinstance(self._camera, Thermometer) else None
 
     def close(self) -> None:
         """Disconnect."""
-        with self._translated_failures():
+        with self._as_camera_errors():
             self._camera.close()
 
-    def _translated_failures(self) -> AbstractContextManager[None]:
-        return _translated_failures(
-            CameraError, f"the plug-in {self._name!r} failed", "tell its authors", passing=RigError
-        )
+    def _as_camera_errors(self) -> AbstractContextManager[None]:
+        return _raise_as(CameraError, f"the plug-in {self._name!r} failed", "tell its authors", passing=RigError)
 
 
 def plugin_controller(settings: StageSettings, clock: Clock) -> Controller:
     """Return the controller that a plug-in makes; raises as `plugin_camera` does."""
     name = settings.protocol
     plugin = _load(STAGES, name, StagePlugin)
-    options = checked_options(settings.options, plugin.settings, f"[stage] with protocol = {name!r}")
-    with _translated_failures(
-        PluginFailed, f"the plug-in {name!r} failed", "correct its settings, or tell its authors"
-    ):
+    options = convert_options(settings.options, plugin.settings, f"[stage] with protocol = {name!r}")
+    with _raise_as(PluginFailed, f"the plug-in {name!r} failed", "correct its settings, or tell its authors"):
         return plugin.make(options, settings, clock)
 
 
-def checked_options[T](options: Mapping[str, Any], kind: type[T], place: str) -> T:
+def convert_options[T](options: Mapping[str, Any], kind: type[T], place: str) -> T:
     """Return `options` as the Struct `kind`; raises `PlanRefused` for keys and values that it does not take."""
     try:
         return msgspec.convert(dict(options), kind)
@@ -169,9 +163,7 @@ def _load[T](group: str, name: str, kind: type[T]) -> T:
     if len(packages) > 1:
         raise UnknownPlugin(f"{key} = {name!r} is offered by {' and '.join(packages)}; uninstall all but one")
     what = f"the plug-in {name!r} of {packages[0]}"
-    with _translated_failures(
-        PluginFailed, f"{what} cannot be imported", "install what it needs, or another version of it"
-    ):
+    with _raise_as(PluginFailed, f"{what} cannot be imported", "install what it needs, or another version of it"):
         plugin = entries[0].load()
     settings = getattr(plugin, "settings", None)
     strict = (
@@ -184,7 +176,7 @@ def _load[T](group: str, name: str, kind: type[T]) -> T:
 
 
 @contextmanager
-def _translated_failures(
+def _raise_as(
     kind: type[RigError], what: str, remedy: str, passing: type[Exception] | tuple[()] = ()
 ) -> Iterator[None]:
     """Raise a failure inside, of whatever type, as one of `kind`; those of type `passing` pass as they are."""

@@ -51,7 +51,7 @@ class AravisDevice:
         except BaseException:
             camera.release()
             raise
-        self._pretends = (vendor, model) == ("Aravis", "Fake")  # it sends a pattern at once, however long it exposes
+        self._is_fake = (vendor, model) == ("Aravis", "Fake")  # it sends a pattern at once, however long it exposes
 
     def release(self) -> None:
         """Disconnect as soon as no call in another thread uses the camera."""
@@ -211,7 +211,7 @@ class AravisDevice:
         stamps = Stamps(
             library.call("arv_buffer_get_system_timestamp", frame), library.call("arv_buffer_get_timestamp", frame)
         )
-        self._times.check(stamps, requested, now, 0.0 if self._pretends else exposure_s)
+        self._times.check(stamps, requested, now, 0.0 if self._is_fake else exposure_s)
         metadata: dict[str, str | int | float] = {
             "camera": self._name,
             "pixel_format": self._format.name,

@@ -167,11 +167,11 @@ class FrameTimes:
                 f"{exposure_s:g} s lasts: it began before the request; take it again"
             )
         if stamps.camera_ns:
-            self._check_own(stamps, requested, exposure_s)
+            self._check_camera_clock(stamps, requested, exposure_s)
             self._newest_ns = stamps.camera_ns
             self._last[exposure_s] = (requested.clock_ns + after_ns, stamps.camera_ns)
 
-    def _check_own(self, stamps: Stamps, requested: Moment, exposure_s: float) -> None:
+    def _check_camera_clock(self, stamps: Stamps, requested: Moment, exposure_s: float) -> None:
         if stamps.camera_ns <= self._newest_ns:
             raise CameraError("a frame is not newer by the camera's clock than the one before; open the camera again")
         last = self._last.get(exposure_s)

@@ -85,7 +85,7 @@ class FolderCamera:
             while self._clock.now_s() < asked_s + bound_s:
                 arrival = self._arriving_file(known, arrival)
                 if arrival is not None:
-                    reason = self._lateness() or self._earliness(arrival, exposure_s, asked_s, folder_time_s)
+                    reason = self._late_reason() or self._early_reason(arrival, exposure_s, asked_s, folder_time_s)
                     if reason:
                         known.add(arrival.path)
                         raise CameraError(f"{arrival.path}: {reason}")
@@ -135,7 +135,7 @@ class FolderCamera:
             return before
         return _Arrival(*state, self._clock.now_s())
 
-    def _lateness(self) -> str:
+    def _late_reason(self) -> str:
         """Return why the first file after a frame that did not come in time is refused, "" if it is another."""
         if self._known_when_late is None:
             return ""
@@ -145,7 +145,7 @@ class FolderCamera:
             "files often come late"
         )
 
-    def _earliness(self, arrival: _Arrival, exposure_s: float, asked_s: float, folder_time_s: float | None) -> str:
+    def _early_reason(self, arrival: _Arrival, exposure_s: float, asked_s: float, folder_time_s: float | None) -> str:
         """Return why a file is refused whose exposure was begun before the request, perhaps while the stage moved."""
         # Read after the listing, so that a file is never taken for an earlier one than it is
         after_s = self._clock.now_s() - asked_s

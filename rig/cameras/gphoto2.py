@@ -109,7 +109,7 @@ class GPhoto2Camera:
 
     def _shutter_choices(self) -> dict[float, str]:
         choices = list(self._shutter().get_choices())
-        return {seconds: choice for choice in choices if (seconds := shutter_s(choice)) is not None}
+        return {seconds: choice for choice in choices if (seconds := parse_shutter_s(choice)) is not None}
 
     def _set_shutter(self, exposure_s: float) -> None:
         choices = self._shutter_choices()
@@ -168,7 +168,7 @@ class GPhoto2Camera:
         return content, place.name
 
 
-def shutter_s(text: str) -> float | None:
+def parse_shutter_s(text: str) -> float | None:
     """Return the seconds of a camera's text for an exposure time, such as 1/250, 0.0100s or 2.5; None for bulb."""
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)(?:/(\d+(?:\.\d+)?))?\s*s?\s*", text)
     if match is None or float(match[2] or 1) == 0:

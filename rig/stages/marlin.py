@@ -128,7 +128,7 @@ class MarlinController:
         """
         for _ in range(_MAX_STARTS):
             marker, echoed = next(self._markers), False
-            self._line.send(marlin.numbered(0, "M110 N0") + f"M118 {marker}\n".encode("ascii"))
+            self._line.send(marlin.number_line(0, "M110 N0") + f"M118 {marker}\n".encode("ascii"))
             for text in self._line.lines_until(self._clock.now_s() + _ECHO_S):
                 if echoed and isinstance(marlin.parse(text), Ok):
                     self._line_number = 0
@@ -142,7 +142,7 @@ class MarlinController:
         """Return whether the controller accepts the next line number, as none does after a restart; None if mute."""
         marker = next(self._markers)
         self._line_number += 1
-        self._line.send(marlin.numbered(self._line_number, f"M118 {marker}"))
+        self._line.send(marlin.number_line(self._line_number, f"M118 {marker}"))
         answered = None
         for text in self._line.lines_until(self._clock.now_s() + _QUIET_S):
             if marker in text:
@@ -171,7 +171,7 @@ class MarlinController:
             self._check(marlin.parse(text), command)
         self._line_number += 1
         for _ in range(_MAX_SENDINGS):
-            self._line.send(marlin.numbered(self._line_number, command))
+            self._line.send(marlin.number_line(self._line_number, command))
             messages = self._await_ok(command, bound_s)
             if messages is not None:
                 return messages

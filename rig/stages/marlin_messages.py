@@ -105,7 +105,7 @@ def parse(line: str) -> Message:
     return next((make(match) for form, make in _FORMS if (match := re.fullmatch(form, line))), Unknown(line))
 
 
-def numbered(number: int, command: str) -> bytes:
+def number_line(number: int, command: str) -> bytes:
     """Return `command` with its line number and the XOR of its bytes, so that Marlin recognises a damaged line."""
     line = f"N{number} {command}".encode("ascii")
     return line + b"*%d\n" % reduce(xor, line)

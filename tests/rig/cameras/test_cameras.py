@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from faintfield.rig.cameras.aravis import AravisCamera
-from faintfield.rig.cameras.gphoto2 import GPhoto2Camera, shutter_s
+from faintfield.rig.cameras.gphoto2 import GPhoto2Camera, parse_shutter_s
 from faintfield.rig.cameras.micromanager import MicroManagerCamera
 from faintfield.rig.cameras.protocol import CameraReport, Exposure, Thermometer, call_within
 from faintfield.rig.cameras.settings import (
@@ -50,7 +50,7 @@ def test_simulated_camera() -> None:
     [("1/250", 1 / 250), ("0.0100s", 0.01), ("30", 30.0), ("bulb", None), ("1/0", None), ("0", None)],
 )  # fmt: skip
 def test_exposure_times_in_words_of_cameras(words: str, seconds: float | None) -> None:
-    assert shutter_s(words) == (None if seconds is None else pytest.approx(seconds))
+    assert parse_shutter_s(words) == (None if seconds is None else pytest.approx(seconds))
 
 
 def test_exposure_is_either_file_or_array() -> None:

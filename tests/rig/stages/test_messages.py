@@ -65,7 +65,7 @@ def test_marlin_lines_are_read() -> None:
 
 @given(st.integers(0, 10**6), st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=60))
 def test_numbered_line_carries_xor_of_its_bytes(number: int, command: str) -> None:
-    line, _, checksum = marlin.numbered(number, command).rstrip(b"\n").rpartition(b"*")
+    line, _, checksum = marlin.number_line(number, command).rstrip(b"\n").rpartition(b"*")
     assert line == f"N{number} {command}".encode()
     assert int(checksum) == reduce(xor, line)
 
