@@ -24,7 +24,6 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def _say_compiling() -> None:
-    """Say why the command takes longer than usual."""
     from faintfield.pipelines.console import inform
 
     inform("compiling kernels, which takes up to a minute; later runs find them where numba can write its cache")

@@ -22,14 +22,14 @@ from faintfield.pipelines.formats.results.stacks import at_depths
 from faintfield.pipelines.formats.results.surface import SURFACE_FILE, SurfaceFileRecord, results_below, surfaces_below
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS
 from faintfield.pipelines.formats.units import StatedUnits, named_by, units_of
-from faintfield.pipelines.pages.page import figure, format_depths, template
-from faintfield.pipelines.pages.report_calibration import (
+from faintfield.pipelines.pages.calibration_pages import (
     GeometrySection,
     NoiseSection,
     find_calibration,
     geometry_section,
     noise_section,
 )
+from faintfield.pipelines.pages.page import figure, format_depths, template
 from faintfield.pipelines.pages.report_pictures import plane_sections
 from faintfield.pipelines.pages.report_planes import error_sections, method_title, read_planes
 from faintfield.pipelines.pages.report_sets import SetSection, set_sections

@@ -25,7 +25,7 @@ from faintfield.pipelines.formats.results.geometry import (
     write_geometry,
 )
 from faintfield.pipelines.formats.sets.board_set import load_board_set
-from faintfield.pipelines.pages.geometry_page import geometry_page
+from faintfield.pipelines.pages.calibration_pages import geometry_page
 
 # Above this the nodes of one sweep no longer stand for those of another.
 _MAX_REPEATABILITY_MM = 0.020

@@ -71,11 +71,7 @@ _COMPUTATIONS = (
     *(f"{_CALIBRATION}.geometry.{name}" for name in ("calibrate_geometry", "stage_report", "transfer_sigma_at")),
     *(f"{_CALIBRATION}.noise.calibrate", f"{_WORKFLOWS}.noise.emva_page", f"{_WORKFLOWS}.noise.draw_page"),
     f"{_WORKFLOWS}.geometry.geometry_page",
-    *(
-        f"faintfield.pipelines.pages.{module}.{name}"
-        for module in ("geometry_page", "report_calibration")
-        for name in ("node_drawing", "sigma_maps")
-    ),
+    *(f"faintfield.pipelines.pages.calibration_pages.{name}" for name in ("node_drawing", "sigma_maps")),
 )
 
 

@@ -18,9 +18,8 @@ from faintfield.calib.geometry import GeometrySettings
 from faintfield.pipelines.formats.image_files import write_png
 from faintfield.pipelines.formats.results.figures import Overview
 from faintfield.pipelines.formats.results.geometry import GeometryRecord
-from faintfield.pipelines.pages.geometry_page import holdout_rows
+from faintfield.pipelines.pages.calibration_pages import find_calibration, holdout_rows
 from faintfield.pipelines.pages.report import write_report
-from faintfield.pipelines.pages.report_calibration import find_calibration
 from faintfield.pipelines.pages.report_sets import photon_budget
 from tests.pipelines.by_hand import write_by_hand
 from tests.pipelines.conftest import Command, assert_refused, run_undrawn
