@@ -37,23 +37,9 @@ def capture_session(
 ) -> int:
     """Begin or resume the session in `folder` and take its missing frames; return the number of frames taken.
 
-    Parameters
-    ----------
-    settings : RigSettings
-        Content of the rig.toml.
-    folder : Path
-        Folder of the session.
-    unattended : bool
-        Give every prompt its usual answer.
-    page : bool
-        Show the capture on a local web page as well.
-    planes : LiveOrder, optional
-        Show planes of the frames so far on that page.
-
-    Raises
-    ------
-    RigError, DiskFull
-        The plan is not possible, the session cannot be used, or the capture stopped before its end.
+    Unattended, every prompt gets its usual answer. The `page` shows `planes` of the frames so far, if they are ordered.
+    Raises `RigError` or `DiskFull` if the plan is not possible, the session cannot be used, or the capture stopped
+    before its end.
     """
     frozen = _plan_session(settings, folder)
     if is_sealed(folder):
@@ -113,10 +99,7 @@ def _open_page(panel: CapturePanel, stack: ExitStack, frames: SessionFrames, ord
 def read_pixels(path: Path) -> Pixels | None:
     """Return the pixels of a frame's file, None if files of its kind cannot be decoded here.
 
-    Raises
-    ------
-    CameraError
-        The file is truncated or damaged, or holds what is no number.
+    Raises `CameraError` if the file is truncated or damaged, or holds what is no number.
     """
     try:
         pixels_dn = read_frame(path).pixels_dn

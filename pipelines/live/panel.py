@@ -40,14 +40,9 @@ class ShownFrame(Struct, frozen=True, eq=False):
 class CapturePanel:
     """The `OperatorInterface` of a capture; views show its state and press its buttons.
 
-    If it is `unattended`, it gives every prompt its unattended answer; requests are still accepted.
-
-    Attributes
-    ----------
-    asked, status, shown
-        Prompt, status and frame to show, or None. Each is replaced as a whole, so any thread may read them.
-    on_change : list of callable
-        Called in the thread of the capture when any of these has changed.
+    If it is `unattended`, it gives every prompt its unattended answer; requests are still accepted. Prompt, status and
+    frame to show are each replaced as a whole, so any thread may read them; then the functions `on_change` are called
+    in the thread of the capture.
     """
 
     def __init__(self, *, unattended: bool) -> None:

@@ -58,7 +58,10 @@ class CompleteViews:
         self.views: list[int] = []
 
     def add(self, view: int, images: ElementalImages) -> None:
-        """Add a frame of a node."""
+        """Add a frame to all planes; return its pixels (row, column), in electrons.
+
+        Raises `InputError` if the file cannot be read, or does not fit the others.
+        """
         frames = self._waiting[view]
         frames.append(images)
         if len(frames) < self._frames_per_view:
@@ -95,13 +98,7 @@ class _Frame(NamedTuple):
 
 
 class PlaneAccumulator:
-    """Planes of a scene at some depths, from the frames in a folder that are there.
-
-    Attributes
-    ----------
-    frames : dict of int to LiveFrame
-        The frames that were added, by the number of their exposure.
-    """
+    """Planes of a scene at some depths, from frames in a folder; `frames` are those added, by number of exposure."""
 
     def __init__(self, scene: LiveScene, folder: Path, depths_mm: Sequence[float]) -> None:
         self.scene = scene

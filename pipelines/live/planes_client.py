@@ -42,16 +42,8 @@ _MAX_FAREWELL_S = 5.0
 class LiveOrder(Struct, frozen=True):
     """Request for live planes: the first message to their process.
 
-    Parameters
-    ----------
-    session, rig : Path
-        Folder of the session, and its rig.toml.
-    depths_mm : tuple of float
-        Depths of the planes.
-    noise, geometry : Path, optional
-        Results of `faintfield noise` and `faintfield geometry`; by default those in the session or beside rig.toml.
-    fx_px : float, optional
-        Focal length in pixels, where no geometry.json is found.
+    Without `noise` and `geometry`, results of `faintfield noise` and `faintfield geometry` are taken from the session
+    or from beside its rig.toml; the focal length is for the case that no geometry.json is found.
     """
 
     session: Path
@@ -121,17 +113,8 @@ class LiveStatus(Struct, frozen=True):
 class PlanesClient:
     """Live planes, as the capture and its page see them; `frames`, called in another thread, returns the valid ones.
 
-    Attributes
-    ----------
-    status : LiveStatus, optional
-        Latest state of the process; None before the first.
-    pid : int
-        Number of the process.
-
-    Raises
-    ------
-    OSError
-        The process cannot be started.
+    `status` is the latest state of the process, of number `pid`; None before the first. Raises OSError if the process
+    cannot be started.
     """
 
     def __init__(self, order: LiveOrder, frames: Callable[[], tuple[LiveFrame, ...]]) -> None:

@@ -48,12 +48,8 @@ class LiveScene:
 def live_scene(order: LiveOrder, frozen: FrozenPlan, frame: Frame) -> LiveScene:
     """Return what is known of the dark scene of a session that is being captured, given any of its frames.
 
-    Poses are the measured ones of a geometry.json if it has all nodes, else those that the stage is told.
-
-    Raises
-    ------
-    RigError, InputError
-        No lens is known, or a file cannot be used; the message says what to give.
+    Poses are the measured ones of a geometry.json if it has all nodes, else those that the stage is told. Raises
+    `RigError` or `InputError` if no lens is known, or a file cannot be used; the message says what to give.
     """
     height, width = frame.pixels_dn.shape[:2]
     size_px = (width, height)

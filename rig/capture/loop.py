@@ -44,12 +44,8 @@ class Capture:
     def run(self) -> None:
         """Take every missing frame and seal the session.
 
-        Raises
-        ------
-        CaptureStopped
-            The operator stopped the capture; running it again resumes it.
-        RigError
-            Stage, camera or disk failed, and the operator chose to stop.
+        Raises `CaptureStopped`, or the failure of stage, camera or disk after which the operator chose to stop. Running
+        the capture again resumes it.
         """
         try:
             if self._session.missing():

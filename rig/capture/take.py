@@ -120,14 +120,7 @@ class FrameTaker:
     def take(self, frame: PlannedFrame) -> None:
         """Move to the node of a frame and take it; before the first frame of a step, wait for the sensor to be cool.
 
-        Raises
-        ------
-        StageError, NotHomed
-            The stage failed, or is not where it was sent.
-        CameraError
-            The camera failed, or its temperature does not settle within `settle_limit_s` (`CameraTimeout`).
-        SessionUnwritable
-            The frame could not be written.
+        Raises `StageError`, `NotHomed`, `CameraError` or `SessionUnwritable`, after which the frame is still missing.
         """
         settings = self._session.rig.camera
         if settings.settle_temperature_c is not None and frame.step != self._cooled_step:

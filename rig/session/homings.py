@@ -31,16 +31,9 @@ class DriftCheck(Struct, frozen=True):
 class HomingGroups(Struct, frozen=True):
     """The homing groups of a session; between groups, positions may differ by as much as the switches do.
 
-    Parameters
-    ----------
-    groups : dict
-        Homing group of each committed frame, by the number of its exposure (`CommittedFrame.intent`); None in sessions
-        that do not record homing.
-    spread_mm : tuple of float, optional
-        Standard deviation of where the switches close, per axis or one number if the axes home together, from the
-        drift checks that passed; it contains the jitter of their timing. None with fewer than two such checks.
-    checks : int
-        Number of these checks.
+    Each committed frame has a group, by the number of its exposure, or None in sessions that do not record homing.
+    `spread_mm` is the standard deviation of where the switches close, per axis or one number if the axes home together,
+    from so many drift checks that passed; it contains the jitter of their timing, and is None with fewer than two.
     """
 
     groups: dict[int, int | None]

@@ -113,12 +113,8 @@ class Sealed(Struct, frozen=True):
 class Journal:
     """An open journal, which is also the `TrafficLog` of the stage; `read_only` opens it on a write-protected medium.
 
-    Raises
-    ------
-    SessionCorrupt
-        The journal is damaged, not what a capture wrote, or missing, unless it is to be created.
-    SessionUnreadable, SessionUnwritable
-        The system does not let it be opened.
+    Raises `SessionCorrupt` if it is missing, unless it is to be created, damaged or not what a capture wrote, and
+    `SessionUnreadable` or `SessionUnwritable` if the system does not let it be opened.
     """
 
     def __init__(self, path: Path, *, create: bool = False, read_only: bool = False) -> None:

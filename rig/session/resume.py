@@ -156,20 +156,11 @@ def _toml_text(value: object) -> str:
 
 @contextmanager
 def open_session(folder: Path, plan: FrozenPlan | None, progress: Progress = iter) -> Iterator[Session]:
-    """Begin a session in `folder`, or resume the one it holds; close it when the block ends.
+    """Begin a session in `folder`, or resume the one it holds by its own plan; close it when the block ends.
 
-    A session that was begun keeps its own plan. `progress` wraps the iteration over the frames whose hashes are
-    compared, to draw a progress bar.
-
-    Raises
-    ------
-    SessionBusy
-        Another capture holds the session.
-    SessionCorrupt
-        Plan and journal disagree or are damaged, the session is complete, or the folder holds other files and no
-        session.
-    SessionUnreadable, SessionUnwritable
-        The folder cannot be read or written.
+    `progress` wraps the iteration over the frames whose hashes are compared, to draw a progress bar. Raises
+    `SessionBusy` if another capture holds the session, `SessionCorrupt` if it is damaged or complete, or if the folder
+    holds other files, and `SessionUnreadable` or `SessionUnwritable` if the system does not let it be used.
     """
     with translate_errors(folder):
         make_folder(folder)

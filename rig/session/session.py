@@ -49,12 +49,7 @@ class WrittenFile(Struct, frozen=True):
 class Session:
     """A session open for writing, as `rig.session.resume.open_session` yields it.
 
-    Attributes
-    ----------
-    frames : tuple of PlannedFrame
-        All frames of the plan, in order.
-    rig : RigSettings
-        The settings that apply now: those of plan.json, with the changes that were made before it was resumed.
+    `rig` has the settings that apply now: those of plan.json, with the changes that were made before it was resumed.
     """
 
     def __init__(self, folder: Path, frozen: FrozenPlan, journal: Journal) -> None:

@@ -42,11 +42,10 @@ class Verdict(Struct, frozen=True):
         takes their frames.
     planned, present, superseded : int
         Number of frames in the plan, of those whose file is present and unchanged, and of files replaced by a later
-        take of the same frame.
-    missing, left_out : tuple of str
-        Names of the frames still to be taken, and of those that the operator left out.
-    suspect : tuple of str
-        Names of frames that were kept although the next check of the stage failed, or the stage was homed before it.
+        take.
+    missing, left_out, suspect : tuple of str
+        Names of the frames still to be taken, of those that the operator left out, and of those that were kept although
+        the next check of the stage failed, or the stage was homed before it.
     sealed : bool
         Whether the session is complete.
     """

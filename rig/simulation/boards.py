@@ -26,12 +26,8 @@ _SIX_POSES = (
 class SimulatedBoard:
     """The inner corners of a chessboard in space.
 
-    Parameters
-    ----------
-    corner_rows, corner_columns, square_mm : int, int, float
-        Numbers of inner corners, and distance of neighbouring ones.
-    rt_ref_board : array (6,)
-        Rodrigues rad and mm, from the board, whose origin is its first corner, to the reference camera.
+    `rt_ref_board` leads from the board, whose origin is its first corner, to the reference camera: Rodrigues rad and
+    mm.
     """
 
     corner_rows: int

@@ -152,10 +152,9 @@ _RIPPLE_K, _RIPPLES, _PERIODS_S = 0.03, 3, (40.0, 200.0)
 
 
 class Cooling:
-    """The temperature of a sensor over time.
+    """The temperature of a sensor that is `start_c` at time 0, and swings a little about the set point in the end.
 
-    It falls, or rises, exponentially from `start_c` at time 0, and then swings a little about the set point; the
-    distance from it falls to 1/e in `time_s`. Without a start it stays at the set point, without any ripple.
+    The distance from it falls to 1/e in `time_s`. Without a start it stays at the set point, without any ripple.
     """
 
     def __init__(self, start_c: float | None, set_point_c: float, time_s: float, seed: int) -> None:

@@ -13,17 +13,11 @@ from faintfield.rig.simulation.optics import SimulatedOptics
 
 @dataclass(frozen=True)
 class TexturedPlane:
-    """A flat object: a picture with an outline, in space.
+    """A flat object in space: a picture (row, column[, 3]) of reflectance 0…1, grey or red, green, blue.
 
-    Parameters
-    ----------
-    reflectance, opacity : float array (row, column[, 3]), float array (row, column)
-        Reflectance 0…1, grey or red, green, blue; 1 on the object, 0 outside it, between them at its edge.
-    pitch_mm : float
-        Distance of neighbouring texture samples.
-    rt_ref_plane : (float, …) of six
-        Pose: Rodrigues rotation (rad) and translation (mm) from the plane's coordinates, whose origin is the centre of
-        the texture, to the reference camera's.
+    Opacity (row, column) is 1 on the object, 0 outside it, and between them at its edge. Samples are `pitch_mm` apart.
+    `rt_ref_plane` leads from the plane's coordinates, whose origin is the centre of the texture, to the reference
+    camera's: Rodrigues rad and mm.
     """
 
     name: str
@@ -63,17 +57,10 @@ def render(
     *,
     samples_per_px: int = 2,
 ) -> Iterator[RenderedView]:
-    """Yield the view of each pose, casting the ray of every detector sample through the planes from near to far.
+    """Yield the view of each pose (view, 6), casting the ray of every detector sample through the planes, near to far.
 
-    Parameters
-    ----------
-    planes, optics : sequence of TexturedPlane, SimulatedOptics
-        Planes, all grey or all in colour, which must not intersect, since they are ordered by the depth of their
-        centres; optics of the camera.
-    poses_rt_cam_ref : array (view, 6)
-        Poses of the camera, Rodrigues rad and mm.
-    samples_per_px : int
-        Rays per pixel and axis, whose mean is the pixel; several reduce aliasing.
+    The planes are all grey or all in colour. They must not intersect, since they are ordered by the depth of their
+    centres. Each pixel is the mean of `samples_per_px` rays per axis; several reduce aliasing.
     """
     rays = optics.rays(samples_per_px)
     colours = planes[0].reflectance.shape[2:]

@@ -40,15 +40,10 @@ class Shape(Protocol):
 
 @dataclass(frozen=True)
 class Rectangle:
-    """A flat rectangle, without limits by default; its texture begins at its centre.
+    """A flat rectangle, without limits by default; its texture begins at its centre. Unrotated, it faces the camera.
 
-    Parameters
-    ----------
-    rt_ref_plane : (float, …) of six
-        Rodrigues rotation (rad) and translation (mm) from the rectangle's coordinates, whose origin is its centre, to
-        the reference camera's. Unrotated, it faces the camera.
-    half_size_mm : (float, float)
-        Half of its width and of its height.
+    `rt_ref_plane` leads from its coordinates, whose origin is its centre, to the reference camera's: Rodrigues rad and
+    mm.
     """
 
     rt_ref_plane: tuple[float, float, float, float, float, float]
@@ -172,17 +167,10 @@ def _minus(points_mm: Vectors, place_mm: tuple[float, ...]) -> Vectors:
 
 @dataclass(frozen=True)
 class Surface:
-    """A shape with a matt texture.
+    """A shape with a matt texture of reflectance (row, column[, 3]), 0…1, grey or red, green, blue.
 
-    Parameters
-    ----------
-    name, shape : str, Shape
-        Name of the object, and where it is.
-    reflectance : float array (row, column) or (row, column, 3)
-        Reflectance 0…1, grey or red, green, blue; a tile that repeats. Its first sample is where the shape's texture
-        begins.
-    pitch_mm : float
-        Distance of neighbouring texture samples.
+    The texture is a tile that repeats, whose samples are `pitch_mm` apart; its first sample is where the shape's
+    texture begins.
     """
 
     name: str

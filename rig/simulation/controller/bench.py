@@ -129,19 +129,9 @@ class Bench:
     """A simulated stage, on which motions take no real time.
 
     Driver and controller take turns on one clock: when the driver waits for bytes, simulated time advances until some
-    arrive or the wait is over. The bytes pass through `link`.
-
-    Parameters
-    ----------
-    firmware, link : callable, Link
-        Makes the controller; the cable.
-    resets_on_open : bool
-        Whether opening the port restarts the controller, as it does on most boards.
-
-    Attributes
-    ----------
-    host_busy_until_s : float
-        Until then the driver does not come to read what has arrived, as on a computer that is busy; faults raise it.
+    arrive or the wait is over. The bytes pass through `link`. Unless told otherwise, opening the port restarts the
+    controller, as on most boards. Until `host_busy_until_s`, which faults raise, the driver does not come to read what
+    has arrived, as on a computer that is busy.
     """
 
     def __init__(self, firmware: MakeFirmware, link: Link | None = None, *, resets_on_open: bool = True) -> None:

@@ -26,15 +26,7 @@ type ByteFilter = Callable[[bytes], bytes]
 
 
 class Wire:
-    """Carries bytes in both directions at 115200 baud, through filters.
-
-    Attributes
-    ----------
-    filters_to_controller, filters_to_host : list
-        Filters of the bytes, in order; faults add filters.
-    connected : bool
-        Whether the cable is plugged in.
-    """
+    """Carries bytes in both directions at 115200 baud, through filters, which faults add, while it is connected."""
 
     def __init__(self, clock: SimulatedClock) -> None:
         self.filters_to_controller: list[ByteFilter] = []
@@ -97,10 +89,7 @@ def parse_parameters(text: str) -> dict[str, float]:
 class SimulatedFirmware(ABC):
     """A simulated controller; `boot_s` is the time from a restart to the first line that it sends.
 
-    Attributes
-    ----------
-    homing_slowdown : float
-        Factor on the time of homing; faults raise it.
+    Homing takes `homing_slowdown` times as long, which faults raise.
     """
 
     protocol: ClassVar[ProtocolName]

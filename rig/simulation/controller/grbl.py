@@ -35,17 +35,8 @@ DEFAULTS = {
 class SimulatedGrbl(SimulatedFirmware):
     """Firmware, settings and mechanics of a GRBL stage.
 
-    Parameters
-    ----------
-    settings : dict
-        Values that differ from the defaults, by `$` number; settings survive restarts.
-    boot_s, play_mm : float
-        Time from a restart to the banner, and play in both drives.
-
-    Attributes
-    ----------
-    door_is_open : bool
-        Whether the safety door stays open; `open_door` alone is a door that is closed again at once.
+    `settings` are the values that differ from the defaults, by `$` number; they survive restarts. Both drives have
+    play. With `door_is_open` the safety door stays open; `open_door` alone is a door that is closed again at once.
     """
 
     door_is_open = False

@@ -28,10 +28,9 @@ class ScheduledEvent:
 
 
 class SimulatedClock:
-    """A `Clock` that runs scheduled events.
+    """A `Clock` that runs scheduled events; waiting runs those that are due, in order and each at its own time.
 
-    Waiting runs the events that are due, in order and each at its own time. Time does not pass otherwise, so a
-    simulation gives the same result on any computer, however busy.
+    Time does not pass otherwise, so a simulation gives the same result on any computer, however busy.
     """
 
     def __init__(self) -> None:

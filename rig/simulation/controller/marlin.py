@@ -28,14 +28,8 @@ _SEEK_MM_PER_S, _BUMP_MM = 25.0, 5.0
 class SimulatedMarlin(SimulatedFirmware):
     """Firmware, settings and mechanics of a Marlin stage.
 
-    Parameters
-    ----------
-    travel_mm : (float, float)
-        Lengths of the axes; coordinates run upwards from zero, where the switches are.
-    boot_s, play_mm : float
-        Time from a restart to the first line, and play in both drives.
-    realtime_position : bool
-        Whether M114 R reports the real position.
+    Coordinates run upwards from zero, where the switches are. Both drives have play. With `realtime_position`, M114 R
+    reports the real position.
     """
 
     protocol = "marlin"
