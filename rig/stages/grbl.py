@@ -82,9 +82,9 @@ class GrblController:
     def home(self, axis: AxisIndex | None, bound_s: float) -> AnswerTime:
         """Home within `bound_s`: GRBL answers nothing until the switches are found."""
         self._command("$H" if axis is None else f"$H{self._axes[axis]}", bound_s)
-        time, self._homing = self._line.answer_time, False
+        time = self._line.answer_time
         self._wait_until_still(0.0)
-        self._alarm, self._count_lost = None, False
+        self._alarm, self._count_lost, self._homing = None, False, False
         return time
 
     def follow(self, path: Sequence[Point], feed_mm_per_s: float, predicted_s: float) -> Point:
