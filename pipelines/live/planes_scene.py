@@ -137,9 +137,7 @@ def _planned_set(session: Path, plan: CapturePlan, lens: Lens, fitted: FittedNoi
     return ElementalSet(
         session,
         settings,
-        lens,
         fitted.model,
-        offset_from_files=False,
         flat=flat,
         unusable=fitted.unusable,
         poses="nominal",

@@ -194,7 +194,6 @@ def true_set(session: Path, truth: Path) -> ElementalSet:
     return replace(
         elemental_set,
         settings=msgspec.structs.replace(elemental_set.settings, camera=camera, view=views),
-        lens=free.lens,
         noise=noise,
         flat=free.flat,
         unusable=np.zeros_like(elemental_set.unusable),

@@ -31,7 +31,7 @@ STANDARD = "EMVA 1288 release 4.0"
 # The quantities that a reconstruction needs.
 _NEEDED = ("offset_dn", "gain_dn_per_e", "read_noise_e", "dark_current_e_per_s")
 
-# The maps that it takes, and the largest number of them that is written, of 8 bytes a pixel.
+# The maps that it takes, and how many, of 8 bytes a pixel, are written at most.
 _MAPS_TAKEN, _MAPS_WRITTEN = (*_NEEDED, "mask", "relative_response"), 12
 
 
@@ -272,7 +272,8 @@ def read_fitted_noise(path: Path, size_px: tuple[int, int]) -> FittedNoise:
     is not known or out of its range.
     """
     record = read_noise(path)
-    values, shape = _numbers(path, record), size_px[::-1]
+    numbers: dict[str, Any] = {**_numbers(path, record)}
+    shape = size_px[::-1]
     for row, column in record.hot_pixels:
         if not (0 <= row < shape[0] and 0 <= column < shape[1]):
             raise BadValue(f"{path}: hot pixel [{row}, {column}] is not one of {shape}; measure this camera")
@@ -288,7 +289,7 @@ def read_fitted_noise(path: Path, size_px: tuple[int, int]) -> FittedNoise:
         response = np.where(unusable, 1, np.maximum(response, 0)).astype(np.float32)
         if not np.isfinite(response).all():
             raise BadValue(f"{path}: relative_response of {NOISE_MAPS} is not finite; run `faintfield noise` again")
-    numbers: dict[str, Any] = values | maps
+    numbers |= maps
     for name in ("quantum_efficiency", "saturation_dn"):
         value = getattr(record, name)
         value = value.value if isinstance(value, Estimate) else value  # written with or without its error

@@ -6,6 +6,7 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
+from faintfield.calib.lens import Lens
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.reading import is_file
 from faintfield.pipelines.formats.toml_files import inside, read_toml, write_toml
@@ -28,6 +29,11 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defau
     distortion: tuple[float, ...] = ()
     mosaic: tuple[str, ...] | None = None
     flat: str | None = None
+
+    @property
+    def lens(self) -> Lens:
+        """The lens; ValueError if it is impossible."""
+        return Lens(self.size_px, self.fx_px, self.fy_px, self.cx_px, self.cy_px, self.distortion)
 
 
 class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):

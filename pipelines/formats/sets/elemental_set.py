@@ -1,8 +1,8 @@
 """The elemental set: checked images and poses, whatever files they come from, and values in its units."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field, is_dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +50,7 @@ class ElementalSet:
     ----------
     folder, settings : Path, ElementalSetFile
         Its folder, to which paths in the set are relative, and what `elemental.toml` says.
-    lens, noise : Lens, NoiseModel
+    noise : NoiseModel
         Of the camera; with `offset_from_files`, each raw file's masked pixels give its offset, and the model's is zero.
     flat : float array (row, column), optional
         Relative response.
@@ -66,9 +66,7 @@ class ElementalSet:
 
     folder: Path
     settings: ElementalSetFile
-    lens: Lens
     noise: NoiseModel
-    offset_from_files: bool
     flat: NDArray[np.float32] | None
     unusable: NDArray[np.bool_]
     measured_in: Path | None = None
@@ -77,6 +75,16 @@ class ElementalSet:
     noise_reference: tuple[Path, ...] = ()
     bright_view: tuple[Path, float] | None = None
     read_frame: Callable[[Path, tuple[int, int]], Frame] = field(default=read_frame, compare=False, repr=False)
+
+    @cached_property
+    def lens(self) -> Lens:
+        """Lens of the camera."""
+        return self.settings.camera.lens
+
+    @property
+    def offset_from_files(self) -> bool:
+        """The offset of each raw file is the black level of its masked pixels."""
+        return isinstance(self.settings.noise, Noise) and self.settings.noise.offset_dn is None
 
     @property
     def reference_view(self) -> int:
@@ -214,29 +222,21 @@ def load_set(folder: Path) -> ElementalSet:
     path = folder if is_file(folder) else folder / FILE_NAME
     folder = path.parent
     settings = read_set_file(path)
-    camera = settings.camera
-    with _naming(path, "camera"):
-        lens = Lens(camera.size_px, camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.distortion)
-    with _naming(path, "noise"):
+    camera, table = settings.camera, "camera"
+    try:
+        _ = camera.lens
+        table = "noise"
         noise = _noise(folder, settings)
+    except ValueError as failure:
+        raise BadValue(f"{path}: {table}: {failure}; correct it") from failure
     return ElementalSet(
         folder,
         settings,
-        lens,
         noise.model,
-        offset_from_files=isinstance(settings.noise, Noise) and settings.noise.offset_dn is None,
         flat=noise.response if camera.flat is None else _read_flat(folder / camera.flat, camera.size_px),
         unusable=noise.unusable,
         noise_reference=tuple(path for path in [folder / NOISE_REFERENCE] if is_file(path)),
     )
-
-
-@contextmanager
-def _naming(path: Path, table: str) -> Iterator[None]:
-    try:
-        yield
-    except ValueError as failure:
-        raise BadValue(f"{path}: {table}: {failure}; correct it") from failure
 
 
 def _noise(folder: Path, settings: ElementalSetFile) -> FittedNoise:

@@ -65,9 +65,7 @@ def nominal_session(folder: Path, kind: SceneKind = "dark_scene", geometry: Path
         ElementalSetFile(
             format=1, exposure_s=exposure_s, reference_view=reference, camera=camera, noise=NOISE_FILE, view=views
         ),
-        lens,
         noise.model,
-        offset_from_files=False,
         flat=None if noise.response is None else relative_to_axis(noise.response, noise.unusable, lens),
         unusable=noise.unusable,
         measured_in=measured_in / GEOMETRY_FILE if is_folder(measured_in) else measured_in,
@@ -157,9 +155,8 @@ def with_measured_geometry(elemental_set: ElementalSet, path: Path) -> Elemental
     geometry, settings = read_geometry(path, CameraPoses), elemental_set.settings
     poses = {entry.node: entry.rt_cam_ref for entry in geometry.nodes}
     _check_match(path, geometry, elemental_set)
-    lens = geometry.camera_lens()
     stated = ("fx_px", "fy_px", "cx_px", "cy_px", "distortion")
-    camera = msgspec.structs.replace(settings.camera, **{name: getattr(lens, name) for name in stated})
+    camera = msgspec.structs.replace(settings.camera, **{name: getattr(geometry.lens, name) for name in stated})
     shifts_mm = _homing_shifts_mm(path, geometry, elemental_set)
     views = [
         msgspec.structs.replace(
@@ -169,7 +166,7 @@ def with_measured_geometry(elemental_set: ElementalSet, path: Path) -> Elemental
         if view.node is not None
     ]
     measured = msgspec.structs.replace(settings, camera=camera, view=views)
-    return replace(elemental_set, settings=measured, lens=lens, measured_in=path, poses="measured")
+    return replace(elemental_set, settings=measured, measured_in=path, poses="measured")
 
 
 def _homing_shifts_mm(path: Path, geometry: CameraPoses, elemental_set: ElementalSet) -> dict[int, NDArray[np.float64]]:
