@@ -143,13 +143,12 @@ def read_frame(
             raise
         except Exception as failure:  # decoders raise exceptions of a dozen types
             raise UnreadableImage(_cannot_decode(path, getattr(failure, "strerror", None) or str(failure))) from failure
-    shape = frame.pixels_dn.shape
-    if len(shape) not in (2, 3) or (len(shape) == 3 and shape[2] != 3):
+    shape, dtype = frame.pixels_dn.shape, frame.pixels_dn.dtype
+    if len(shape) not in (2, 3) or shape[2:] not in ((), (3,)) or dtype.kind not in "buif":
         raise UnreadableImage(
-            f"{path}: holds an array of shape {shape}; one grey or RGB picture is wanted; export it as such"
+            f"{path}: holds {dtype} values of shape {shape}; one grey or RGB picture of real numbers is wanted; export "
+            "it as such"
         )
-    if frame.pixels_dn.dtype.kind not in "buif":
-        raise UnreadableImage(f"{path}: holds {frame.pixels_dn.dtype} pixels; real numbers are wanted; export it so")
     return frame
 
 

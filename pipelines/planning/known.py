@@ -1,6 +1,6 @@
 """Knowledge of a rig before a capture: its sensor, its lens, the light of the scene, and how fast it is."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -36,6 +36,9 @@ _MAX_SATURATED = 0.01
 # The middle of a flat reaches to either side by the frame's larger side over this.
 _MIDDLE_DIVISOR = 20
 
+# What is known of a sensor, by the names of `Sensor` and of records of noise.
+_NUMBERS = ("read_noise_e", "dark_current_e_per_s", "gain_dn_per_e", "quantum_efficiency")
+
 _NOT_MEASURED = "no noise calibration; give the result of `faintfield noise` as --noise, or --read-noise-e"
 
 # Its objects take a while to draw.
@@ -58,34 +61,23 @@ class Sensor:
 
 def known_sensor(settings: RigSettings, noise: Path | None, **options: float | None) -> Sensor:
     """Return the sensor by `options`, named as attributes of `Sensor`, else measured (`noise`), else simulated."""
+    record = model = None
     if noise is not None:
-        sensor = _measured_sensor(noise)
+        source, record = str(noise), read_noise(noise)
+        numbers = {name: getattr(record, name) for name in _NUMBERS}
+        if record.quantum_efficiency is None:
+            numbers["quantum_efficiency"] = Estimate(None, why="not stated")
     elif isinstance(settings.camera, SimulatedSettings):
-        sensor = _simulated_sensor(settings.camera)
+        source, sensor = "the simulated camera", _simulated_experiment(settings.camera).sensor
+        numbers = {name: getattr(sensor, name) for name in _NUMBERS}
+        model = NoiseModel(sensor.offset_dn, saturation_dn=sensor.saturation_dn, **numbers)
     else:
-        unknown = Estimate(None, why=_NOT_MEASURED)
-        sensor = Sensor("no calibration", unknown, unknown, unknown, unknown)
-    numbers: dict[str, Any] = {name: Estimate(value) for name, value in options.items() if value is not None}
-    return replace(sensor, source=f"options and {sensor.source}", **numbers) if numbers else sensor
-
-
-def _measured_sensor(path: Path) -> Sensor:
-    record = read_noise(path)
-    efficiency = record.quantum_efficiency
-    if not isinstance(efficiency, Estimate):  # a record holds it with or without its error
-        efficiency = Estimate(efficiency, why="not stated" if efficiency is None else None)
-    return Sensor(
-        str(path), record.read_noise_e, record.dark_current_e_per_s, record.gain_dn_per_e, efficiency, record, path
-    )
-
-
-def _simulated_sensor(settings: SimulatedSettings) -> Sensor:
-    sensor = _simulated_experiment(settings).sensor
-    names = ("read_noise_e", "dark_current_e_per_s", "gain_dn_per_e", "quantum_efficiency")
-    numbers = {name: getattr(sensor, name) for name in names}
-    model = NoiseModel(sensor.offset_dn, saturation_dn=sensor.saturation_dn, **numbers)
-    measured: dict[str, Any] = {name: Estimate(value) for name, value in numbers.items()}
-    return Sensor("the simulated camera", **measured, model=model)
+        source, numbers = "no calibration", dict.fromkeys(_NUMBERS, Estimate(None, why=_NOT_MEASURED))
+    stated = {name: value for name, value in options.items() if value is not None}
+    known: dict[str, Any] = {
+        name: value if isinstance(value, Estimate) else Estimate(value) for name, value in (numbers | stated).items()
+    }
+    return Sensor(f"options and {source}" if stated else source, **known, record=record, path=noise, model=model)
 
 
 @dataclass(frozen=True)

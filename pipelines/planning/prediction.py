@@ -51,9 +51,9 @@ class DepthPrediction(Struct, frozen=True, kw_only=True):
 class Alternative(Struct, frozen=True, kw_only=True):
     """One row of the table: another exposure, grid or number of frames, at the depth that the fewest views see.
 
-    `snr` is that of one elemental image by eq. (4), all its frames added up. `sigma_e` is in electrons of one frame of
-    the record's `exposure_s`, so that rows can be compared. `scene_s` and `time_s` are the durations of the dark scene
-    and of the whole session, without prompts. `why_not` says why the rig cannot do this.
+    `snr` is that of one elemental image by eq. (4). `sigma_e` is in electrons of one frame of the record's
+    `exposure_s`, so that rows can be compared. `scene_s` is the duration of the dark scene, `time_s` that of the
+    session without prompts.
     """
 
     exposure_s: float
@@ -71,11 +71,10 @@ class Alternative(Struct, frozen=True, kw_only=True):
 class PredictionRecord(Struct, frozen=True, kw_only=True):
     """Prediction of what a capture will show.
 
-    `exposure_s` is that of the first frame of the dark scene at a node, in which `light_e` and `photons` are expected,
-    and `total_exposure_s` that of all its frames. `snr` and `snr_linear` are those of an elemental image of a uniform
-    object, by eq. (4) and eq. (7). `pixel_share` is the part of the pixels that have the scarcest colour. `rose_k` is
-    by how many standard deviations a visible square stands out. `cheapest` is the shortest session that reaches
-    `wanted_sigma_e`. `vignetting` says why it is not known.
+    `light_e` and `photons` are expected in the first frame of the dark scene at a node, of `exposure_s`. `snr` and
+    `snr_linear` are those of an elemental image of a uniform object, by eq. (4) and eq. (7). `pixel_share` is the part
+    of the pixels that have the scarcest colour; by `rose_k` standard deviations a visible square stands out. `cheapest`
+    is the shortest session that reaches `wanted_sigma_e`. `vignetting` says why it is not known.
     """
 
     rig: str

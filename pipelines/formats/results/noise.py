@@ -1,7 +1,4 @@
-"""The record of a sensor's noise, `noise.json`, with its maps per pixel, and both as a reconstruction takes them.
-
-Keys stand in the file in the order of the fields; docs/noise.md explains the quantities.
-"""
+"""The record of a sensor's noise, `noise.json` (docs/noise.md), its maps, and both as a reconstruction takes them."""
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass

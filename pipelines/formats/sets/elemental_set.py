@@ -44,24 +44,14 @@ _MAX_RESPONSE = 1e6
 
 @dataclass(frozen=True)
 class ElementalSet:
-    """An elemental set that has been checked when it was loaded: everything but the pixels.
+    """An elemental set that was checked when it was loaded: everything but the pixels.
 
-    Attributes
-    ----------
-    folder, settings : Path, ElementalSetFile
-        Its folder, to which paths in the set are relative, and what `elemental.toml` says.
-    noise : NoiseModel
-        Of the camera; with `offset_from_files`, each raw file's masked pixels give its offset, and the model's is zero.
-    flat : float array (row, column), optional
-        Relative response.
-    unusable : bool array (row, column)
-        Pixels that are left out (hot, dead).
-    measured_in, described_in : Path, str
-        The geometry.json of the lens, None if the lens is the set's own; the file that says what the images are.
-    noise_reference, bright_view : tuple of Path, (Path, float)
-        Exposures without light, and the reference view in plenty of light with its exposure in s, if there are any.
-    read_frame : callable
-        Reads a frame, given its path and its size in px; see `reconstruction.channels.keeping_frames`.
+    Paths in the set are relative to its `folder`, and `settings` is what `elemental.toml` says. `noise` is the model of
+    the camera, whose offset is zero with `offset_from_files`. `flat` is the relative response (row, column), and
+    `unusable` are the pixels that are left out (hot, dead). `measured_in` is the geometry.json of the lens, if it is
+    not the set's own; `described_in` the file that says what the images are. `noise_reference` are exposures without
+    light, and `bright_view` is the reference view in plenty of light with its exposure in s, if there are any.
+    `read_frame` reads a frame, given its path and its size in px; see `reconstruction.channels.keeping_frames`.
     """
 
     folder: Path
