@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray, ray_from_surface
+from faintfield.calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray, ray_from_surface, transfer
 from faintfield.pipelines.formats.frames import Lattice
 from faintfield.pipelines.formats.plane_poses import Place, TiltedPlane, depth_of
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
@@ -195,3 +195,14 @@ def principal_shift(elemental_set: ElementalSet) -> NDArray[np.float64] | None:
             "a sheared or rectified light field has none: remove one of the two"
         )
     return np.asarray(shift_px / [camera.fx_px, camera.fy_px])
+
+
+def seen_from(
+    elemental_set: ElementalSet, depth_mm: float, pixels: NDArray[np.float64], views: Sequence[int]
+) -> NDArray[np.float64]:
+    """Return where views see what pixels (pixel, 2) of the reference view show of a plane: x, y (view, pixel, 2)."""
+    camera, poses = elemental_set.settings.camera, elemental_set.poses_rt_cam_ref
+    # The lens has the camera's principal point; a view with its own has its picture shifted
+    shifts = elemental_set.principal_points_px() - np.array([camera.cx_px, camera.cy_px])
+    straight, plane = pixels - shifts[elemental_set.reference_view], fronto_parallel_rt_ref_plane(depth_mm)
+    return np.array([transfer(elemental_set.lens, poses[view], plane, straight) + shifts[view] for view in views])

@@ -41,7 +41,7 @@ def reconstruct_folder(
     if surface is not None:
         elemental_set, page_in = open_set(folder, out, scene, geometry)
         out = out or page_in / SURFACE_FOLDER
-        return surface_and_report(elemental_set, out, surface.resolve(elemental_set), page_in=page_in)
+        return surface_and_report(elemental_set, out, surface, page_in=page_in)
     runner = make_runner(options.workers, options.scheduler)
     planes = select_planes(options)
     elemental_set, out = open_set(folder, out, scene, geometry)

@@ -33,7 +33,7 @@ from faintfield.pipelines.reconstruction.request import (
     resolve,
     select_planes,
 )
-from faintfield.pipelines.reconstruction.surface.request import SURFACE_FOLDER, SurfaceSelection, select_surface
+from faintfield.pipelines.reconstruction.surface.request import SURFACE_FOLDER, SurfaceRequest, select_surface
 from faintfield.pipelines.workflows.geometry import measure_stage
 from faintfield.pipelines.workflows.noise import measure_sensor
 from faintfield.pipelines.workflows.reconstruct import open_set, reconstruct_and_report, surface_and_report
@@ -201,7 +201,7 @@ def _problem_of(path: Path) -> str | None:
 def session_steps(
     session: Path,
     planes: Selection | None,
-    surface: SurfaceSelection | None = None,
+    surface: SurfaceRequest | None = None,
     runner: Runner | None = None,
     *,
     lens: LensName = "opencv5",
@@ -259,14 +259,14 @@ def _step_of_planes(session: Path, opened: Opened, selection: Selection, runner:
     )
 
 
-def _step_of_surface(session: Path, opened: Opened, selection: SurfaceSelection) -> Step:
+def _step_of_surface(session: Path, opened: Opened, selection: SurfaceRequest) -> Step:
     def options() -> object:
         elemental_set, _ = opened()
-        return selection.resolve(elemental_set).options(elemental_set.poses)
+        return selection.options(elemental_set)
 
     def make() -> object:
         elemental_set, out = opened()
-        return surface_and_report(elemental_set, out / SURFACE_FOLDER, selection.resolve(elemental_set), page_in=out)
+        return surface_and_report(elemental_set, out / SURFACE_FOLDER, selection, page_in=out)
 
     return Step(
         "surface",

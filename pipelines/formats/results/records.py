@@ -120,7 +120,6 @@ class SolveRecord(Struct, frozen=True, kw_only=True):
     passes: int
     objective: float | None = None
     certificate: Certificate | None = None
-    mean_e: float
     passes_before: float | UnsetType = UNSET
     penalty_weight_curve: list[WeightScore] | UnsetType | None = UNSET
     penalty: PenaltyRecord | UnsetType = UNSET

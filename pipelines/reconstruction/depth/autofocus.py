@@ -6,12 +6,13 @@ import numpy as np
 from msgspec import UNSET
 from numpy.typing import NDArray
 
-from faintfield.calib.homography import fronto_parallel_rt_ref_plane, image_lattice, transfer
+from faintfield.calib.homography import image_lattice
 from faintfield.pipelines.console import inform, working
 from faintfield.pipelines.formats.results.records import BestFocusRecord
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, rounded_depth
-from faintfield.pipelines.reconstruction.depth.comparison import BinnedViews, Compared, binned_views, check_places
-from faintfield.recon.depth.agreement import DepthEstimate, Significance
+from faintfield.pipelines.reconstruction.depth.comparison import BinnedViews, binned_views, check_places
+from faintfield.pipelines.reconstruction.operators import seen_from
+from faintfield.recon.depth.agreement import Agreement, DepthEstimate, Significance, depth_map
 from faintfield.recon.depth.focus import MIN_SAMPLES, SURE, likeliest_depth_mm, places_of_focus
 from faintfield.recon.errors import NothingInFocus
 
@@ -59,19 +60,21 @@ def best_focus(elemental_set: ElementalSet, out: Path, range_mm: tuple[float, fl
     in this range, or no better than shuffled ones.
     """
     near_mm, far_mm = sorted(range_mm or searched_range_mm(elemental_set))
-    ranges, compared, found, significance = _narrowed(elemental_set, out, (near_mm, far_mm))
+    ranges, bins_px, planes, found, significance = _narrowed(elemental_set, out, (near_mm, far_mm))
     sure = found.confidence >= SURE
     places = places_of_focus(found, _DEPTHS)
     if not places:
         raise _nothing(elemental_set, ranges[0])
-    depths = sorted({rounded_depth(elemental_set, _refined(compared, found, place)) for place in places})
+    searched_mm = _searched_depths(ranges[-1])
+    refined_mm = (_refined(planes, searched_mm, found, place) for place in places)
+    depths = sorted({rounded_depth(elemental_set, depth) for depth in refined_mm})
     between = elemental_set.depths_text(near_mm, far_mm, join=" and ")
     inform(f"planes of best focus between {between}: {elemental_set.depths_text(*depths)}")
     return BestFocusRecord(
         depth_mm=depths,
         searched_mm=ranges,
         depths_per_search=_DEPTHS,
-        bins_px=compared.bins_px,
+        bins_px=bins_px,
         share_of_sure=[float(place.sum() / sure.sum()) for place in places],
         p_value=significance.p_value if significance else UNSET,
         z_shuffled=significance.z if significance else UNSET,
@@ -110,27 +113,28 @@ def _moved_px(elemental_set: ElementalSet, range_mm: tuple[float, float]) -> flo
 
 def _narrowed(
     elemental_set: ElementalSet, out: Path, range_mm: tuple[float, float]
-) -> tuple[list[tuple[float, float]], Compared, DepthEstimate, Significance | None]:
+) -> tuple[list[tuple[float, float]], int, list[Agreement], DepthEstimate, Significance | None]:
     """Search a range, then the part of it in which anything was found.
 
-    Returns all ranges, the last comparison, and the significance of the first.
+    Returns all ranges, the bins, agreement and depths of the last, and the significance of the first.
     """
     views = views_of_search(elemental_set, range_mm, out)
     significance = check_places(views, range_mm)
     ranges = [range_mm]
     while True:
-        compared = views.compared(_searched_depths(ranges[-1]))
-        found = compared.depth_map()
+        depths_mm = _searched_depths(ranges[-1])
+        planes = views.agreements(depths_mm)
+        found = depth_map(planes, np.asarray(depths_mm))
         sure = found.confidence >= SURE
         if np.count_nonzero(sure) < MIN_SAMPLES:
             raise _nothing(elemental_set, range_mm)
         first, last = np.quantile(found.index[sure], _RANGE_OF_SURE) + np.array([-_MARGIN_STEPS, _MARGIN_STEPS])
         if len(ranges) == _SEARCHES or last - first > _SHRUNK_ENOUGH * _DEPTHS:
-            return ranges, compared, found, significance
-        inverse = np.interp([first, last], np.arange(_DEPTHS), 1 / np.asarray(compared.depths_mm))
+            return ranges, views.bins_px, planes, found, significance
+        inverse = np.interp([first, last], np.arange(_DEPTHS), 1 / np.asarray(depths_mm))
         narrower = float(1 / inverse[0]), float(1 / inverse[1])
         if _moved_px(elemental_set, narrower) < _LEAST_MOVED_PX:
-            return ranges, compared, found, significance
+            return ranges, views.bins_px, planes, found, significance
         ranges.append(narrower)
         views = views_of_search(elemental_set, ranges[-1], out)
 
@@ -196,25 +200,20 @@ def _range_of_disparities(elemental_set: ElementalSet, least_px: float, largest_
 
 def overlap(elemental_set: ElementalSet, depth_mm: float) -> float:
     """Return the share of the reference view's part of a plane that the views see, too, on average."""
-    pixels = image_lattice(elemental_set.settings.camera.size_px)
-    plane = fronto_parallel_rt_ref_plane(depth_mm)
-    centres = elemental_set.principal_points_px()
-    camera = elemental_set.settings.camera
-    # The lens has the camera's principal point; a view with its own has its picture shifted
-    shifts = centres - np.array([camera.cx_px, camera.cy_px])
-    seen = [
-        transfer(elemental_set.lens, rt, plane, pixels - shifts[elemental_set.reference_view]) + shift
-        for rt, shift in zip(elemental_set.poses_rt_cam_ref, shifts, strict=True)
-    ]
-    inside = np.all((np.array(seen) > -0.5) & (np.array(seen) < np.array(camera.size_px) - 0.5), axis=2)
+    size_px = elemental_set.settings.camera.size_px
+    views = range(len(elemental_set.settings.view))
+    seen = seen_from(elemental_set, depth_mm, image_lattice(size_px), views)
+    inside = np.all((seen > -0.5) & (seen < np.array(size_px) - 0.5), axis=2)
     return float(inside.mean())
 
 
-def _refined(compared: Compared, estimate: DepthEstimate, place: NDArray[np.bool_]) -> float:
+def _refined(
+    planes: list[Agreement], depths_mm: list[float], estimate: DepthEstimate, place: NDArray[np.bool_]
+) -> float:
     """Return the depth, between those of the search, at which the views agree best on a place."""
     middle = round(float(np.median(estimate.index[place])))
     near = slice(max(middle - _STEPS_AROUND, 0), middle + _STEPS_AROUND + 1)
-    return likeliest_depth_mm(compared.planes[near], compared.depths_mm[near], place)
+    return likeliest_depth_mm(planes[near], depths_mm[near], place)
 
 
 def _nothing(elemental_set: ElementalSet, range_mm: tuple[float, float]) -> NothingInFocus:

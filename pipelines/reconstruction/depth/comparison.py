@@ -4,25 +4,23 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations
 from math import factorial
+from operator import add
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.calib.homography import fronto_parallel_rt_ref_plane, transfer
 from faintfield.pipelines.console import inform, progress, working
 from faintfield.pipelines.formats.large_arrays import memory_or_file
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.channels import ChannelLayout, channel_layouts, load_channel
-from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
+from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid, seen_from
 from faintfield.recon.depth.agreement import (
     Agreement,
-    DepthEstimate,
     Significance,
     agreement,
     bins_for,
-    depth_map,
     disagreement,
     significance,
 )
@@ -67,19 +65,6 @@ _SEED = 20
 
 
 @dataclass(frozen=True)
-class Compared:
-    """The agreement of the views at each depth, all colours together, in bins of `bins_px` detector pixels."""
-
-    planes: list[Agreement]
-    depths_mm: Sequence[float]
-    bins_px: int
-
-    def depth_map(self) -> DepthEstimate:
-        """Return where each sample is sharp."""
-        return depth_map(self.planes, np.asarray(self.depths_mm))
-
-
-@dataclass(frozen=True)
 class BinnedViews:
     """The views of a set in bins of `bins_px` detector pixels, one colour after the other, the middle colour first."""
 
@@ -87,8 +72,8 @@ class BinnedViews:
     colours: list[tuple[ChannelLayout, ElementalImages]]
     bins_px: int
 
-    def compared(self, depths_mm: Sequence[float]) -> Compared:
-        """Compare the views at each depth."""
+    def agreements(self, depths_mm: Sequence[float]) -> list[Agreement]:
+        """Return the agreement of the views at each depth, all colours together."""
         planes: list[Agreement] = []
         for layout, images in self.colours:
             factory = OperatorFactory(
@@ -98,8 +83,8 @@ class BinnedViews:
                 agreement(factory.at(depth, _between_bins(self.elemental_set, depth, self.bins_px)), images)
                 for depth in progress(depths_mm, f"comparing the views, {layout.name}")
             ]
-            planes = [_sum(*pair) for pair in zip(planes, found, strict=True)] if planes else found
-        return Compared(planes, depths_mm, self.bins_px)
+            planes = [Agreement(*map(add, *pair)) for pair in zip(planes, found, strict=True)] if planes else found
+        return planes
 
 
 def _between_bins(elemental_set: ElementalSet, depth_mm: float, bins_px: int) -> PlaneGrid:
@@ -121,28 +106,17 @@ def binned_views(elemental_set: ElementalSet, middle_mm: float, out: Path, *, mi
     layouts = channel_layouts(elemental_set)
     middle = len(layouts) // 2
     images = load_channel(elemental_set, layouts[middle], memory_or_file(out))
-    bins = _bins(elemental_set, layouts[middle], images, middle_mm, min_bins_px)
+    lattice, factory = layouts[middle].lattices[0], OperatorFactory(elemental_set, layouts[middle], images)
+    needed = bins_for(factory.at(middle_mm, plane_grid(elemental_set, middle_mm)), images)
+    bins = min(max(needed, -(-min_bins_px // max(lattice.step))), min(lattice.shape) // _MIN_BINS_ACROSS)
+    del factory
     colours = [(layouts[middle], images.binned(bins))]
     if np.prod(colours[0][1].electrons.shape[1:]) <= _ENOUGH_BINS:
         for layout in layouts[:middle] + layouts[middle + 1 :]:
             del images  # before the next colour is read
             images = load_channel(elemental_set, layout, memory_or_file(out))
             colours.append((layout, images.binned(bins)))
-    return BinnedViews(elemental_set, colours, bins * max(layouts[middle].lattices[0].step))
-
-
-def _bins(
-    elemental_set: ElementalSet, layout: ChannelLayout, images: ElementalImages, middle_mm: float, min_bins_px: int
-) -> int:
-    lattice = layout.lattices[0]
-    needed = bins_for(
-        OperatorFactory(elemental_set, layout, images).at(middle_mm, plane_grid(elemental_set, middle_mm)), images
-    )
-    return min(max(needed, -(-min_bins_px // max(lattice.step))), min(lattice.shape) // _MIN_BINS_ACROSS)
-
-
-def _sum(first: Agreement, second: Agreement) -> Agreement:
-    return Agreement(*(a + b for a, b in zip(first, second, strict=True)))
+    return BinnedViews(elemental_set, colours, bins * max(lattice.step))
 
 
 @dataclass(frozen=True)
@@ -290,17 +264,8 @@ def _places_px(
     """Return where others see the bins of the reference view at each depth: column, row (view, depth, bin, 2)."""
     rows, columns = np.indices(shape)
     pixels = (np.stack([columns.ravel(), rows.ravel()], axis=-1) + 0.5) * bins_px - 0.5
-    camera, poses = elemental_set.settings.camera, elemental_set.poses_rt_cam_ref
-    shifts = elemental_set.principal_points_px() - np.array([camera.cx_px, camera.cy_px])
-    straight = pixels - shifts[elemental_set.reference_view]
-    seen = [
-        [
-            transfer(elemental_set.lens, poses[view], fronto_parallel_rt_ref_plane(depth), straight) + shifts[view]
-            for depth in depths_mm
-        ]
-        for view in chosen
-    ]
-    places = (np.array(seen) + 0.5) / bins_px - 0.5
+    seen = np.stack([seen_from(elemental_set, depth, pixels, chosen) for depth in depths_mm], axis=1)
+    places = (seen + 0.5) / bins_px - 0.5
     # Outside is outside, also behind a camera
     return np.clip(np.nan_to_num(places, nan=-1.0), -1.0, shape[::-1]).astype(np.float32)
 

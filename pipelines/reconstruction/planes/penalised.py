@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from msgspec import structs
@@ -14,7 +15,7 @@ from faintfield.recon.solver.cross_validation import MIN_VIEWS, cross_validated_
 from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.solver.initialization import mean_light_e, universal_penalty_weight
 from faintfield.recon.solver.penalties import Penalty
-from faintfield.recon.solver.pmlem import PmlemIterate, pmlem
+from faintfield.recon.solver.pmlem import pmlem
 from faintfield.recon.solver.proximal import DualField
 from faintfield.recon.solver.uncertainty import (
     Answers,
@@ -61,11 +62,6 @@ class Pilot:
     other_colours: Image
 
 
-def mean_e(plane: Image) -> float:
-    """Return the mean of a plane, summed in float64."""
-    return float(np.mean(plane, dtype=np.float64))
-
-
 @dataclass(frozen=True)
 class Objective:
     """Objective that PMLEM minimises, without the penalty's weight.
@@ -95,16 +91,10 @@ class Objective:
 
 def solve_pmlem(objective: Objective, options: SolverOptions) -> list[Solution]:
     """Run PMLEM to its certificate and return the planes; all their records are of the one iteration."""
-    choice = _choose_weight(objective, options)
-    record, iterate = certified(objective, choice.start, choice.weight, choice.dual, options)
-    record = structs.replace(
-        record,
-        penalty_weight_chosen=choice.chosen,
-        passes_before=1 + choice.passes,
-        penalty_weight_curve=choice.curve,
-    )
-    planes = objective.posed.operator.planes_of(iterate)
-    return [Solution(plane, structs.replace(record, mean_e=mean_e(plane))) for plane in planes]
+    weight, start, dual, how = _choose_weight(objective, options)
+    record, samples = certified(objective, start, weight, dual, options)
+    record = structs.replace(record, **{"passes_before": 1.0, "penalty_weight_curve": None} | how)
+    return [Solution(plane, record) for plane in objective.posed.operator.planes_of(samples)]
 
 
 def with_sigma(
@@ -151,13 +141,22 @@ def certified(
     for count, iterate in enumerate(iterates, 1):
         if iterate.certificate.distance <= _TOLERANCE or max(count, iterate.passes) >= limit:
             break
+    certificate = Certificate(
+        kind=_PMLEM_CERTIFICATE,
+        value=float(iterate.certificate.distance),
+        stationarity=float(iterate.certificate.stationarity),
+        slack=float(iterate.certificate.slack),
+        tolerance=_TOLERANCE,
+        reached=bool(iterate.certificate.distance <= _TOLERANCE),
+        passes=iterate.passes,
+        inner_steps=iterate.inner_steps,
+    )
     record = SolveRecord(
         penalty_weight=weight,
         penalty_weight_chosen="given",
         passes=iterate.passes,
         objective=iterate.objective,
-        certificate=_certificate(iterate),
-        mean_e=mean_e(iterate.plane),
+        certificate=certificate,
         penalty=PenaltyRecord(objective.penalty.name, objective.penalty.smoothing_e),
         likelihood=objective.posed.images.likelihood.name,
     )
@@ -175,46 +174,24 @@ def solve_then_sigma(objective: Objective, options: SolverOptions) -> tuple[Solu
     return solution, partial(standard_deviation, local, weight, objective.penalty, generator)
 
 
-def _certificate(iterate: PmlemIterate) -> Certificate:
-    certificate = iterate.certificate
-    return Certificate(
-        kind=_PMLEM_CERTIFICATE,
-        value=float(certificate.distance),
-        stationarity=float(certificate.stationarity),
-        slack=float(certificate.slack),
-        tolerance=_TOLERANCE,
-        reached=bool(certificate.distance <= _TOLERANCE),
-        passes=iterate.passes,
-        inner_steps=iterate.inner_steps,
-    )
-
-
-@dataclass(frozen=True)
-class _Choice:
-    """A penalty weight, how it was chosen, and where a reconstruction with it may start."""
-
-    weight: float
-    chosen: str
-    start: Image
-    dual: DualField
-    passes: float = 0.0
-    curve: list[WeightScore] | None = None
-
-
-def _choose_weight(objective: Objective, options: SolverOptions) -> _Choice:
-    """Return the penalty weight for PMLEM: as given, or else by cross-validation."""
+def _choose_weight(objective: Objective, options: SolverOptions) -> tuple[float, Image, DualField, dict[str, Any]]:
+    """Return the penalty weight for PMLEM, where a reconstruction with it may start, and how it was chosen."""
     posed, start = objective.posed, objective.start
     if options.penalty == "none":
-        return _Choice(0.0, "none: no penalty", start, posed.dual())
+        return 0.0, start, posed.dual(), {"penalty_weight_chosen": "none: no penalty"}
     if options.penalty_weight != "auto":
-        return _Choice(options.penalty_weight, "given", start, posed.dual())
+        return options.penalty_weight, start, posed.dual(), {"penalty_weight_chosen": "given"}
     guess = universal_penalty_weight(posed.operator, posed.images, start)
     if len(posed.operator.seeing_views) < MIN_VIEWS:
-        return _Choice(guess, "from the noise level: too few views to hold some out", start, posed.dual())
+        chosen = "from the noise level: too few views to hold some out"
+        return guess, start, posed.dual(), {"penalty_weight_chosen": chosen}
     found = cross_validated_weight(posed, guess, objective.penalty, objective.level_e)
-    curve = [WeightScore(weight, loss) for weight, loss in found.candidates.items()]
-    chosen = "predicts held-out views best"
+    how = {
+        "penalty_weight_chosen": "predicts held-out views best",
+        "passes_before": 1 + found.passes,
+        "penalty_weight_curve": [WeightScore(weight, loss) for weight, loss in found.candidates.items()],
+    }
     if found.solution is None:
-        return _Choice(found.weight, f"{chosen}, in windows of the plane", start, posed.dual(), found.passes, curve)
-    nearest = np.maximum(found.solution.plane, 1e-3 * start)
-    return _Choice(found.weight, chosen, nearest, found.solution.dual, found.passes, curve)
+        how["penalty_weight_chosen"] = f"{how['penalty_weight_chosen']}, in windows of the plane"
+        return found.weight, start, posed.dual(), how
+    return found.weight, np.maximum(found.solution.plane, 1e-3 * start), found.solution.dual, how

@@ -9,7 +9,7 @@ from msgspec import UNSET, structs
 
 from faintfield.pipelines.arguments import PriorName, SolverOptions
 from faintfield.pipelines.formats.results.records import PriorRecord, SolveRecord
-from faintfield.pipelines.reconstruction.planes.penalised import Objective, Solution, certified, mean_e, with_sigma
+from faintfield.pipelines.reconstruction.planes.penalised import Objective, Solution, certified, with_sigma
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.prior.collaborative import patch_candidates
 from faintfield.recon.prior.evidence import Evidence, evidence_of_planes, misfits
@@ -149,7 +149,7 @@ def _solution(
     )
     if options.proposal:
         sidecars = sidecars | {"proposal": proposal.picture, "moved": moved}
-    return Solution(plane, structs.replace(record, mean_e=mean_e(plane), prior=prior), sidecars)
+    return Solution(plane, structs.replace(record, prior=prior), sidecars)
 
 
 def _without(solution: Solution, reason: str) -> Solution:

@@ -14,7 +14,7 @@ from faintfield.pipelines.formats.large_arrays import available_bytes
 from faintfield.pipelines.formats.plane_poses import Place
 from faintfield.pipelines.formats.results.records import Certificate, Method, SolveRecord
 from faintfield.pipelines.reconstruction.operators import OperatorFactory
-from faintfield.pipelines.reconstruction.planes.penalised import Objective, Pilot, Solution, mean_e, solve_pmlem
+from faintfield.pipelines.reconstruction.planes.penalised import Objective, Pilot, Solution, solve_pmlem
 from faintfield.pipelines.reconstruction.planes.prior import with_prior
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages, Image, select_likelihood
@@ -68,26 +68,28 @@ def solve(
     if method == "backprojection":
         plane = back_projection(operator, images)
         chosen = "none: a mean of the views"
-        return Solution(
-            plane, SolveRecord(penalty_weight=None, penalty_weight_chosen=chosen, passes=1, mean_e=mean_e(plane))
-        )
+        return Solution(plane, SolveRecord(penalty_weight=None, penalty_weight_chosen=chosen, passes=1))
     if method == "pmlem":
         objective = Objective.of(SceneProblem(operator, images), options)
-        if pilot:
-            return with_prior(objective, [pilot.solution], options, other_colours=pilot.other_colours)[0]
-        return with_prior(objective, solve_pmlem(objective, options), options)[0]
-    start = smooth_start(operator, images)
-    likelihood = select_likelihood(images, options.likelihood, mean_light_e(operator, start))
-    images = replace(images, likelihood=likelihood)
-    return _solve_one_step_late(operator, images, start, method, options)
+        start = [pilot.solution] if pilot else solve_pmlem(objective, options)
+        return with_prior(objective, start, options, other_colours=pilot.other_colours if pilot else None)[0]
+    return _solve_one_step_late(operator, images, method, options)
 
 
 def _solve_one_step_late(
-    operator: PlaneOperator, images: ElementalImages, start: Image, method: Method, options: SolverOptions
+    operator: PlaneOperator, images: ElementalImages, method: Method, options: SolverOptions
 ) -> Solution:
     """Run MLEM or one-step-late PMLEM as published."""
+    start = smooth_start(operator, images)
+    likelihood = select_likelihood(images, options.likelihood, mean_light_e(operator, start))
+    images = replace(images, likelihood=likelihood)
     epsilon = _EPSILON_OF_SCALE * float(np.quantile(start, 0.99)) ** 2
-    weight, chosen = _one_step_late_weight(operator, images, start, method, options)
+    if method == "mlem":
+        weight, chosen = 0.0, "none: maximum likelihood"
+    elif options.penalty_weight != "auto":
+        weight, chosen = options.penalty_weight, "given"
+    else:
+        weight, chosen = universal_penalty_weight(operator, images, start), "from the noise level"
     steps: list[IterationStep] = []
     limit = options.passes or _MAX_PASSES[method]
     for iterate in pmlem_one_step_late(operator, images, start, penalty_weight=weight, epsilon=epsilon):
@@ -108,20 +110,9 @@ def _solve_one_step_late(
             oscillates=oscillates(steps, _SETTLED),
             kept_at_start=int(np.count_nonzero(~updated_samples(operator.sensitivity(), weight))),
         ),
-        mean_e=mean_e(plane),
         likelihood=images.likelihood.name,
     )
     return Solution(plane, record)
-
-
-def _one_step_late_weight(
-    operator: PlaneOperator, images: ElementalImages, start: Image, method: Method, options: SolverOptions
-) -> tuple[float, str]:
-    if method == "mlem":
-        return 0.0, "none: maximum likelihood"
-    if options.penalty_weight != "auto":
-        return options.penalty_weight, "given"
-    return universal_penalty_weight(operator, images, start), "from the noise level"
 
 
 def solve_together(
@@ -183,19 +174,22 @@ def _with_occlusion(
     """
     first = joint[0].record
     options = replace(options, penalty_weight=first.penalty_weight or 0.0)
+
+    def without(reason: str) -> list[Solution]:
+        inform(f"occlusion is left out: {reason}; the planes are those of joint")
+        return [
+            replace(solution, record=structs.replace(solution.record, occlusion=False, occlusion_left_out=reason))
+            for solution in done or with_prior(objective, joint, options, other_colours=other_colours)
+        ]
+
     try:
         occluded = factory.of_scene(grids, [opacity(solution.plane) for solution in joint])
     except GeometryMismatch:
-        unchanged = done or with_prior(objective, joint, options, other_colours=other_colours)
-        return _without_occlusion(unchanged, "a plane would be hidden from all views")
+        return without("a plane would be hidden from all views")
     behind = replace(objective, posed=replace(objective.posed, operator=occluded))
     better = solve_pmlem(behind, options)
-    objectives = better[0].record.objective, first.objective
-    assert objectives[0] is not None
-    assert objectives[1] is not None
-    if objectives[0] >= objectives[1]:
-        unchanged = done or with_prior(objective, joint, options, other_colours=other_colours)
-        return _without_occlusion(unchanged, "it explains the images no better")
+    if (better[0].record.objective or 0.0) >= (first.objective or 0.0):
+        return without("it explains the images no better")
     return [
         _of_opaque_part(solution, first)
         for solution in with_prior(behind, better, options, other_colours=other_colours)
@@ -205,22 +199,11 @@ def _with_occlusion(
 def _of_opaque_part(solution: Solution, first: SolveRecord) -> Solution:
     """Return a plane as `α f` with α beside it, its weight recorded as chosen in the first run."""
     alpha = opacity(solution.plane)
-    plane = alpha * solution.plane
     record = structs.replace(
         solution.record,
         penalty_weight_chosen=first.penalty_weight_chosen,
         penalty_weight_curve=first.penalty_weight_curve,
         passes_before=first.passes_before,
-        mean_e=mean_e(plane),
         occlusion=True,
     )
-    return Solution(plane, record, solution.sidecars | {"opacity": alpha})
-
-
-def _without_occlusion(joint: list[Solution], reason: str) -> list[Solution]:
-    """Return the planes unchanged, and inform the user."""
-    inform(f"occlusion is left out: {reason}; the planes are those of joint")
-    return [
-        replace(solution, record=structs.replace(solution.record, occlusion=False, occlusion_left_out=reason))
-        for solution in joint
-    ]
+    return Solution(alpha * solution.plane, record, solution.sidecars | {"opacity": alpha})

@@ -116,6 +116,7 @@ class Channel:
             pitch_mm=grid.pitch_mm,
             origin_mm=grid.origin_mm,
             **structs.asdict(solution.record),
+            mean_e=float(np.mean(solution.plane, dtype=np.float64)),
             flux_e=float(solution.plane.sum(dtype=np.float64)) * (px_per_sample**2 * cosine),
         )
         arrays = {"plane": solution.plane, **solution.sidecars}

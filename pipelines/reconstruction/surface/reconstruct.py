@@ -44,7 +44,7 @@ from faintfield.pipelines.reconstruction.depth.search import (
     naming_range,
 )
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
-from faintfield.pipelines.reconstruction.planes.penalised import Objective, Solution, mean_e, solve_then_sigma
+from faintfield.pipelines.reconstruction.planes.penalised import Objective, Solution, solve_then_sigma
 from faintfield.pipelines.reconstruction.planes.prior import with_prior
 from faintfield.pipelines.reconstruction.surface.files import SurfaceMaps, write_surface
 from faintfield.pipelines.reconstruction.surface.parallax import aperture_of
@@ -87,7 +87,7 @@ def reconstruct_surface(
             f"{out}: holds the depth map of a sweep, whose files have the names of the surface's; give another --out"
         )
     unit = unit_of_maps(elemental_set.units, as_px=request.unit == "px")
-    options = in_units(elemental_set, request.options(elemental_set.poses))
+    options = in_units(elemental_set, request.options(elemental_set))
     origin = provenance("reconstruct", options, elemental_set.input_hashes(), elemental_set.units)
     kept = read_current(out / SURFACE_FILE, SurfaceFileRecord, origin)
     if kept is not None:
@@ -96,7 +96,7 @@ def reconstruct_surface(
     grid = plane_grid(elemental_set, 1.0)
     needed_bytes = _needed_bytes(grid.shape, len(layouts), proposal=request.solver.proposal)
     require_room(out, int(needed_bytes / (1 - SHARE_OF_DISK)))  # decoded frames take the rest
-    range_mm, arrangement = request.depth_range_mm, elemental_set.settings.arrangement
+    range_mm, arrangement = request.range_mm(elemental_set), elemental_set.settings.arrangement
     find_range = range_mm is None and (arrangement is None or arrangement.disparity_range_px is None)
     if range_mm is None:
         range_mm = searched_range_mm(elemental_set)
@@ -115,7 +115,7 @@ def reconstruct_surface(
     facts = SurfaceFacts(
         unit=unit,
         searched=(in_unit(elemental_set, near, unit), in_unit(elemental_set, far, unit)),
-        range_found=request.depth_range_mm is None,
+        range_found=request.ends is None,
         depths=len(depths),
         bins_px=bins,
         rounds=estimate.rounds,
@@ -194,7 +194,7 @@ def _channel(name: str, light: Solution) -> SurfaceChannel:
         certificate=record.certificate,
         passes=record.passes,
         likelihood=record.likelihood or "",
-        mean_e=mean_e(light.plane),
+        mean_e=float(np.mean(light.plane, dtype=np.float64)),
         prior=record.prior,
     )
 

@@ -8,7 +8,6 @@ from msgspec import UNSET
 
 from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.errors import WrongUsage
-from faintfield.pipelines.formats.results.records import Poses
 from faintfield.pipelines.formats.results.surface import SurfaceOptions
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.options import Options
@@ -25,16 +24,23 @@ _FARTHEST_MM = 1e9
 
 @dataclass(frozen=True)
 class SurfaceRequest:
-    """A surface to reconstruct: its range of depths, nearest first, which is found in the views if None.
+    """A surface to reconstruct: its range of depths in mm, or of disparities in px; it is found in the views if None.
 
-    `unit` is that of the depths in its files: mm, or px of disparity from node to node.
+    Its files state depths in the unit of the range.
     """
 
-    depth_range_mm: tuple[float, float] | None = None
+    ends: tuple[float, float] | None = None
     unit: Literal["mm", "px"] = "mm"
     solver: SolverOptions = field(default_factory=SolverOptions)
 
-    def options(self, poses: Poses) -> SurfaceOptions:
+    def range_mm(self, elemental_set: ElementalSet) -> tuple[float, float] | None:
+        """Return the range in mm, the nearest depth first (BadValue: a disparity has no depth)."""
+        if self.ends is None or self.unit == "mm":
+            return self.ends
+        near_mm, far_mm = sorted(elemental_set.depth_of_disparity(disparity_px) for disparity_px in self.ends)
+        return near_mm, far_mm
+
+    def options(self, elemental_set: ElementalSet) -> SurfaceOptions:
         """Return the options that the results record."""
         effective = {
             "uncertainty": UNSET,
@@ -42,27 +48,14 @@ class SurfaceRequest:
             "proposal": self.solver.proposal or UNSET,
         }
         return SurfaceOptions(
-            depth_range_mm=self.depth_range_mm, unit=self.unit, **vars(self.solver) | effective, poses=poses
+            depth_range_mm=self.range_mm(elemental_set),
+            unit=self.unit,
+            **vars(self.solver) | effective,
+            poses=elemental_set.poses,
         )
 
 
-@dataclass(frozen=True)
-class SurfaceSelection:
-    """The range of a surface in mm or px as the options give it, before the set is known."""
-
-    range_mm: tuple[float, float] | None
-    range_px: tuple[float, float] | None
-    solver: SolverOptions
-
-    def resolve(self, elemental_set: ElementalSet) -> SurfaceRequest:
-        """Return the request for a set, whose disparities become depths (BadValue: one has none)."""
-        if self.range_px is None:
-            return SurfaceRequest(self.range_mm, "mm", self.solver)
-        near_mm, far_mm = sorted(elemental_set.depth_of_disparity(disparity_px) for disparity_px in self.range_px)
-        return SurfaceRequest((near_mm, far_mm), "px", self.solver)
-
-
-def select_surface(options: Options) -> SurfaceSelection | None:
+def select_surface(options: Options) -> SurfaceRequest | None:
     """Return the surface that options select, None if they ask for none.
 
     Raises WrongUsage if a range is no range, two are given, or one although no surface is wanted; or a prior does not
@@ -75,16 +68,19 @@ def select_surface(options: Options) -> SurfaceSelection | None:
         return None
     if depth_range_mm and disparity_range_px:
         raise WrongUsage("--depth-range-mm and --disparity-range-px say the same of a surface; give one of them")
-    range_mm = _ends("--depth-range-mm", depth_range_mm, "400:1500") if depth_range_mm else None
-    range_px = _ends("--disparity-range-px", disparity_range_px, "-3.6:1") if disparity_range_px else None
-    if range_mm is not None and not 0 < range_mm[0] < range_mm[1] <= _FARTHEST_MM:
-        raise WrongUsage(
-            f"--depth-range-mm {depth_range_mm}: depths are positive, and at most {_FARTHEST_MM:.0f} mm; give "
-            "NEAR:FAR, such as 400:1500"
-        )
+    ends = None
+    if depth_range_mm:
+        ends = _ends("--depth-range-mm", depth_range_mm, "400:1500")
+        if not 0 < ends[0] < ends[1] <= _FARTHEST_MM:
+            raise WrongUsage(
+                f"--depth-range-mm {depth_range_mm}: depths are positive, and at most {_FARTHEST_MM:.0f} mm; give "
+                "NEAR:FAR, such as 400:1500"
+            )
+    elif disparity_range_px:
+        ends = _ends("--disparity-range-px", disparity_range_px, "-3.6:1")
     solver = replace(options.solver, uncertainty=False)  # of planes: a surface has its own always
     check_prior(["pmlem"], solver)
-    return SurfaceSelection(range_mm, range_px, solver)
+    return SurfaceRequest(ends, "px" if disparity_range_px else "mm", solver)
 
 
 def _ends(option: str, text: str, example: str) -> tuple[float, float]:

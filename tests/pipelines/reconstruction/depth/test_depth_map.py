@@ -25,6 +25,7 @@ from faintfield.pipelines.formats.sets.ground_truth import (
 from faintfield.pipelines.reconstruction.accuracy import write_depth_errors
 from faintfield.pipelines.reconstruction.depth.autofocus import searched_range_mm
 from faintfield.pipelines.reconstruction.depth.comparison import binned_views
+from faintfield.recon.depth.agreement import depth_map
 from faintfield.recon.depth.focus import SURE
 from tests.pipelines.conftest import Command, Edit, SetMaker, assert_refused, run_undrawn
 from tests.pipelines.forms import read_record
@@ -183,14 +184,14 @@ def test_pieces_of_photographed_chess_board_stand_in_order(real_data: Path, tmp_
     elemental_set = load_set(tmp_path / "chess")
     disparities_px = np.linspace(-12, 3.6, 27)
     depths_mm = [elemental_set.depth_of_disparity(d) for d in disparities_px.tolist()]
-    compared = binned_views(elemental_set, depths_mm[13], tmp_path).compared(depths_mm)
-    found = compared.depth_map()
+    views = binned_views(elemental_set, depths_mm[13], tmp_path)
+    found = depth_map(views.agreements(depths_mm), np.asarray(depths_mm))
     disparity_px = np.interp(found.index, np.arange(27), disparities_px) / 3
     disparity_px[found.confidence < SURE] = np.nan
     silver = ((613, 320), (598, 240), (573, 135), (497, 65))
     black = ((222, 300), (238, 235), (388, 150), (328, 120), (288, 30))
     for pieces in (silver, black):
-        places = [(row // compared.bins_px, column // compared.bins_px) for column, row in pieces]
+        places = [(row // views.bins_px, column // views.bins_px) for column, row in pieces]
         near_to_far = [np.nanmedian(disparity_px[r - 3 : r + 4, c - 3 : c + 4]) for r, c in places]
         assert np.diff(near_to_far).min() > 0.15
         # Of this set it is known that points move by −3.4 … +0.8 px
