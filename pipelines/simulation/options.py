@@ -3,28 +3,57 @@
 from dataclasses import dataclass
 from typing import Literal
 
-import msgspec
 from cyclopts import Parameter
 
-from faintfield.pipelines.arguments import Fraction, NotNegative, Positive, Seed
+from faintfield.pipelines.arguments import Count, Fraction, NotNegative, Positive, Seed, SizePx
 
 
-class SyntheticOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """Options of `faintfield simulate`, as its help explains them and provenance.json records them."""
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class SyntheticOptions:
+    """Options of `faintfield simulate`, as provenance.json records them.
 
-    snr: float = 0.16
-    seed: int = 1
-    rows: int = 7
-    columns: int = 7
-    pitch_mm: float = 50.0
-    size_px: tuple[int, int] = (640, 480)
-    exposure_s: float = 0.1
-    position_error_mm: float = 0.3
-    rotation_error_mrad: float = 3.5
+    Parameters
+    ----------
+    snr
+        SNR, eq. (4), over the object region of the reference view; it sets the light.
+    seed
+        Seed of the random generator.
+    rows
+        Rows of the grid of nodes.
+    columns
+        Columns of the grid of nodes.
+    pitch_mm
+        Distance between neighbouring nodes.
+    size_px
+        Width and height of the detector.
+    exposure_s
+        Exposure of each view.
+    position_error_mm
+        Standard deviation of each node's position along each axis; the centre node has no error.
+    rotation_error_mrad
+        Standard deviation of each node's rotation about each axis; the centre node has no error.
+    poses
+        Poses that elemental.toml states: those the camera really had (true), or those it was sent to (nominal).
+    colour
+        Sensor without colour filters (grey), or with a Bayer mosaic.
+    objects
+        The flat toys, or a scene that fills the view: a slanted wall, a rising floor, a ball, a tilted page and a thin
+        rod (surfaces), at 517 to 1009 mm.
+    """
+
+    snr: Positive = 0.16
+    seed: Seed = 1
+    rows: Count = 7
+    columns: Count = 7
+    pitch_mm: Positive = 50.0
+    size_px: SizePx = (640, 480)
+    exposure_s: Positive = 0.1
+    position_error_mm: NotNegative = 0.3
+    rotation_error_mrad: NotNegative = 3.5
     poses: Literal["true", "nominal"] = "true"
     colour: Literal["grey", "bayer"] = "grey"
-    # Sets of toys, which were the only ones once, do not record it
-    objects: Literal["toys", "surfaces"] | msgspec.UnsetType = msgspec.UNSET
+    objects: Literal["toys", "surfaces"] = "toys"
 
 
 @Parameter(name="*")

@@ -1,7 +1,7 @@
 """The elemental set of a synthetic scene with its ground truth, and the exposures of a simulated sensor."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -64,7 +64,10 @@ def write_synthetic_set(out: Path, options: SyntheticOptions, *, overwrite: bool
         stated = true if options.poses == "true" else experiment.nominal_poses_rt_cam_ref()
         scene.write_settings(folder, stated, stated_noise(sensor))
         truth = write_ground_truth(folder, scene, white_e, options.snr, options.poses)
-        write_json(folder / "provenance.json", provenance("simulate", options, {}))
+        recorded = asdict(options)
+        if options.objects == "toys":  # once the only ones
+            del recorded["objects"]
+        write_json(folder / "provenance.json", provenance("simulate", recorded, {}))
     return truth
 
 

@@ -29,6 +29,7 @@ from faintfield.pipelines.formats.sets.board_set import load_board_set
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.formats.sets.ground_truth import read_truth
 from faintfield.pipelines.formats.sets.session_set import with_measured_geometry
+from faintfield.pipelines.simulation.options import SyntheticOptions
 from faintfield.pipelines.workflows.geometry import GeometrySummary
 from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
 from tests.pipelines.conftest import Command, assert_refused, drawing_nothing
@@ -41,7 +42,9 @@ BOARDS = [Board(f"b{index}", 9, 7, 40.0, 29.0, "DICT_4X4_250", 31 * index) for i
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("scene") / "set"
-    simulate(out, rows=3, columns=3, pitch_mm=100.0, poses="nominal", size_px=(320, 240), seed=3)
+    simulate(
+        out, options=SyntheticOptions(rows=3, columns=3, pitch_mm=100.0, poses="nominal", size_px=(320, 240), seed=3)
+    )
     return out
 
 

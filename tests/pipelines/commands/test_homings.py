@@ -20,6 +20,7 @@ from faintfield.pipelines.formats.results.geometry import (
 from faintfield.pipelines.formats.sets import session_set
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
 from faintfield.pipelines.formats.sets.session_set import with_measured_geometry
+from faintfield.pipelines.simulation.options import SyntheticOptions
 from faintfield.rig.session.homings import HomingGroups
 from tests.calib.geometry.simulated import centres_mm
 
@@ -30,7 +31,9 @@ CHAIN = [HomingRecord(0, 1, (0.1, -0.02, 0.0), SIGMA_MM), HomingRecord(1, 2, (0.
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> ElementalSet:
     out = tmp_path_factory.mktemp("scene") / "set"
-    simulate(out, rows=3, columns=3, pitch_mm=100.0, poses="nominal", size_px=(64, 48), seed=3)
+    simulate(
+        out, options=SyntheticOptions(rows=3, columns=3, pitch_mm=100.0, poses="nominal", size_px=(64, 48), seed=3)
+    )
     return load_set(out)
 
 
