@@ -26,10 +26,9 @@ class Board:
         Numbers of squares across and down.
     square_mm, marker_mm : float
         Edge lengths as measured on the print.
-    dictionary : str
-        One of OpenCV's predefined dictionaries, such as "DICT_5X5_1000".
-    first_marker_id : int
-        Number of the first marker; boards that are in view together must not share numbers.
+    dictionary, first_marker_id : str, int
+        One of OpenCV's predefined dictionaries, such as "DICT_5X5_1000", and the number of the first marker; boards
+        that are in view together must not share numbers.
 
     Raises
     ------
@@ -95,13 +94,7 @@ class Board:
 
 
 def predefined_dictionary(name: str) -> Any:
-    """Return OpenCV's dictionary of markers by name.
-
-    Raises
-    ------
-    ValueError
-        The name is unknown.
-    """
+    """Return OpenCV's dictionary of markers by name; ValueError if it is unknown."""
     number = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
     if number is None:
         known = sorted(known for known in dir(cv2.aruco) if known.startswith("DICT_"))
@@ -115,29 +108,20 @@ def black_rectangles_mm(board: Board) -> NDArray[np.float64]:
     Adjacent bits in a row of a marker form one rectangle, so that a printer leaves no hairline between them. The first
     square is black, as OpenCV draws boards by default.
     """
-    rectangles = []
-    marker_of = iter(board.marker_ids)
-    for row in range(board.rows):
-        for column in range(board.columns):
-            left, top = column * board.square_mm, row * board.square_mm
-            if (row + column) % 2 == 0:
-                rectangles.append((left, top, board.square_mm, board.square_mm))
-                continue
-            margin = (board.square_mm - board.marker_mm) / 2
-            for x, y, width, height in _marker_runs(board, next(marker_of)):
-                rectangles.append((left + margin + x, top + margin + y, width, height))
-    return np.array(rectangles)
-
-
-def _marker_runs(board: Board, marker_id: int) -> list[tuple[float, float, float, float]]:
-    """Return the black rectangles of one marker, row by row, in mm from the marker's top left."""
     dictionary = predefined_dictionary(board.dictionary)
     side = dictionary.markerSize + 2
-    black = dictionary.generateImageMarker(marker_id, side, borderBits=1) == 0
-    bit_mm = board.marker_mm / side
-    runs = []
-    for row in range(side):
-        edges = np.flatnonzero(np.diff(np.pad(black[row].astype(int), 1)))
-        for start, end in edges.reshape(-1, 2):
-            runs.append((start * bit_mm, row * bit_mm, (end - start) * bit_mm, bit_mm))
-    return runs
+    bit_mm, margin_mm = board.marker_mm / side, (board.square_mm - board.marker_mm) / 2
+    rectangles = []
+    marker_of = iter(board.marker_ids)
+    for row, column in np.ndindex(board.rows, board.columns):
+        left, top = column * board.square_mm, row * board.square_mm
+        if (row + column) % 2 == 0:
+            rectangles.append((left, top, board.square_mm, board.square_mm))
+            continue
+        black = dictionary.generateImageMarker(next(marker_of), side, borderBits=1) == 0
+        for line, bits in enumerate(black.astype(int)):
+            edges = np.flatnonzero(np.diff(np.pad(bits, 1)))
+            for start, end in edges.reshape(-1, 2):
+                x, y = start * bit_mm, line * bit_mm
+                rectangles.append((left + margin_mm + x, top + margin_mm + y, (end - start) * bit_mm, bit_mm))
+    return np.array(rectangles)

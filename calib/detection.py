@@ -51,14 +51,10 @@ class BoardCorners:
 
     Attributes
     ----------
-    board : str
-        Name of the board.
-    corners : int array (corner,)
-        Numbers of the corners.
-    pixels : float array (corner, 2)
-        Column and row of each.
-    sigma_px : float array (corner,)
-        Standard deviation of each per axis, from the image's noise.
+    board, corners : str, int array (corner,)
+        Name of the board, and numbers of the corners.
+    pixels, sigma_px : float array (corner, 2), (corner,)
+        Column and row of each, and its standard deviation per axis, from the image's noise.
     markers : int
         Number of the board's markers that were found.
     legacy : bool
@@ -149,20 +145,9 @@ class _Markers:
 
 @dataclass(frozen=True)
 class _Part:
-    """A part of the image, perhaps reduced, and the markers in it.
+    """A part of the image in 8 bits, reduced by `step`, its first column and row, and the markers by dictionary.
 
-    Attributes
-    ----------
-    stretched : array (row, column)
-        The part in 8 bits.
-    step : int
-        Pixels of the image per pixel of the part.
-    origin : (int, int)
-        Column and row of the part's first pixel.
-    found : dict of str to _Markers
-        The markers in the part by dictionary.
-    unknown : list of array (4, 2)
-        Outlines in the part that look like markers but are none.
+    `unknown` are outlines (4, 2) that look like markers but are none.
     """
 
     stretched: NDArray[np.uint8]

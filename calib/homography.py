@@ -95,21 +95,10 @@ def image_lattice(size_px: tuple[int, int], across: int = _POINTS_ACROSS) -> NDA
 def transfer(
     lens: Lens, rt_cam_ref: NDArray[np.floating], rt_ref_plane: NDArray[np.floating], pixels: NDArray[np.floating]
 ) -> NDArray[np.float64]:
-    """Return where a view sees the points of a plane that the reference view sees at given pixels.
+    """Return where a view sees the points of a plane (point, 2) that the reference view sees at `pixels` (point, 2).
 
-    Parameters
-    ----------
-    lens : Lens
-        Lens of both views.
-    rt_cam_ref, rt_ref_plane : array (6,)
-        Poses of the view and of the plane, Rodrigues rad and mm.
-    pixels : array (point, 2)
-        Column, row in the reference view.
-
-    Returns
-    -------
-    array (point, 2)
-        NaN where the plane is not in front of both cameras.
+    Both have one lens; poses of view and plane (6,) are Rodrigues rad and mm. NaN where the plane is not in front of
+    both cameras.
     """
     rays = np.column_stack([lens.rays_at(pixels), np.ones(len(pixels))])
     normal = rotation_matrix(rt_ref_plane)[:, 2]
@@ -133,16 +122,12 @@ def transfer_sigma_px(
 
     Parameters
     ----------
-    lens : Lens
-        Lens of all views.
-    rt_cam_ref : array (view, 6)
-        Poses of the views.
+    lens, rt_cam_ref : Lens, array (view, 6)
+        Lens of all views, and their poses.
     covariances : sequence of array (4 + distortion + 6, square)
         Covariance of `lens.parameters` and the view's pose, for each view.
-    rt_ref_plane : array (6,)
-        Pose of the plane, which may be tilted.
-    pixels : array (point, 2), optional
-        Pixels of the reference view; by default a lattice over its image.
+    rt_ref_plane, pixels : array (6,), (point, 2)
+        Pose of the plane, which may be tilted; pixels of the reference view, by default a lattice over its image.
 
     Returns
     -------

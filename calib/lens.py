@@ -104,8 +104,7 @@ class Lens:
         Parameters
         ----------
         first, step : (int, int)
-            Row and column of the first pixel, and the distance to the next. The default takes all pixels; a step of
-            (2, 2) takes one phase of a Bayer mosaic.
+            Row and column of the first pixel, and the distance to the next: (2, 2) for one phase of a Bayer mosaic.
 
         Raises
         ------
@@ -123,13 +122,7 @@ class Lens:
         return rays
 
     def rays_at(self, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return the undistorted rays (point, 2) of pixels (point, 2) given as column, row: x, y at unit depth.
-
-        Raises
-        ------
-        LensNotInvertible
-            Some pixel is the image of no ray or of several rays.
-        """
+        """Return the undistorted rays (point, 2), x, y at unit depth, of pixels (point, 2): column, row; see `rays`."""
         return np.asarray(self._undistorted(np.asarray(pixels, np.float64)[np.newaxis])[0])
 
     def project(self, points: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -25,10 +25,8 @@ class BentResponse:
 
     Parameters
     ----------
-    bends_per_dn : tuple of Map
-        κ₁ in 1/DN, κ₂ in 1/DN² and so on.
-    up_to_dn : Map
-        Signal up to which the bend was measured.
+    bends_per_dn, up_to_dn : tuple of Map, Map
+        κ₁ in 1/DN, κ₂ in 1/DN² and so on; signal up to which the bend was measured.
 
     Raises
     ------
@@ -73,20 +71,16 @@ class NoiseModel:
 
     Parameters
     ----------
-    offset_dn : Map
-        Mean of a dark frame of zero exposure, in DN.
-    gain_dn_per_e : Map
-        DN per electron; at zero signal where the response bends.
-    read_noise_e : Map
-        σ, standard deviation of the read noise, in electrons.
-    dark_current_e_per_s : Map
-        D, electrons per pixel and second without light.
+    offset_dn, gain_dn_per_e : Map
+        Mean of a dark frame of zero exposure, in DN; DN per electron, at zero signal where the response bends.
+    read_noise_e, dark_current_e_per_s : Map
+        σ, standard deviation of the read noise, in electrons; D, electrons per pixel and second without light.
     quantum_efficiency : float, optional
         η, electrons per photon; None if unknown.
     saturation_dn : float
         Value from which pixels are saturated.
     response : BentResponse, optional
-        How the response bends; None for a linear sensor.
+        Bend of the response; None for a linear sensor.
 
     Raises
     ------

@@ -62,22 +62,17 @@ class GridInspection:
         one; all pixels of each alike; no neighbours; or nothing in common above noise.
     axes : Axes
         Significance of the match and the axes, and the mean correlation of blocks.
-    side_z : float
-        Significance of which end is near; positive if it speaks for `orientation`.
-    direction : {"pictures", "signs", "names"}
-        Source of both directions against their opposites: hidden parts, the sign of all disparities, or only the names.
-    undecided : bool
-        Another orientation, turned by 180°, is as likely, and the names state neither.
-    contradicted : bool
-        The pictures deny the orientation that was prescribed.
-    disparity_px : (float, float)
-        Range of disparities along rows of nodes in px of the files, in this orientation.
-    ratio : float
-        Disparities along x over those along y: the ratio of pitches.
-    fits : NeighbourFits
-        Turns and shifts of views in px of the files, and views that fit no neighbour.
-    order : OrderTest
-        Comparison of neighbours by the names with other pictures.
+    side_z, direction : float, {"pictures", "signs", "names"}
+        Significance of which end is near, positive if it speaks for `orientation`; source of both directions against
+        their opposites: hidden parts, the sign of all disparities, or only the names.
+    undecided, contradicted : bool
+        Another orientation, turned by 180°, is as likely, and the names state neither; the pictures deny the
+        orientation that was prescribed.
+    disparity_px, ratio : (float, float), float
+        Range of disparities along rows of nodes in px of the files, in this orientation; disparities along x over those
+        along y.
+    fits, order : NeighbourFits, OrderTest
+        Agreement of each view with its neighbours, and of neighbours by the names against other pictures.
     """
 
     orientation: Orientation
@@ -114,16 +109,9 @@ class GridInspection:
 def inspect_grid(
     nodes: Sequence[Node], pictures: GridPictures, prescribed: Orientation | None = None
 ) -> GridInspection:
-    """Inspect the pictures of a grid.
+    """Inspect the pictures of a grid at different nodes; views may be missing.
 
-    Parameters
-    ----------
-    nodes : sequence of (int, int)
-        The two numbers of each view, different ones; views may be missing.
-    pictures : GridPictures
-        Their pictures.
-    prescribed : Orientation, optional
-        The orientation, if a person stated it; else it is found.
+    The orientation is found, or only checked if a person prescribed it.
     """
     if (failure := _failure_at_sight(nodes, pictures)) is not None:
         return GridInspection(prescribed or Orientation(), failure)

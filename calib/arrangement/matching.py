@@ -36,15 +36,10 @@ SURE = 5.0
 
 @dataclass(frozen=True)
 class Correlations:
-    """Correlation of the blocks of several views with their neighbours.
+    """Correlation of the blocks of several views with their neighbours, and by chance: with turned neighbours.
 
-    Attributes
-    ----------
-    shifts_px : array (shift,)
-        Displacements from one node to the next, symmetric about zero.
-    along, chance : dict of (number, axis) to array (view, block, shift)
-        Correlation with the neighbours, and with neighbours turned by 180°. `number` 0 or 1 is the number of the names
-        that steps by one, `axis` 0 displacement along x, 1 along y. NaN for views without neighbours.
+    Displacements (shift,) are from one node to the next. Tables (view, block, shift) are NaN for views without
+    neighbours; their keys are the number of the names that steps by one, 0 or 1, and the axis of displacement, 0 for x.
     """
 
     shifts_px: Floats
@@ -55,24 +50,15 @@ class Correlations:
 def correlate(
     pictures: Mapping[Node, Picture], nodes: Sequence[Node], shifts_px: Floats, distance: int
 ) -> Correlations:
-    """Correlate the blocks of some views with the views `distance` nodes before and after them.
+    """Correlate the blocks of the views at some nodes with the views `distance` nodes before and after them.
 
-    Parameters
-    ----------
-    pictures : mapping of node to array (row, column)
-        Pictures without their brightness.
-    nodes : sequence of (int, int)
-        Views whose blocks are matched.
-    shifts_px : array (shift,)
-        Displacements from node to node, symmetric about zero; the view before shows the opposite ones.
-    distance : int
-        Nodes between the two views of a pair.
+    Pictures (row, column) have no brightness. Displacements (shift,) are from node to node and symmetric about zero,
+    since the view before shows the opposite ones.
     """
     turned = {node: np.ascontiguousarray(picture[::-1, ::-1]) for node, picture in pictures.items()}
-    along: dict[tuple[int, int], Table] = {}
-    chance: dict[tuple[int, int], Table] = {}
-    for tables, candidates in ((along, pictures), (chance, turned)):
-        for number, axis in product((0, 1), repeat=2):
+    correlations = Correlations(shifts_px, {}, {})
+    for number, axis in product((0, 1), repeat=2):
+        for tables, candidates in ((correlations.along, pictures), (correlations.chance, turned)):
             rows = [
                 [
                     correlate_blocks(pictures[node], candidates[other], sign * distance * shifts_px, axis)
@@ -84,7 +70,7 @@ def correlate(
             if any(rows):
                 empty = [np.full_like(next(filter(None, rows))[0], np.nan)]
                 tables[number, axis] = np.stack([np.mean(sides or empty, axis=0, dtype=np.float32) for sides in rows])
-    return Correlations(shifts_px, along, chance)
+    return correlations
 
 
 def correlate_blocks(view: Picture, other: Picture, shifts_px: Floats, axis: int) -> Table:
@@ -148,10 +134,9 @@ class Axes:
         The first number is the column; one of the numbers is reversed.
     ratio : float
         Disparity along x over disparity along y, roughly.
-    transposed_z, opposed_z : float
-        Standard errors by which this is better than its contrary; 0 where there is nothing to compare.
-    match_z : float
-        Standard errors by which the views agree better than with pictures turned by 180°.
+    transposed_z, opposed_z, match_z : float
+        Standard errors by which this is better than its contrary, 0 where there is nothing to compare, and by which the
+        views agree better than with pictures turned by 180°.
     level : float
         Mean correlation of the blocks at their best disparities.
     """

@@ -42,6 +42,9 @@ _MIN_REPEATABILITY, _MIN_REPEATABILITY_Z = 0.6, 3.0
 # noise decides, in random order half of them.
 _WORSE_SHARE = 0.85
 
+# Share of other pictures that neighbours fit better than, from which no other order is tried in place of a square.
+_CERTAIN_SHARE = 0.95
+
 # Exchanges that differ which that correlation needs: four views in a square have too few.
 _LEAST = 10
 
@@ -86,15 +89,7 @@ def compare_neighbours(pictures: Mapping[Node, Picture], range_px: tuple[float, 
 
     Along a row every point moves along x by its disparity; what it moves along y comes from the cameras: a constant
     shift, a turn (growing along x), a magnification (growing along y). Along columns it is the other way round.
-
-    Parameters
-    ----------
-    pictures : mapping of node to array (row, column)
-        Views by row and column, without their brightness.
-    range_px : (float, float)
-        Least and largest disparity along x.
-    ratio : float
-        Disparity along x over disparity along y.
+    Pictures have no brightness, disparities along x are within `range_px`, those along y less by `ratio`.
     """
     places = {node: index for index, node in enumerate(pictures)}
     pairs = []
@@ -202,21 +197,18 @@ class OrderTest:
     verdict: Literal["fits", "denied", "open", "few"] = "open"
     share: float = 1.0
 
+    @property
+    def is_certain(self) -> bool:
+        """Neighbours fit so well that no other order needs to be tried."""
+        return self.verdict == "fits" and self.share > _CERTAIN_SHARE
+
 
 def check_order(pictures: Mapping[Node, Picture], axes: Axes, largest_px: float) -> OrderTest:
     """Exchange the neighbours of views for other pictures, along each number by itself.
 
     In a light field the blocks of a view are found in all its neighbours at one disparity, and in no other pictures
-    that take their places. Copies fit in every place; pictures in random order fit as badly in their own.
-
-    Parameters
-    ----------
-    pictures : mapping of node to array (row, column)
-        Coarse pictures by the numbers of their names, without their brightness.
-    axes : Axes
-        Movement of points along both numbers.
-    largest_px : float
-        Largest disparity.
+    that take their places. Copies fit in every place; pictures in random order fit as badly in their own. Pictures are
+    the coarse ones by the numbers of their names.
     """
     generator = np.random.default_rng(_SEED)
     reach = int(np.ceil(largest_px))

@@ -41,18 +41,9 @@ def far_side_z(
 ) -> float:
     """Return the standard errors by which what is hidden lies where the disparity is larger, negative if smaller.
 
-    Parameters
-    ----------
-    pictures : mapping of node to array (row, column)
-        Views by row and column; disparities along x and y have one sign.
-    nodes : sequence of (int, int)
-        Views whose edges are tested, if they have neighbours on both sides along a row, a column, or both.
-    shifts_px : array (shift,)
-        Disparities per node to compare, in ascending order.
-    distance : int
-        Nodes from a view to the neighbours that it is compared with.
-    ratio : float
-        Disparity along x over disparity along y.
+    Views are by row and column, and disparities along x, over `ratio` those along y, have one sign with them. Edges are
+    tested in the views at some nodes that have neighbours at `distance` on both sides along a row, a column, or both;
+    `shifts_px` (shift,) are the disparities per node to compare, in ascending order.
     """
     scales = (float(distance), distance / ratio)
     tiles: dict[tuple[int, int, int], list[tuple[float, float]]] = {}

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.errors import LensNotInvertible, NotIdentifiable, PoorFit
-from faintfield.calib.geometry.bundle import Bundle, fit_boards, solve_again
+from faintfield.calib.geometry.bundle import Bundle, solve_again
 from faintfield.calib.geometry.observations import Observations
 from faintfield.calib.geometry.rig_geometry import RigGeometry
 from faintfield.calib.homography import fronto_parallel_rt_ref_plane, rotation_matrix, transfer_sigma_px
@@ -53,19 +53,24 @@ def rms_over_views(sigma_px: NDArray[np.float64]) -> float:
 def require_determined(
     geometry: RigGeometry, observations: Observations, depths_mm: Sequence[float], limit_px: float
 ) -> None:
-    """Check that the transfer by the plane at each depth is known to within a limit.
+    """Check that at least half of the views see the plane at each depth, and that the transfer by it is known.
 
     Raises
     ------
     NotIdentifiable
-        It is not; the message gives σ, the limit, and what the boards lack.
+        It is not known to within the limit; the message gives σ, the limit, and what the boards lack.
     """
     for depth_mm in depths_mm:
         try:
             of_views_px = transfer_sigma_at(geometry, depth_mm)
         except LensNotInvertible:  # an undetermined lens may fold the image
             of_views_px = np.full((len(geometry.nodes), 1), np.inf)
-        _require_seen(of_views_px, depth_mm)
+        seen, others = int((~np.isnan(of_views_px)).any(axis=1).sum()), len(of_views_px) - 1
+        if 2 * seen < others:
+            raise NotIdentifiable(
+                f"plane at {depth_mm:g} mm: {seen} of the {others} views beside the centre's see anything of it, limit "
+                "half; give --depth-mm in mm from the camera, or nodes that lie nearer to one another"
+            )
         sigma_px = rms_over_views(of_views_px)
         if not sigma_px <= limit_px:
             raise NotIdentifiable(
@@ -75,51 +80,33 @@ def require_determined(
             )
 
 
-def _require_seen(sigma_px: NDArray[np.float64], depth_mm: float) -> None:
-    """Check that at least half of the views see some of a plane."""
-    seen, others = int((~np.isnan(sigma_px)).any(axis=1).sum()), len(sigma_px) - 1
-    if 2 * seen < others:
-        raise NotIdentifiable(
-            f"plane at {depth_mm:g} mm: {seen} of the {others} views beside the centre's see anything of it, limit "
-            "half; give --depth-mm in mm from the camera, or nodes that lie nearer to one another"
-        )
-
-
 def find_shortcomings(geometry: RigGeometry, observations: Observations, depth_mm: float) -> list[str]:
     """Return what the set lacks, and for each what to add."""
     found = []
     boards = geometry.boards
+    nearest_mm = min(float(board.rt_ref_board[5]) for board in boards)
     if len(boards) < _MIN_BOARDS:
         found.append(
             f"{len(boards)} board pose(s) only: show at least {_MIN_BOARDS}, better 6, tilted by 20 to 40 degrees"
         )
-    tilt_rad = max(_tilt_rad(board.rt_ref_board) for board in boards)
+    # The angle between a board and the detector
+    cosine = min(abs(rotation_matrix(board.rt_ref_board)[2, 2]) for board in boards)
+    tilt_rad = float(np.arccos(min(cosine, 1.0)))
     if tilt_rad < _MIN_TILT_RAD:
         found.append(
             f"no board is tilted by more than {np.degrees(tilt_rad):.0f} degrees: "
             "tilt some by 20 to 40 degrees, about both axes"
         )
-    nearest_mm = min(float(board.rt_ref_board[5]) for board in boards)
     if nearest_mm > _MAX_DISTANCE_OVER_DEPTH * depth_mm:
         found.append(f"the nearest board stands at {nearest_mm:.0f} mm: bring some to about {depth_mm:g} mm")
     if len(geometry.nodes) < _MIN_NODES:
         found.append(f"{len(geometry.nodes)} node(s) only: take at least {_MIN_NODES}")
-    coverage = _coverage(observations, geometry.lens.size_px)
+    pixels = observations.pixels[observations.weights > 0]
+    cells = np.clip((pixels / geometry.lens.size_px * _COVERAGE_CELLS).astype(int), 0, _COVERAGE_CELLS - 1)
+    coverage = len(np.unique(cells, axis=0)) / _COVERAGE_CELLS**2
     if coverage < _MIN_COVERAGE:
         found.append(f"corners cover {coverage:.0%} of the image: move boards into its edges, or take larger ones")
     return found
-
-
-def _tilt_rad(rt_ref_board: NDArray[np.float64]) -> float:
-    """Return the angle between a board and the detector."""
-    return float(np.arccos(min(abs(rotation_matrix(rt_ref_board)[2, 2]), 1.0)))
-
-
-def _coverage(observations: Observations, size_px: tuple[int, int]) -> float:
-    """Return the share of the image's cells that hold a corner."""
-    pixels = observations.pixels[observations.weights > 0]
-    cells = np.clip((pixels / np.array(size_px) * _COVERAGE_CELLS).astype(int), 0, _COVERAGE_CELLS - 1)
-    return len(np.unique(cells, axis=0)) / _COVERAGE_CELLS**2
 
 
 def inconsistent_views(bundle: Bundle, observations: Observations) -> list[str]:
@@ -157,10 +144,9 @@ def inconsistent_views(bundle: Bundle, observations: Observations) -> list[str]:
 def holdout_ratio(bundle: Bundle, observations: Observations) -> float | None:
     """Return the ratio of the residual of boards left out to that of the fit, √(Σ held out² / Σ fitted²).
 
-    Each target (a board in a sweep) is left out in turn. Lens and cameras are found from the others, then only the
-    pose of that board is fitted to its corners. A ratio near 1 says that the model is right and determined; a wrong
-    lens model, boards of different sizes, or a board that moved increase it. A target that some node sees alone is
-    not left out; None if that holds for all.
+    Each target (a board in a sweep) is left out in turn, unless some node sees it alone; None if that holds for all.
+    Lens and cameras are found from the others, then only the pose of that board is fitted to its corners. A wrong lens
+    model, boards of different sizes, or a board that moved make the ratio larger than 1.
 
     Raises
     ------
@@ -182,7 +168,7 @@ def holdout_ratio(bundle: Bundle, observations: Observations) -> float | None:
             raise NotIdentifiable(
                 f"without board '{name}' the geometry cannot be solved ({failure}); show more boards"
             ) from failure
-        refitted = fit_boards(bundle, without, observations, ~others)
+        refitted = solve_again(bundle, observations, ~others, fixed=without)
         held_out += float(np.sum(refitted.residuals() ** 2))
         fitted += float(np.sum(residuals[~others] ** 2))
     return float(np.sqrt(held_out / fitted)) if fitted else None

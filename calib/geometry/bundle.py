@@ -1,18 +1,24 @@
-"""Bundle adjustment with mrcal: one lens, the pose of every node, and the pose of every board in every sweep."""
+"""Bundle adjustment with mrcal: one lens, the pose of every node, and the pose of every board in every sweep.
 
+It begins with the focal length that fits best of many, and with poses along a tree of views.
+"""
+
+import heapq
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.errors import MissingMrcal
-from faintfield.calib.geometry.initialization import initialize
 from faintfield.calib.geometry.observations import Observations
+from faintfield.calib.homography import rotation_matrix
 
 LENS_MODELS = {"pinhole": "LENSMODEL_PINHOLE", **{f"opencv{n}": f"LENSMODEL_OPENCV{n}" for n in (4, 5, 8)}}
 
@@ -20,6 +26,16 @@ LENS_MODELS = {"pinhole": "LENSMODEL_PINHOLE", **{f"opencv{n}": f"LENSMODEL_OPEN
 # the largest entry of a step, in mrcal's scaled state, that ends them.
 _MAX_POLISHING_STEPS = 5
 _POLISHING_TOLERANCE = 1e-11
+
+
+# Focal lengths tried, in widths of the detector: from a fisheye to a long telephoto.
+_FOCAL_WIDTHS = np.geomspace(0.35, 12.0, 30)
+
+# Views that are tried with each focal length; more take longer and hardly change the choice among 30.
+_MAX_FOCAL_VIEWS = 24
+
+type Transform = NDArray[np.float64]
+"""Homogeneous matrix (4, 4) from the source to the destination frame."""
 
 
 def load_mrcal() -> Any:
@@ -42,10 +58,8 @@ class BundleProblem:
     ----------
     observations : Observations
         Corners of the boards.
-    size_px : (int, int)
-        Width and height of the detector.
-    square_mm : float
-        Edge length of the squares of all boards.
+    size_px, square_mm : (int, int), float
+        Width and height of the detector; edge length of the squares of all boards.
     lens_model : str
         One of `LENS_MODELS`.
     with_warp : bool
@@ -61,13 +75,7 @@ class BundleProblem:
 
 @dataclass(frozen=True)
 class Bundle:
-    """Solution of a bundle adjustment.
-
-    Attributes
-    ----------
-    inputs : dict
-        mrcal's optimization inputs at the optimum: `mrcal.optimize(**inputs)` stays there.
-    """
+    """Solution: mrcal's optimization inputs at the optimum, where `mrcal.optimize(**inputs)` stays."""
 
     inputs: dict[str, Any]
 
@@ -137,19 +145,23 @@ def solve(problem: BundleProblem) -> Bundle:
     return Bundle(inputs)
 
 
-def solve_again(bundle: Bundle, observations: Observations, chosen: NDArray[np.bool_]) -> Bundle:
-    """Return the solution from the chosen views (view,) alone, starting from `bundle`; outliers stay marked."""
-    inputs = _restricted(bundle, observations, chosen)
-    _optimize(inputs)
-    return Bundle(inputs)
+def solve_again(
+    bundle: Bundle, observations: Observations, chosen: NDArray[np.bool_], fixed: Bundle | None = None
+) -> Bundle:
+    """Return the solution from the chosen views (view,) alone, starting from `bundle`; outliers stay marked.
 
-
-def fit_boards(bundle: Bundle, other: Bundle, observations: Observations, chosen: NDArray[np.bool_]) -> Bundle:
-    """Return the poses of the boards in the chosen views (view,), with lens and cameras fixed to those of `other`."""
-    inputs = _restricted(bundle, observations, chosen)
-    inputs |= {name: copy(other.inputs[name]) for name in ("intrinsics", "rt_cam_ref", "calobject_warp")}
-    locked = ("intrinsics_core", "intrinsics_distortions", "extrinsics", "calobject_warp")
-    inputs |= {f"do_optimize_{name}": False for name in locked}
+    Lens and cameras are those of the solution `fixed`, if it is given, and only boards are fitted.
+    """
+    targets, frame_of = np.unique(observations.target_of[chosen], return_inverse=True)
+    inputs = {name: copy(value) for name, value in bundle.inputs.items()}
+    inputs["rt_ref_frame"] = np.ascontiguousarray(inputs["rt_ref_frame"][targets])
+    inputs["observations_board"] = np.ascontiguousarray(inputs["observations_board"][chosen])
+    indices = _indices(frame_of.astype(np.int32), observations.node_of[chosen])
+    inputs["indices_frame_camintrinsics_camextrinsics"] = indices
+    if fixed is not None:
+        inputs |= {name: copy(fixed.inputs[name]) for name in ("intrinsics", "rt_cam_ref", "calobject_warp")}
+        locked = ("intrinsics_core", "intrinsics_distortions", "extrinsics", "calobject_warp")
+        inputs |= {f"do_optimize_{name}": False for name in locked}
     _optimize(inputs)
     return Bundle(inputs)
 
@@ -187,22 +199,10 @@ def _indices(target_of: NDArray[np.int32], node_of: NDArray[np.int32]) -> NDArra
     return np.ascontiguousarray(np.column_stack([target_of, np.zeros_like(target_of), node_of - 1]), np.int32)
 
 
-def _restricted(bundle: Bundle, observations: Observations, chosen: NDArray[np.bool_]) -> dict[str, Any]:
-    """Return a copy of a solution's inputs with the chosen views and the boards that they see."""
-    targets, frame_of = np.unique(observations.target_of[chosen], return_inverse=True)
-    inputs = {name: copy(value) for name, value in bundle.inputs.items()}
-    inputs["rt_ref_frame"] = np.ascontiguousarray(inputs["rt_ref_frame"][targets])
-    inputs["observations_board"] = np.ascontiguousarray(inputs["observations_board"][chosen])
-    indices = _indices(frame_of.astype(np.int32), observations.node_of[chosen])
-    inputs["indices_frame_camintrinsics_camextrinsics"] = indices
-    return inputs
-
-
 def _optimize(inputs: dict[str, Any]) -> None:
     """Move the inputs to the optimum, in place."""
-    mrcal = load_mrcal()
     with _c_library_silenced():
-        mrcal.optimize(**inputs)
+        load_mrcal().optimize(**inputs)
 
 
 @contextmanager
@@ -229,3 +229,89 @@ def _polish(inputs: dict[str, Any]) -> None:
         mrcal.ingest_packed_state(state - step, **inputs)
         if np.abs(step).max() < _POLISHING_TOLERANCE:
             break
+
+
+def initialize(
+    observations: Observations, size_px: tuple[int, int], square_mm: float
+) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+    """Return the focal length that fits single views best, and poses along the tree of the best-fitting views.
+
+    The lens is a pinhole whose principal point is the middle of the detector. The poses of nodes and boards, (node, 6)
+    and (target, 6), are rt_cam_ref and rt_ref_board, Rodrigues rad and mm.
+    """
+    focal_px = _focal_by_trial(observations, size_px, square_mm)
+    matrix = _matrix(focal_px, size_px)
+    poses = [_pose(observations, view, matrix, square_mm) for view in range(len(observations.node_of))]
+    camera_from_ref, ref_from_board = _tree(observations, [pose for pose, _ in poses], [error for _, error in poses])
+    rt_cam_ref, rt_ref_board = (
+        np.array([_rt(transforms[index]) for index in range(len(transforms))])
+        for transforms in (camera_from_ref, ref_from_board)
+    )
+    return focal_px, rt_cam_ref, rt_ref_board
+
+
+def _focal_by_trial(observations: Observations, size_px: tuple[int, int], square_mm: float) -> float:
+    """Return the focal length at which single views, each with a pose of its own, have the least reprojection error."""
+    counts = (observations.weights > 0).sum(axis=(1, 2))
+    views = np.argsort(-counts, kind="stable")
+    # The best views of every target, since a board that faces the camera does not determine the focal length.
+    per_target = [views[observations.target_of[views] == target] for target in range(len(observations.targets))]
+    ranked = zip_longest(*(of_target.tolist() for of_target in per_target))
+    chosen = [view for rank in ranked for view in rank if view is not None][:_MAX_FOCAL_VIEWS]
+    errors = [
+        sum(_pose(observations, view, _matrix(focal, size_px), square_mm)[1] ** 2 for view in chosen)
+        for focal in _FOCAL_WIDTHS * size_px[0]
+    ]
+    return float(_FOCAL_WIDTHS[int(np.argmin(errors))] * size_px[0])
+
+
+def _pose(
+    observations: Observations, view: int, matrix: NDArray[np.float64], square_mm: float
+) -> tuple[Transform, float]:
+    """Return the transform from board to camera that fits one view, and its rms reprojection error in pixels."""
+    row, column = np.nonzero(observations.weights[view] > 0)
+    points = np.column_stack([column, row, np.zeros(len(row))]) * square_mm
+    pixels = np.ascontiguousarray(observations.pixels[view, row, column])
+    found, rotations, translations, errors = cv2.solvePnPGeneric(points, pixels, matrix, None, flags=cv2.SOLVEPNP_IPPE)
+    if not found:
+        return np.eye(4), np.inf
+    best = int(np.argmin(np.ravel(errors)))
+    pose = np.eye(4)
+    pose[:3, :3] = rotation_matrix(np.ravel(rotations[best]))
+    pose[:3, 3] = np.ravel(translations[best])
+    return pose, float(np.ravel(errors)[best])
+
+
+def _tree(
+    observations: Observations, poses: list[Transform], errors: list[float]
+) -> tuple[dict[int, Transform], dict[int, Transform]]:
+    """Return the transforms (camera from ref, ref from board), found from the reference along the best views."""
+    camera_from_ref, ref_from_board = {0: np.eye(4)}, dict[int, Transform]()
+    views_of: dict[tuple[str, int], list[int]] = {}
+    for view, (node, target) in enumerate(zip(observations.node_of, observations.target_of, strict=True)):
+        views_of.setdefault(("node", int(node)), []).append(view)
+        views_of.setdefault(("target", int(target)), []).append(view)
+    waiting = [(errors[view], view) for view in views_of["node", 0]]
+    heapq.heapify(waiting)
+    while waiting:
+        _, view = heapq.heappop(waiting)
+        node, target = int(observations.node_of[view]), int(observations.target_of[view])
+        reached = []
+        if target not in ref_from_board:
+            ref_from_board[target] = np.linalg.inv(camera_from_ref[node]) @ poses[view]
+            reached = views_of["target", target]
+        elif node not in camera_from_ref:
+            camera_from_ref[node] = poses[view] @ np.linalg.inv(ref_from_board[target])
+            reached = views_of["node", node]
+        for other in reached:
+            heapq.heappush(waiting, (errors[other], other))
+    return camera_from_ref, ref_from_board
+
+
+def _matrix(focal_px: float, size_px: tuple[int, int]) -> NDArray[np.float64]:
+    width, height = size_px
+    return np.array([[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1]])
+
+
+def _rt(transform: Transform) -> NDArray[np.float64]:
+    return np.append(cv2.Rodrigues(transform[:3, :3])[0].ravel(), transform[:3, 3])

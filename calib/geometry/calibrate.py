@@ -1,7 +1,9 @@
 """Calibrate the geometry of the rig from corners: solve, find the uncertainty, and accept or refuse the result."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +17,16 @@ from faintfield.calib.geometry.acceptance import (
     require_determined,
 )
 from faintfield.calib.geometry.bundle import LENS_MODELS, Bundle, BundleProblem, solve
-from faintfield.calib.geometry.covariance import Uncertainty, uncertainty
-from faintfield.calib.geometry.homings import HomingShift, as_one_homing, homing_shifts, interrupted_sweeps
-from faintfield.calib.geometry.observations import BoardObservation, Node, Observations, gather
-from faintfield.calib.geometry.rig_geometry import BoardPose, RigGeometry
+from faintfield.calib.geometry.covariance import Uncertainty, homing_shifts, uncertainty
+from faintfield.calib.geometry.observations import (
+    BoardObservation,
+    Node,
+    Observations,
+    as_one_homing,
+    gather,
+    interrupted_sweeps,
+)
+from faintfield.calib.geometry.rig_geometry import BoardPose, HomingShift, RigGeometry
 from faintfield.calib.lens import Lens
 
 # Largest rms residual in pixels; beyond, boards and images do not belong together.
@@ -42,11 +50,9 @@ class GeometrySettings:
         Depths of the planes to be reconstructed, at which the transfer between views must be known.
     max_transfer_sigma_px : float
         Largest standard deviation of the transfer at these depths, rms over views and image.
-    max_holdout_ratio : float
-        Largest ratio of the residual of boards left out to that of the fit.
-    negligible_holdout_px : float
-        Rms residual that leaving boards out may always add. Where corners fit to a few thousandths of a pixel, the
-        ratio can be large although the added residual does not matter.
+    max_holdout_ratio, negligible_holdout_px : float
+        Largest ratio of the residual of boards left out to that of the fit, and the rms residual that leaving boards
+        out may always add: where corners fit to a few thousandths of a pixel, a large ratio does not matter.
 
     Raises
     ------
@@ -99,7 +105,8 @@ def calibrate_geometry(
         mrcal is not installed.
     """
     settings = settings or GeometrySettings()
-    solved = _solve_homings(boards, observations, size_px, reference, settings.lens_model)
+    problem_of = partial(_problem, boards, size_px, reference, settings.lens_model)
+    solved = _solve_homings(observations, problem_of, list(boards.values()))
     gathered, bundle = solved.problem.observations, solved.bundle
     geometry = _geometry(solved)
     if not find_shortcomings(geometry, gathered, max(settings.depths_mm)):  # else the solution may be any
@@ -122,51 +129,33 @@ class _Solved:
 
 
 def _solve_homings(
-    boards: Mapping[str, Board],
     observations: Sequence[BoardObservation],
-    size_px: tuple[int, int],
-    reference: Node,
-    lens_model: str,
+    problem_of: Callable[[Sequence[BoardObservation]], BundleProblem],
+    boards: Sequence[Board],
 ) -> _Solved:
     """Return the solution with a pose of each board before and after a homing, if the homing shifted the stage."""
-    sweeps = interrupted_sweeps(observations)
-    if sweeps:
-        try:
-            apart = _solve_apart(boards, observations, size_px, reference, lens_model)
-        except CalibrationError:  # too few nodes share a board and a homing
-            apart = None
-        if apart is not None and any(shift.is_significant() for shift in apart.shifts):
-            return apart
-        sweeps = [] if apart is not None else sweeps
-    one = _problem(boards, as_one_homing(observations), size_px, reference, lens_model)
-    bundle = _solve(one)
-    return _Solved(one, bundle, uncertainty(bundle, one.observations), undetermined=sweeps)
-
-
-def _solve_apart(
-    boards: Mapping[str, Board],
-    observations: Sequence[BoardObservation],
-    size_px: tuple[int, int],
-    reference: Node,
-    lens_model: str,
-) -> _Solved | None:
-    """Return the solution with a pose of each board after each homing; None if that leaves nodes without a pose."""
-    problem = _problem(boards, observations, size_px, reference, lens_model)
-    joined = _problem(boards, as_one_homing(observations), size_px, reference, lens_model)
-    if set(problem.observations.nodes) != set(joined.observations.nodes):
-        return None
-    bundle = _solve(problem)
-    known = uncertainty(bundle, problem.observations)
-    shifts = homing_shifts(bundle, problem.observations, known.covariance, list(boards.values()))
-    return _Solved(problem, bundle, known, shifts)
+    joined = problem_of(as_one_homing(observations))
+    undetermined = interrupted_sweeps(observations)
+    if undetermined:
+        with suppress(CalibrationError):  # too few nodes share a board and a homing
+            apart = problem_of(observations)
+            if set(apart.observations.nodes) == set(joined.observations.nodes):
+                bundle = _solve(apart)
+                known = uncertainty(bundle, apart.observations)
+                shifts = homing_shifts(bundle, apart.observations, known.covariance, boards)
+                if any(shift.is_significant() for shift in shifts):
+                    return _Solved(apart, bundle, known, shifts)
+                undetermined = []
+    bundle = _solve(joined)
+    return _Solved(joined, bundle, uncertainty(bundle, joined.observations), undetermined=undetermined)
 
 
 def _problem(
     boards: Mapping[str, Board],
-    observations: Sequence[BoardObservation],
     size_px: tuple[int, int],
     reference: Node,
     lens_model: str,
+    observations: Sequence[BoardObservation],
 ) -> BundleProblem:
     """Return the input of the bundle adjustment, checked for enough nodes and boards of one size."""
     named = [boards[name] for name in dict.fromkeys(seen.target.board for seen in observations)]
@@ -212,11 +201,9 @@ def _require_residuals(bundle: Bundle, observations: Observations) -> None:
 
 def _geometry(solved: _Solved) -> RigGeometry:
     """Return the solution in raster order of the nodes, without a hold-out ratio."""
-    problem, bundle, known = solved.problem, solved.bundle, solved.known
-    observations = problem.observations
+    problem, bundle, known, observations = solved.problem, solved.bundle, solved.known, solved.problem.observations
     order = sorted(range(len(observations.nodes)), key=lambda index: observations.nodes[index])
     squares, inliers = float(np.sum(bundle.residuals() ** 2)), int(bundle.inlier.sum())
-    poses = zip(observations.targets, bundle.rt_ref_board, strict=True)
     return RigGeometry(
         lens=Lens.from_parameters(problem.size_px, bundle.intrinsics),
         lens_model=problem.lens_model,
@@ -224,7 +211,7 @@ def _geometry(solved: _Solved) -> RigGeometry:
         reference=order.index(0),
         rt_cam_ref=bundle.rt_cam_ref[order],
         covariance=_lens_and_poses(bundle, known.covariance, order),
-        boards=[BoardPose(target, rt_ref_board) for target, rt_ref_board in poses],
+        boards=list(map(BoardPose, observations.targets, bundle.rt_ref_board)),
         warp_mm=bundle.warp_mm,
         sigma_px=known.sigma_px,
         rms_inlier_px=float(np.sqrt(squares / (2 * inliers))),
@@ -256,8 +243,7 @@ def _require_fit(geometry: RigGeometry, settings: GeometrySettings) -> None:
     ratio, limit = geometry.holdout_ratio, settings.max_holdout_ratio
     if ratio is None or ratio <= limit:
         return
-    added_px = geometry.rms_inlier_px * np.sqrt(ratio**2 - 1)
-    if added_px > settings.negligible_holdout_px:
+    if geometry.rms_inlier_px * np.sqrt(ratio**2 - 1) > settings.negligible_holdout_px:
         other = "" if geometry.lens_model == "opencv8" else "try --lens opencv8, "
         raise PoorFit(
             f"boards left out of the fit are off by {ratio:.2f} times its residual of {geometry.rms_inlier_px:.3g} px, "

@@ -1,4 +1,4 @@
-"""Covariance of the solution, and repeatability of the gantry between sweeps.
+"""Covariance of the solution, repeatability of the gantry between sweeps, and shifts by homings within sweeps.
 
 To first order the weighted residuals are `x = M (ε + G δ)` with M = I − J (JᵀJ)⁻¹ Jᵀ. Here J is the optimizer's
 Jacobian, ε the noise of the corners (variance σ²), and δ the gantry's position error at each node in each sweep
@@ -7,18 +7,22 @@ independent and have variances `σ² + τ² λ`; the rest of the residuals has v
 of both gives σ and τ. The state's covariance is `σ² (JᵀJ)⁻¹ + τ² B Bᵀ` with B = (JᵀJ)⁻¹ Jᵀ G.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain, pairwise
 from typing import Any
 
+import cv2
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
+from faintfield.calib.board import Board
 from faintfield.calib.errors import NotIdentifiable
 from faintfield.calib.geometry.bundle import Bundle, load_mrcal
 from faintfield.calib.geometry.observations import Observations
-from faintfield.calib.geometry.rig_geometry import Repeatability
+from faintfield.calib.geometry.rig_geometry import HomingShift, Repeatability
 
 # Eigenvalues of K below this multiple of the largest are left out: the fit absorbs those directions of the gantry's
 # errors, so that the residuals contain nothing of them.
@@ -39,7 +43,7 @@ class Uncertainty:
     sigma_px : float
         Standard deviation of a corner of weight one, per axis.
     repeatability : Repeatability, optional
-        Repeatability of the gantry between sweeps; None with a single sweep.
+        None with a single sweep.
     """
 
     covariance: NDArray[np.float64]
@@ -139,3 +143,43 @@ def _variance_components(
     # The root has no derivative at zero: near it, take the root of the standard error of τ².
     se_mm = float(se_of_tau2 / (2 * sd_mm)) if tau2 > se_of_tau2 else float(np.sqrt(se_of_tau2))
     return float(np.sqrt(sigma2)), Repeatability(sd_mm, se_mm)
+
+
+def homing_shifts(
+    bundle: Bundle, observations: Observations, covariance: NDArray[np.float64], boards: Sequence[Board]
+) -> list[HomingShift]:
+    """Return the shift between each two homings that follow one another in a sweep.
+
+    Switches close within some hundredths of a millimetre, so all nodes that rely on one homing are shifted alike. A
+    homing between sweeps shows nowhere, since the pose of a board is found anew in each. One within a sweep shows as
+    boards that moved: in `bundle` every board has a pose after each homing, and their middles are compared.
+    """
+    middles_mm = {
+        board.name: np.array([board.corner_shape[1] - 1, board.corner_shape[0] - 1, 0.0]) / 2 * board.square_mm
+        for board in boards
+    }
+    targets = observations.targets
+    by_board: dict[tuple[str, int], list[int]] = {}
+    for index, target in enumerate(targets):  # in the order of sweeps and homings
+        by_board.setdefault((target.board, target.sweep), []).append(index)
+    pairs: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for before, after in chain.from_iterable(map(pairwise, by_board.values())):
+        pairs.setdefault((targets[before].homing, targets[after].homing), []).append((before, after))
+    first = bundle.state_slices()["boards"].start
+    found = []
+    for (one, other), of_boards in sorted(pairs.items()):
+        shift, jacobian = np.zeros(3), np.zeros((3, len(covariance)))
+        for indices in of_boards:
+            for index, sign in zip(indices, (1, -1), strict=True):
+                point, slope = _point(bundle.rt_ref_board[index], middles_mm[targets[index].board])
+                shift += sign * point / len(of_boards)
+                jacobian[:, first + 6 * index : first + 6 * index + 6] += sign * slope / len(of_boards)
+        found.append(HomingShift(one, other, shift, jacobian @ covariance @ jacobian.T))
+    return found
+
+
+def _point(rt: NDArray[np.float64], at_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return a board's point in the reference frame, and its derivative (3, 6) by the board's pose."""
+    rotation, derivative = cv2.Rodrigues(np.ascontiguousarray(rt[:3]))
+    by_rotation = np.array([row.reshape(3, 3) @ at_mm for row in np.asarray(derivative)]).T
+    return np.asarray(rotation) @ at_mm + rt[3:], np.hstack([by_rotation, np.eye(3)])

@@ -1,7 +1,7 @@
 """Input of the bundle adjustment: corners of boards, by node and sweep."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +20,8 @@ class Target:
 
     Parameters
     ----------
-    board : str
-        Its name.
-    sweep : int
-        Number of the sweep.
+    board, sweep : str, int
+        Name of the board and number of the sweep.
     homing : int
         Number of the stage's homing that the node's position relies on.
     """
@@ -39,16 +37,13 @@ class BoardObservation:
 
     Parameters
     ----------
-    node : (int, int)
-        Row and column of the grid.
-    target : Target
-        Board and sweep.
+    node, target : (int, int), Target
+        Row and column of the grid; board and sweep.
     corners : int array (corner,)
         Their numbers on the board.
-    pixels : float array (corner, 2)
-        Their positions in the image: column, row.
-    sigma_px : float array (corner,)
-        Their standard deviations per axis. Only the ratios count; the level follows from the residuals.
+    pixels, sigma_px : float array (corner, 2), (corner,)
+        Their column and row in the image, and their standard deviations per axis. Only the ratios of these count; the
+        level follows from the residuals.
     """
 
     node: Node
@@ -64,16 +59,13 @@ class Observations:
 
     Attributes
     ----------
-    nodes : list of (int, int)
-        The nodes that boards connect to the reference, which is the first.
-    targets : list of Target
-        The boards in each sweep.
+    nodes, targets : list of (int, int), list of Target
+        The nodes that boards connect to the reference, which is the first; the boards in each sweep.
     node_of, target_of : int array (view,)
         Indices into `nodes` and `targets`.
-    pixels : float array (view, row, column, 2)
-        Corners on the lattice of the largest board; zero where none was seen.
-    weights : float array (view, row, column)
-        The median σ over that of the corner; −1 where none was seen.
+    pixels, weights : float array (view, row, column, 2), (view, row, column)
+        Corners on the lattice of the largest board, and the median σ over that of the corner; 0 and −1 where none was
+        seen.
     """
 
     nodes: list[Node]
@@ -100,14 +92,7 @@ def gather(
 ) -> Observations:
     """Sort observations for the solver, and leave out nodes that share no board with the rest.
 
-    Parameters
-    ----------
-    observations : sequence of BoardObservation
-        Observations in any order.
-    corner_shapes : dict of board name to (int, int)
-        Rows and columns of each board's inner corners.
-    reference : (int, int)
-        The centre node, whose camera is the reference frame.
+    `corner_shapes` has rows and columns of each board's inner corners; the camera of node `reference` is the frame.
 
     Raises
     ------
@@ -116,60 +101,64 @@ def gather(
     ValueError
         A corner does not exist on its board.
     """
-    useful = [
-        seen for seen in observations if len(seen.corners) >= _MIN_CORNERS and _determines_pose(seen, corner_shapes)
-    ]
+    useful = [seen for seen in observations if _determines_pose(seen, corner_shapes)]
     nodes = _connected_nodes(useful, reference)
     if not nodes:
         raise TooFewViews(
             f"node {reference}, whose camera is the reference, shows no board with {_MIN_CORNERS} corners or more; "
             "take it again with a board in view"
         )
-    kept = [observation for observation in useful if observation.node in nodes]
-    targets = sorted(
-        {observation.target for observation in kept}, key=lambda target: (target.sweep, target.homing, target.board)
-    )
-    kept.sort(key=lambda observation: (targets.index(observation.target), nodes.index(observation.node)))
-    return Observations(
-        nodes,
-        targets,
-        np.array([nodes.index(observation.node) for observation in kept], np.int32),
-        np.array([targets.index(observation.target) for observation in kept], np.int32),
-        *_lattices(kept, corner_shapes),
-    )
+    kept = [seen for seen in useful if seen.node in nodes]
+    targets = sorted({seen.target for seen in kept}, key=lambda target: (target.sweep, target.homing, target.board))
+    kept.sort(key=lambda seen: (targets.index(seen.target), nodes.index(seen.node)))
+    node_of = np.array([nodes.index(seen.node) for seen in kept], np.int32)
+    target_of = np.array([targets.index(seen.target) for seen in kept], np.int32)
+    return Observations(nodes, targets, node_of, target_of, *_lattices(kept, corner_shapes))
+
+
+def as_one_homing(observations: Sequence[BoardObservation]) -> list[BoardObservation]:
+    """Return the observations as if no homing had interrupted a sweep."""
+    return [replace(seen, target=replace(seen.target, homing=0)) for seen in observations]
+
+
+def interrupted_sweeps(observations: Sequence[BoardObservation]) -> list[int]:
+    """Return the sweeps within which the stage homed."""
+    homings: dict[int, set[int]] = {}
+    for seen in observations:
+        homings.setdefault(seen.target.sweep, set()).add(seen.target.homing)
+    return sorted(sweep for sweep, of_sweep in homings.items() if len(of_sweep) > 1)
 
 
 def _lattices(
     views: Sequence[BoardObservation], corner_shapes: dict[str, tuple[int, int]]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return `pixels` and `weights` of the views' corners, see `Observations`."""
-    shape = np.max([corner_shapes[observation.target.board] for observation in views], axis=0)
+    shape = np.max([corner_shapes[seen.target.board] for seen in views], axis=0)
     pixels, weights = np.zeros((len(views), *shape, 2)), np.full((len(views), *shape), -1.0)
-    typical_px = float(np.median(np.concatenate([observation.sigma_px for observation in views])))
-    for view, observation in enumerate(views):
-        rows, columns = corner_shapes[observation.target.board]
-        row, column = np.divmod(observation.corners, columns)
+    typical_px = float(np.median(np.concatenate([seen.sigma_px for seen in views])))
+    for view, seen in enumerate(views):
+        rows, columns = corner_shapes[seen.target.board]
+        row, column = np.divmod(seen.corners, columns)
         if row.max() >= rows:
             raise ValueError(
-                f"board '{observation.target.board}' has no corner {observation.corners.max()}; "
-                "give the board as printed"
+                f"board '{seen.target.board}' has no corner {seen.corners.max()}; give the board as printed"
             )
-        pixels[view, row, column] = observation.pixels
-        weights[view, row, column] = typical_px / observation.sigma_px
+        pixels[view, row, column] = seen.pixels
+        weights[view, row, column] = typical_px / seen.sigma_px
     return pixels, weights
 
 
-def _determines_pose(observation: BoardObservation, corner_shapes: dict[str, tuple[int, int]]) -> bool:
-    """Return whether the corners lie on two rows and two columns at least, and so determine the pose of the board."""
-    row, column = np.divmod(observation.corners, corner_shapes[observation.target.board][1])
-    return len(set(row.tolist())) > 1 and len(set(column.tolist())) > 1
+def _determines_pose(seen: BoardObservation, corner_shapes: dict[str, tuple[int, int]]) -> bool:
+    """Return whether corners are enough, and on two rows and two columns at least: they then determine the pose."""
+    row, column = np.divmod(seen.corners, corner_shapes[seen.target.board][1])
+    return len(seen.corners) >= _MIN_CORNERS and len(np.unique(row)) > 1 and len(np.unique(column)) > 1
 
 
 def _connected_nodes(observations: Sequence[BoardObservation], reference: Node) -> list[Node]:
     """Return the nodes that chains of common boards connect to the reference, the reference first."""
     nodes_of: dict[Target, set[Node]] = {}
-    for observation in observations:
-        nodes_of.setdefault(observation.target, set()).add(observation.node)
+    for seen in observations:
+        nodes_of.setdefault(seen.target, set()).add(seen.node)
     reached = {reference} if any(reference in nodes for nodes in nodes_of.values()) else set()
     waiting = list(reached)
     while waiting:
@@ -178,5 +167,4 @@ def _connected_nodes(observations: Sequence[BoardObservation], reference: Node) 
             if node in neighbours:
                 waiting.extend(neighbours - reached)
                 reached |= neighbours
-    others = sorted(reached - {reference})
-    return [reference, *others] if reached else []
+    return [reference, *sorted(reached - {reference})] if reached else []

@@ -5,11 +5,14 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
-from faintfield.calib.geometry.homings import HomingShift
 from faintfield.calib.geometry.observations import Node, Target
 from faintfield.calib.homography import rotation_matrix
 from faintfield.calib.lens import Lens
+
+# Probability of a shift that chance alone shows.
+_CHANCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -22,18 +25,28 @@ class BoardPose:
 
 @dataclass(frozen=True)
 class Repeatability:
-    """Repeatability of the gantry between sweeps.
+    """Repeatability of the gantry between sweeps: standard deviation of the position at a node, per axis, and its error.
 
-    Attributes
-    ----------
-    sd_mm : float
-        Standard deviation of the position at a node, per axis; zero if the corners' noise explains all differences.
-    se_mm : float
-        Standard error of `sd_mm`.
+    It is zero if the corners' noise explains all differences.
     """
 
     sd_mm: float
     se_mm: float
+
+
+@dataclass(frozen=True)
+class HomingShift:
+    """Shift (3,) of all cameras from one homing to a later one, in the reference camera's frame, and its covariance."""
+
+    before: int
+    after: int
+    shift_mm: NDArray[np.float64]
+    covariance_mm2: NDArray[np.float64]
+
+    def is_significant(self) -> bool:
+        """Return whether chance hardly makes such a shift."""
+        distance2 = float(self.shift_mm @ np.linalg.solve(self.covariance_mm2, self.shift_mm))
+        return bool(stats.chi2.sf(distance2, 3) < _CHANCE)
 
 
 @dataclass(frozen=True)
@@ -42,10 +55,8 @@ class RigGeometry:
 
     Attributes
     ----------
-    lens : Lens
-        Lens of the camera.
-    lens_model : str
-        "pinhole", "opencv4", "opencv5" or "opencv8".
+    lens, lens_model : Lens, str
+        Lens of the camera; its model is "pinhole", "opencv4", "opencv5" or "opencv8".
     nodes : list of (int, int)
         Row and column of the nodes, in raster order.
     reference : int
@@ -60,22 +71,20 @@ class RigGeometry:
         Height of the boards' bulge at their middle, along x and along y.
     sigma_px : float
         Standard deviation of a typical corner, per axis, estimated from the residuals.
-    rms_inlier_px : float
-        √(Σ residual² / 2N) over the N inliers.
-    rms_mrcal_px : float
-        mrcal's rms_reproj_error__pixels: √(Σ residual² / N) over all corners, masked ones included.
+    rms_inlier_px, rms_mrcal_px : float
+        √(Σ residual² / 2N) over the N inliers; mrcal's rms_reproj_error__pixels, √(Σ residual² / N) over all corners,
+        masked ones included.
     corners, outliers : int
         Numbers of inliers and of outliers.
     holdout_ratio : float, optional
         Ratio of the residual of boards left out of the fit to that of the fit; None with a single board pose.
     repeatability : Repeatability, optional
-        Repeatability of the gantry between sweeps; None with a single sweep.
+        None with a single sweep.
     warnings : list of str
         Views that disagree with the rest, and what to do about them.
-    homings : list of HomingShift
-        Shifts of the stage by homings within sweeps, if they show.
-    undetermined_homings : list of int
-        Sweeps within which the stage homed although no other sweep joins the nodes before and after.
+    homings, undetermined_homings : list of HomingShift, list of int
+        Shifts of the stage by homings within sweeps, if they show; sweeps within which the stage homed although no
+        other sweep joins the nodes before and after.
     """
 
     lens: Lens

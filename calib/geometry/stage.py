@@ -40,10 +40,8 @@ class StageReport:
 
     Attributes
     ----------
-    pitch_x_mm, pitch_y_mm : StageEstimate
-        Distance between neighbouring nodes along a row and along a column.
-    scale_x, scale_y : StageEstimate
-        The pitch over the commanded pitch.
+    pitch_x_mm, pitch_y_mm, scale_x, scale_y : StageEstimate
+        Distance between neighbouring nodes along a row and along a column, and its ratio to the commanded one.
     squareness_rad : StageEstimate
         Angle between the axes minus a right angle.
     backlash_x_mm, backlash_y_mm : StageEstimate
@@ -51,10 +49,9 @@ class StageReport:
         approached in the negative direction. The stage falls short by half of it either way.
     tilt_rad : StageEstimate
         Angle between the reference camera's axis and the normal of the grid.
-    node_residual_rms_mm : StageEstimate
-        Rms distance of the nodes from the regular grid that fits best, in three dimensions.
-    residuals_mm : list of (float, float, float)
-        Residual of each node along the grid's x, y and normal.
+    node_residual_rms_mm, residuals_mm : StageEstimate, list of (float, float, float)
+        Rms distance of the nodes from the regular grid that fits best, in three dimensions; the residual of each node
+        along the grid's x, y and normal.
     warnings : list of str
         Nodes far from their places; otherwise scale errors too large for a stage.
     """
@@ -75,34 +72,22 @@ class StageReport:
 def approach_directions(visits: Sequence[tuple[Node, int]]) -> dict[Node, tuple[float, float]]:
     """Return the direction in which each node was approached along x and y: ±1, averaged over sweeps.
 
-    An axis that does not move keeps the direction of its last move; before its first move it gets the direction of
-    that move.
-
-    Parameters
-    ----------
-    visits : sequence of ((int, int), int)
-        Node and sweep in the order of capture.
+    `visits` are node and sweep in the order of capture. An axis that does not move keeps the direction of its last
+    move; before its first move it gets the direction of that move.
     """
-    directions: dict[Node, list[NDArray[np.float64]]] = {}
+    directions: dict[Node, list[Array]] = {}
     for sweep in dict.fromkeys(sweep for _, sweep in visits):
         path = [node for node, of_sweep in visits if of_sweep == sweep]
-        moves = np.sign(np.diff(np.array(path, float)[:, ::-1], axis=0, prepend=np.nan))
-        for axis in (0, 1):
-            _fill_forward(moves[:, axis])
+        moves = np.sign(np.diff(np.array(path, float)[:, ::-1], axis=0, prepend=0.0))
+        moves[0] = 0.0
+        for along in moves.T:
+            moving = np.flatnonzero(along)
+            if moving.size:
+                last = np.searchsorted(moving, np.arange(len(along)), side="right") - 1
+                along[:] = along[moving[np.maximum(last, 0)]]
         for node, direction in zip(path, moves, strict=True):
             directions.setdefault(node, []).append(direction)
-    means = {node: np.mean(of_node, axis=0) for node, of_node in directions.items()}
-    return {node: (float(mean[0]), float(mean[1])) for node, mean in means.items()}
-
-
-def _fill_forward(moves: Array) -> None:
-    """Replace each rest (0, or NaN at the start) by the move before it, or else by the first move, in place."""
-    moving = np.flatnonzero(np.nan_to_num(moves))
-    if not moving.size:
-        moves[:] = 0.0
-        return
-    last = np.maximum(np.searchsorted(moving, np.arange(len(moves)), side="right") - 1, 0)
-    moves[:] = moves[moving[last]]
+    return {node: tuple(np.mean(of_node, axis=0).tolist()) for node, of_node in directions.items()}
 
 
 def stage_report(

@@ -1,34 +1,59 @@
-"""The lens, and where the camera was at every node, with their page: `faintfield geometry`."""
+"""Lens and camera poses from a board set, with their record, files and page: `faintfield geometry`."""
 
+import io
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import msgspec
+import numpy as np
+from msgspec import UNSET
 
-from faintfield.calib.geometry import GeometrySettings
-from faintfield.pipelines.arguments import LensName
-from faintfield.pipelines.calibration.geometry import (
-    MeasuredGeometry,
-    geometry_files,
-    geometry_record,
-    measure_geometry,
+from faintfield.calib.detection import BoardCorners, detect_boards
+from faintfield.calib.errors import TooFewViews
+from faintfield.calib.geometry import (
+    BoardObservation,
+    BoardPose,
+    GeometrySettings,
+    RigGeometry,
+    Target,
+    calibrate_geometry,
+    rms_over_views,
+    transfer_sigma_at,
 )
-from faintfield.pipelines.console import inform
+from faintfield.calib.geometry.bundle import load_mrcal
+from faintfield.calib.geometry.rig_geometry import HomingShift
+from faintfield.calib.geometry.stage import StageReport, approach_directions, stage_report
+from faintfield.calib.noise.strips import read_ahead, usable_cores
+from faintfield.pipelines.arguments import LensName
+from faintfield.pipelines.console import inform, progress, working
+from faintfield.pipelines.formats.exchange.mrcal import camera_model_text
+from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.results.geometry import (
+    CAMERA_FILE,
+    CORNERS_FILE,
+    COVARIANCE_FILE,
     DEFAULT_DEPTHS_MM,
     GEOMETRY_PAGE,
+    BoardRecord,
     GeometryOptions,
     GeometryRecord,
+    HomingRecord,
     LensRecord,
+    NodeRecord,
     RepeatabilityRecord,
     StageRecord,
     write_geometry,
 )
-from faintfield.pipelines.formats.sets.board_set import load_board_set
+from faintfield.pipelines.formats.sets.board_set import BoardSet, BoardView, load_board_set
 from faintfield.pipelines.pages.calibration_pages import geometry_page
 
 # Above this the nodes of one sweep no longer stand for those of another.
 _MAX_REPEATABILITY_MM = 0.020
+
+# A message about missed boards names this many nodes; more would not fit one line.
+_MAX_NODES_NAMED = 8
 
 
 class GeometrySummary(msgspec.Struct, frozen=True):
@@ -53,25 +78,169 @@ def measure_stage(
     depth_mm: Sequence[float] | None = None,
     limit_px: float = 0.5,
 ) -> GeometrySummary:
-    """Measure lens and poses from the boards of a session or set, and write them with their page."""
+    """Measure lens and poses from the boards of a session or set, and write them with their page.
+
+    Raises
+    ------
+    InputError, CalibrationError
+        mrcal is not installed, an image cannot be used, or the corners do not determine the geometry.
+    """
     board_set = load_board_set(directory)
     out = out or board_set.source.parent
     options = GeometryOptions(lens, tuple(depth_mm or DEFAULT_DEPTHS_MM), limit_px)
-    limits = GeometrySettings(lens, options.depth_mm, limit_px)
-    measured = measure_geometry(board_set, limits)
-    record = geometry_record(measured, options)
-    write_geometry(out, record, {**geometry_files(measured), GEOMETRY_PAGE: geometry_page(record, limits)})
-    _inform_of(measured, record)
+    settings = GeometrySettings(lens, options.depth_mm, limit_px)
+    load_mrcal()  # fails at once if it is missing, not after all images were searched
+    observations, size_px = _observe(board_set)
+    with working("solving lens and poses"):
+        rig = calibrate_geometry(board_set.boards, observations, size_px, board_set.reference, settings)
+    visits = [] if board_set.one_sided else [(view.node, view.sweep) for view in board_set.views]
+    stage = stage_report(rig, approach_directions(visits), board_set.pitch_mm)
+    record = _record(board_set, rig, stage, options)
+    write_geometry(out, record, {**_files(rig, observations), GEOMETRY_PAGE: geometry_page(record, settings)})
+    _inform_of(board_set, record)
     figures = {name: getattr(record, name) for name in GeometrySummary.__struct_fields__[2:]}
     return GeometrySummary(str(out), str(out / GEOMETRY_PAGE), **figures)
 
 
-def _inform_of(measured: MeasuredGeometry, record: GeometryRecord) -> None:
+def _observe(board_set: BoardSet) -> tuple[list[BoardObservation], tuple[int, int]]:
+    """Find the boards in all views; return their corners and the size of the images."""
+    boards, views = list(board_set.boards.values()), board_set.views
+    first = views[0].image()
+    size_px = first.shape[1], first.shape[0]
+
+    def seen_in(view: BoardView) -> list[BoardCorners]:
+        return detect_boards(first if view is views[0] else view.image(size_px), boards)
+
+    found = read_ahead(views, seen_in, usable_cores())
+    per_view = list(progress(found, "looking for boards", len(views)))
+    _inform_of_found(per_view)
+    observations = [
+        BoardObservation(
+            view.node, Target(seen.board, view.sweep, view.homing), seen.corners, seen.pixels, seen.sigma_px
+        )
+        for view, boards_seen in per_view
+        for seen in boards_seen
+        if len(seen.corners)
+    ]
+    if not observations:
+        markers = sum(board.markers for _, seen in per_view for board in seen)
+        raise TooFewViews(
+            f"{board_set.source}: {markers} markers of the boards and no corner between them in {len(views)} "
+            f"views; compare [[board]] ({'columns, rows' if markers else 'dictionary'}, first_marker_id) with the print"
+            ", or expose longer"
+        )
+    return observations, size_px
+
+
+def _inform_of_found(per_view: list[tuple[BoardView, list[BoardCorners]]]) -> None:
+    """Name views without boards, and prints in the older layout."""
+    empty = [view.node for view, seen in per_view if not any(len(board.corners) for board in seen)]
+    if empty:
+        names = ", ".join(str(list(node)) for node in empty[:_MAX_NODES_NAMED])
+        more = " …" if empty[_MAX_NODES_NAMED:] else ""
+        inform(f"no board was found in {len(empty)} of {len(per_view)} views (nodes {names}{more})")
+    legacy = sorted({board.board for _, seen in per_view for board in seen if board.legacy})
+    if legacy:
+        inform(f"printed in OpenCV's older layout, which begins with a white square: {', '.join(legacy)}")
+
+
+def _record(board_set: BoardSet, rig: RigGeometry, stage: StageReport, options: GeometryOptions) -> GeometryRecord:
+    lens = rig.lens
+    numbers = lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, tuple(lens.distortion)
+    lens_sigma = tuple(np.sqrt(np.diag(rig.covariance)[: len(lens.parameters)]).tolist())
+    poses = zip(rig.nodes, rig.rt_cam_ref.tolist(), rig.sigma_mm().tolist(), rig.sigma_rad().tolist(), strict=True)
+    transfers_px = {f"{depth:g}": rms_over_views(transfer_sigma_at(rig, depth)) for depth in options.depth_mm}
+    return GeometryRecord(
+        lens=LensRecord(rig.lens_model, *numbers, lens_sigma),
+        size_px=lens.size_px,
+        reference_node=rig.nodes[rig.reference],
+        nodes=[NodeRecord(*pose) for pose in poses],
+        homings=[_homing_record(shift) for shift in rig.homings] or UNSET,
+        rms_inlier_px=rig.rms_inlier_px,
+        rms_mrcal_px=rig.rms_mrcal_px,
+        corner_sigma_px=rig.sigma_px,
+        corners=rig.corners,
+        outliers=rig.outliers,
+        holdout_ratio=rig.holdout_ratio,
+        warnings=[*rig.warnings, *_homing_warnings(board_set, rig)],
+        transfer_sigma_px=transfers_px,
+        repeatability=msgspec.convert(rig.repeatability, RepeatabilityRecord | None, from_attributes=True),
+        boards=[_board_record(board_set, pose, rig.warp_mm.tolist()) for pose in rig.boards],
+        stage=msgspec.convert(stage, StageRecord, from_attributes=True),
+        **provenance("geometry", options, dict(board_set.input_hashes())).parts(),
+    )
+
+
+def _homing_warnings(board_set: BoardSet, rig: RigGeometry) -> list[str]:
+    """Return a warning where the stage homed within the only sweep, and may have come back to another place."""
+    sweeps = rig.undetermined_homings
+    if not sweeps or board_set.switches_repeat:
+        return []
+    return [
+        f"the stage homed again within sweep {', '.join(map(str, sweeps))}, and no other sweep joins the nodes before "
+        "and after, which may be shifted by as much as its switches repeat; take one more sweep"
+    ]
+
+
+def _homing_record(shift: HomingShift) -> HomingRecord:
+    (x, y, z), sigmas = shift.shift_mm.tolist(), np.sqrt(np.diag(shift.covariance_mm2)).tolist()
+    return HomingRecord(shift.before, shift.after, (x, y, z), (sigmas[0], sigmas[1], sigmas[2]))
+
+
+def _board_record(board_set: BoardSet, pose: BoardPose, warp_mm: list[float]) -> BoardRecord:
+    """Return a board with what is printed on it, so that the stored corners can be solved again."""
+    return BoardRecord(
+        **asdict(board_set.boards[pose.target.board]),
+        sweep=pose.target.sweep,
+        rt_ref_board=tuple(pose.rt_ref_board.tolist()),
+        warp_mm=(warp_mm[0], warp_mm[1]),
+        homing=pose.target.homing or UNSET,
+    )
+
+
+def _files(rig: RigGeometry, observations: Sequence[BoardObservation]) -> dict[str, bytes | str]:
+    """Return the files beside geometry.json by name: covariance, corners, and a camera model for each node.
+
+    The covariance is of fx, fy, cx, cy, the distortion, then rt_cam_ref of every node. The corners are those of the
+    boards whose pose was solved.
+    """
+    solved = {(board.target.board, board.target.sweep) for board in rig.boards}
+    seen_boards = [seen for seen in observations if (seen.target.board, seen.target.sweep) in solved]
+    files: dict[str, bytes | str] = {
+        COVARIANCE_FILE: _npz(covariance=rig.covariance, nodes=np.array(rig.nodes), intrinsics=rig.lens.parameters),
+        CORNERS_FILE: _corners_npz(seen_boards, apart=bool(rig.homings)),
+    }
+    for node, rt_cam_ref in zip(rig.nodes, rig.rt_cam_ref, strict=True):
+        files[CAMERA_FILE.format(*node)] = camera_model_text(rig.lens, rig.lens_model, rt_cam_ref)
+    return files
+
+
+def _corners_npz(observations: Sequence[BoardObservation], *, apart: bool) -> bytes:
+    """Return all corners, one row per corner; with the homings of the boards' poses if these are told apart."""
+    counts = [len(seen.corners) for seen in observations]
+    return _npz(
+        pixels=np.concatenate([seen.pixels for seen in observations]),
+        sigma_px=np.concatenate([seen.sigma_px for seen in observations]),
+        corner=np.concatenate([seen.corners for seen in observations]),
+        node=np.repeat([seen.node for seen in observations], counts, axis=0),
+        sweep=np.repeat([seen.target.sweep for seen in observations], counts),
+        homing=np.repeat([seen.target.homing if apart else 0 for seen in observations], counts),
+        board=np.repeat([seen.target.board for seen in observations], counts),
+    )
+
+
+def _npz(**arrays: Any) -> bytes:
+    content = io.BytesIO()
+    np.savez_compressed(content, **arrays)
+    return content.getvalue()
+
+
+def _inform_of(board_set: BoardSet, record: GeometryRecord) -> None:
     """Print in a few lines how good the geometry is."""
     known = ", ".join(f"{sigma:.3f} px at {depth} mm" for depth, sigma in record.transfer_sigma_px.items())
     inform(f"{len(record.nodes)} nodes, {record.corners} corners, residual {record.rms_inlier_px:.3f} px")
     inform(f"transfer between views known to {known}")
-    missing = {view.node for view in measured.board_set.views} - set(measured.rig.nodes)
+    missing = {view.node for view in board_set.views} - {entry.node for entry in record.nodes}
     if missing:
         inform(f"without a pose, since no board ties them to the rest: nodes {sorted(missing)}; take them again")
     off_grid = record.stage.node_residual_rms_mm.value

@@ -11,7 +11,7 @@ from rich.table import Table
 from faintfield.calib.arrangement.inspection import MIN_SIDE_PX, GridInspection, inspect_grid
 from faintfield.calib.arrangement.matching import SURE
 from faintfield.calib.arrangement.views import Node, Orientation, prepare_pictures
-from faintfield.pipelines.console import console, inform, visible
+from faintfield.pipelines.console import console, inform
 from faintfield.pipelines.errors import AmbiguousOrder, CameraTurned, CopiedPicture, NotOneScene, ShuffledPictures
 from faintfield.pipelines.formats.exchange.image_grid import ImageGrid
 from faintfield.pipelines.formats.exchange.imported_set import read_picture
@@ -31,9 +31,6 @@ _NOTABLE_DEG, _NOTABLE_SCALE = 0.3, 0.005
 
 # Spread of light between views, and displacement in px beyond what disparities explain, that are worth a word.
 _NOTABLE_LIGHT, _NOTABLE_PX = 0.1, 1.0
-
-# Share of other pictures that neighbours fit better than, from which no other order is tried in place of a square.
-_CERTAIN_SHARE = 0.95
 
 # Correlation by which the blocks must agree better in another order of a list.
 _MIN_LEVEL_GAIN = 0.05
@@ -73,18 +70,8 @@ def arrange_grid(
 ) -> tuple[ImageGrid, Arrangement]:
     """Inspect the pictures of a grid, put them in order, and print what they show.
 
-    Parameters
-    ----------
-    grid : ImageGrid
-        Pictures by the two numbers of their names, or by their place in a list.
-    prescribed : Orientation, optional
-        The order, if options state it; the pictures are then only measured.
-    white : float
-        Value of a white pixel.
-    size_px : (int, int)
-        Width and height of the pictures.
-    aligned : bool
-        A person stated that the pictures are aligned, so that disparities may have any sign.
+    If options prescribe the order, the pictures are only measured. `white` is the value of a white pixel; `aligned`
+    says that a person stated that the pictures are aligned, so that disparities may have any sign.
 
     Raises
     ------
@@ -113,9 +100,9 @@ def arrange_grid(
     arranged = grid.moved(orientation.apply(nodes), transposed=orientation.transpose, omit=fits.odd)
     light = dict(zip(paths, pictures.relative_light.tolist(), strict=True))
     uneven = inspection.failure is None and np.ptp(pictures.relative_light) > _NOTABLE_LIGHT
-    least, largest = inspection.range_px
+    least, largest = (round(limit, 2) for limit in inspection.range_px)
     record = Arrangement(
-        disparity_range_px=None if inspection.failure else (round(least, 2), round(largest, 2)),
+        disparity_range_px=None if inspection.failure else (least, largest),
         told_by="options" if prescribed else inspection.direction,
         transposed=orientation.transpose,
         rows_flipped=orientation.flip_rows,
@@ -140,7 +127,7 @@ def _choose_order(grid: ImageGrid, inspect: _Inspect, *, fixed: bool) -> tuple[l
     rows, columns = grid.size
     if fixed or min(rows, columns) == 1:
         return nodes, inspection
-    if grid.guessed and not _is_certain(inspection) and (line := _line_of_views(grid, inspection, inspect)):
+    if grid.guessed and not inspection.order.is_certain and (line := _line_of_views(grid, inspection, inspect)):
         return line
     if grid.ordered and rows != columns:
         by_column = [(place % rows, place // rows) for place in range(len(nodes))]
@@ -168,19 +155,13 @@ def _choose_order(grid: ImageGrid, inspect: _Inspect, *, fixed: bool) -> tuple[l
 def _line_of_views(
     grid: ImageGrid, square: GridInspection, inspect: _Inspect
 ) -> tuple[list[Node], GridInspection] | None:
-    """Return a grid that was guessed to be a square as one line of views, if the neighbours fit in that only.
-
-    Raises
-    ------
-    AmbiguousOrder
-        They fit in both.
-    """
+    """Return a guessed square as one line of views if the neighbours fit in that only; AmbiguousOrder if in both."""
     (rows, columns), count = grid.size, len(grid.paths)
     nodes = [(0, place) for place in range(count)]
     line = inspect(nodes)
     # The views of a square whose rows run back and forth make a line, too
     if line.order.verdict != "fits" or any(
-        _is_certain(inspect(other)) for other in _back_and_forth(list(grid.paths)).values()
+        inspect(other).order.is_certain for other in _back_and_forth(list(grid.paths)).values()
     ):
         return None
     if square.failure or square.order.verdict == "denied":
@@ -194,10 +175,6 @@ def _line_of_views(
             f"--rows 1 --columns {count}, or --rows {count} --columns 1"
         )
     return None
-
-
-def _is_certain(inspection: GridInspection) -> bool:
-    return inspection.order.verdict == "fits" and inspection.order.share > _CERTAIN_SHARE
 
 
 def _back_and_forth(nodes: list[Node]) -> dict[str, list[Node]]:
@@ -227,14 +204,14 @@ def _refuse_unfit(inspection: GridInspection, paths: Sequence[Path], *, prescrib
     (least, largest), orientation = inspection.range_px, inspection.orientation
     if inspection.undecided and not prescribed and not (aligned and not orientation.opposed):
         options, other = _options(orientation), _options(orientation.turned())
-        remedy = f"give {other}, or --disparity-px if they are aligned on a plane nearer than the scene"
+        remedy = f"{other}, or --disparity-px if they are aligned on a plane nearer than the scene"
         if orientation.opposed:
-            remedy = f"give {options} or {other}"
+            remedy = f"{options} or {other}"
+        by_name = "the order of the names"
         raise AmbiguousOrder(
             f"{folder}: two orders of the views are equally likely: disparities of {least:.2f} … {largest:.2f} px with "
-            f"{options or 'the order of the names'}, or {-largest:.2f} … {-least:.2f} px with "
-            f"{other or 'the order of the names'}, and no hidden parts tell near from far "
-            f"({inspection.side_z:.1f} standard errors); {remedy}"
+            f"{options or by_name}, or {-largest:.2f} … {-least:.2f} px with {other or by_name}, and no hidden parts "
+            f"tell near from far ({inspection.side_z:.1f} standard errors); give {remedy}"
         )
     for participle, values, limit, unit in (
         ("turned", np.degrees(fits.turn_rad), _MAX_DEG, "°"),
@@ -256,11 +233,10 @@ def _options(orientation: Orientation) -> str:
 
 def _print_table(grid: ImageGrid, record: Arrangement, inspection: GridInspection) -> None:
     """Print what the pictures show."""
-    rows, columns = grid.size
-    lines = {"grid": f"{_count(rows, 'row')} x {_count(columns, 'column')}, {_count(len(grid.paths), 'view')}"}
-    if record.disparity_range_px is None:
-        lines["order"] = "as in the names: the pictures do not tell"
-    else:
+    counts = [*zip(grid.size, ("row", "column"), strict=True), (len(grid.paths), "view")]
+    rows, columns, views = (f"{count} {noun}{'s' * (count != 1)}" for count, noun in counts)
+    lines = {"grid": f"{rows} x {columns}, {views}", "order": "as in the names: the pictures do not tell"}
+    if record.disparity_range_px is not None:
         options = _options(inspection.orientation)
         sources = {
             "pictures": f"hidden parts tell near from far, {abs(inspection.side_z):.0f} standard errors",
@@ -279,15 +255,11 @@ def _print_table(grid: ImageGrid, record: Arrangement, inspection: GridInspectio
         if record.relative_light:
             lines["light"] = f"{min(record.relative_light):.2f} … {max(record.relative_light):.2f} of the typical view"
         if record.missing:
-            lines["missing"] = ", ".join(f"({row}, {column})" for row, column in record.missing)
+            lines["missing"] = ", ".join(map(str, record.missing))
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     for heading, text in lines.items():
-        table.add_row(visible(heading), visible(text))
+        table.add_row(heading, text)
     console.print(table)
-
-
-def _count(count: int, noun: str) -> str:
-    return f"{count} {noun}{'s' * (count != 1)}"
 
 
 def _warnings(record: Arrangement, inspection: GridInspection, count: int) -> list[str]:
@@ -295,37 +267,37 @@ def _warnings(record: Arrangement, inspection: GridInspection, count: int) -> li
     fits, order = inspection.fits, inspection.order
     if inspection.failure:
         return [f"{_FAILURES[inspection.failure]}; the order of the names is kept"]
-    lines = []
-    if inspection.contradicted:
-        lines.append(
-            "the pictures contradict the order that the options state; without them it is found from the pictures"
-        )
-    if order.verdict != "fits" and inspection.still:
-        lines.append("all views show the same; no depth can be found")
-    elif order.verdict == "open":
-        lines.append(
-            "all pictures fit one another equally well: they show the same, or are too dark to check their order"
-        )
-    elif order.verdict == "few":
-        lines.append(f"{count} pictures are too few for their order to be checked")
-    elif order.verdict == "denied":
-        lines.append(
-            f"neighbours fit better than only {order.share:.0%} of other pictures, so the order may be wrong: in a "
-            "light field they fit better than nearly all"
-        )
-    if record.told_by == "names":
-        lines.append("the pictures do not tell where rows and columns begin; the order of the names is kept")
-    if record.odd_views:
-        lines.append(f"fit none of their neighbours, and are left out: {', '.join(record.odd_views)}")
+    verdict = {
+        "fits": "",
+        "open": "all pictures fit one another equally well: they show the same, or are too dark to check their order",
+        "few": f"{count} pictures are too few for their order to be checked",
+        "denied": f"neighbours fit better than only {order.share:.0%} of other pictures, so the order may be wrong: in "
+        "a light field they fit better than nearly all",
+    }[order.verdict]
+    if verdict and inspection.still:
+        verdict = "all views show the same; no depth can be found"
     x_px, y_px = fits.shift_px[int(np.argmax(np.abs(fits.shift_px).max(axis=1)))]
-    if max(abs(x_px), abs(y_px)) > _NOTABLE_PX:
-        lines.append(
-            f"views are shifted against their neighbours, by up to ({x_px:.1f}, {y_px:.1f}) px: the camera was off the "
-            "grid; planes are sharper with calibrated poses (import colmap)"
-        )
-    if record.turn_deg > _NOTABLE_DEG:
-        lines.append(f"views are turned by up to {record.turn_deg:.2f}°; a grid's camera does not turn")
     magnification = float(np.abs(fits.magnification - 1).max())
-    if magnification > _NOTABLE_SCALE:
-        lines.append(f"views are magnified by up to {100 * magnification:.1f} %")
-    return lines
+    remarks = [
+        (
+            inspection.contradicted,
+            "the pictures contradict the order that the options state; without them it is found from the pictures",
+        ),
+        (bool(verdict), verdict),
+        (
+            record.told_by == "names",
+            "the pictures do not tell where rows and columns begin; the order of the names is kept",
+        ),
+        (bool(record.odd_views), f"fit none of their neighbours, and are left out: {', '.join(record.odd_views)}"),
+        (
+            max(abs(x_px), abs(y_px)) > _NOTABLE_PX,
+            f"views are shifted against their neighbours, by up to ({x_px:.1f}, "
+            f"{y_px:.1f}) px: the camera was off the grid; planes are sharper with calibrated poses (import colmap)",
+        ),
+        (
+            record.turn_deg > _NOTABLE_DEG,
+            f"views are turned by up to {record.turn_deg:.2f}°; a grid's camera does not turn",
+        ),
+        (magnification > _NOTABLE_SCALE, f"views are magnified by up to {100 * magnification:.1f} %"),
+    ]
+    return [remark for holds, remark in remarks if holds]

@@ -7,14 +7,12 @@ are relative, often with backslashes; decimals may be commas; `#` begins a comme
 
 import math
 import shutil
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PureWindowsPath
 
 import msgspec
 import numpy as np
 
-from faintfield.calib.noise import Conditions
 from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.files import sha256, write_json, write_whole, writing_folder
@@ -56,7 +54,7 @@ class ExportedData(msgspec.Struct, frozen=True):
 
 @dataclass
 class Descriptor:
-    """A descriptor file: release of the standard, bits per pixel, and the frames."""
+    """A descriptor file: release of the standard, bits per pixel, and the frames with the paths that it states."""
 
     release: str = ""
     bits: int = 0
@@ -66,7 +64,13 @@ class Descriptor:
 def import_data(descriptor: Path, out: Path, *, overwrite: bool = False) -> ImportedFrames:
     """Make a noise set of the images that a descriptor names."""
     read = read_descriptor(descriptor)
-    sources = [image_path(descriptor, frame.file) for frame in read.frames]
+    sources = [
+        inside(descriptor.parent, PureWindowsPath(frame.file).as_posix(), f"{descriptor}: image")
+        for frame in read.frames
+    ]
+    missing = next((source for source in sources if not is_file(source)), None)
+    if missing is not None:
+        raise MissingFile(f"{missing}: is named by {descriptor} but missing; unpack all of the data set")
     names = [f"frames/{index:05d}_{source.name}" for index, source in enumerate(sources)]
     frames = [msgspec.structs.replace(frame, file=name) for name, frame in zip(names, read.frames, strict=True)]
     saturation_dn = float(2**read.bits - 1)
@@ -84,7 +88,7 @@ def import_data(descriptor: Path, out: Path, *, overwrite: bool = False) -> Impo
 
 
 def export_data(folder: Path, out: Path, *, overwrite: bool = False) -> ExportedData:
-    """Write the frames of a noise set or a session as images and a descriptor.
+    """Write the frames of a noise set or a session as images and a descriptor: flats by their level, then darks.
 
     Raises
     ------
@@ -94,25 +98,46 @@ def export_data(folder: Path, out: Path, *, overwrite: bool = False) -> Exported
     if not folder.exists():
         raise MissingFile(f"{folder}: no such folder; name a noise set or a session")
     noise_set = load_noise_set(folder)
-    settings, series = noise_set.settings, _ordered(noise_set.series)
-    first = read_frame(series[0][1][0])
+    settings = noise_set.settings
+    for conditions, paths in noise_set.series.items():
+        if conditions.kind == "flat" and not conditions.photons:
+            raise BadValue(
+                f"{paths[0]}: states no photons, which an EMVA 1288 descriptor gives for every bright image; add "
+                "photons to its entry, or leave it out"
+            )
+    order = sorted(noise_set.series, key=lambda series: (series.kind != "flat", series.level, series.exposure_s))
+    sources = [(path, conditions) for conditions in order for path in noise_set.series[conditions]]
+    first = read_frame(sources[0][0])
     bits = _bits(settings, first)
-    sources = [path for _, paths in series for path in paths]
-    replace = DESCRIPTOR if overwrite else None
-    with writing_folder(out, replace_if=replace, reads=[noise_set.folder, *sources]) as building:
+    region = (slice(*settings.region.rows), slice(*settings.region.columns)) if settings.region else np.s_[:, :]
+    height, width = first.pixels_dn[region].shape
+    lines = [f"v {_RELEASE}", f"n {bits} {width} {height}"]
+    replace, reads = DESCRIPTOR if overwrite else None, [noise_set.folder, *(path for path, _ in sources)]
+    with writing_folder(out, replace_if=replace, reads=reads) as building:
         (building / "images").mkdir()
-        names = {}
-        for index, source in enumerate(progress(sources, "writing images")):
-            names[source] = _write_image(source, building, index, settings, first)
-        images = [(conditions, [names[path] for path in paths]) for conditions, paths in series]
-        height, width = first.pixels_dn[_region(settings)].shape
-        write_whole(building / DESCRIPTOR, descriptor_text(images, bits, (width, height)))
+        last = None
+        for index, (source, conditions) in enumerate(progress(sources, "writing images")):
+            if conditions != last:
+                exposure_ns = repr(conditions.exposure_s * _NS_PER_S)
+                dark = conditions.kind == "dark"
+                lines.append(f"d {exposure_ns}" if dark else f"b {exposure_ns} {conditions.photons!r}")
+                last = conditions
+            # Regions and raw files are written anew
+            whole = settings.region is None and source.suffix.lower() not in RAW_SUFFIXES
+            name = f"images/{index:05d}_{source.stem}{source.suffix if whole else '.tiff'}"
+            pixels = read_frame(source, first.pixels_dn.shape[1::-1], of="the first frame").pixels_dn
+            if whole:
+                shutil.copyfile(source, building / name)
+            else:
+                write_frame(building / name, pixels[region])
+            lines.append("i " + str(PureWindowsPath(name)))
+        write_whole(building / DESCRIPTOR, "\n".join(lines) + "\n")
     inform(f"{out / DESCRIPTOR}: {len(sources)} images of {bits} bits, {width} x {height} px")
     return ExportedData(str(out), len(sources), bits, (width, height))
 
 
 def read_descriptor(path: Path) -> Descriptor:
-    """Read a descriptor file; the frames keep the paths that it states.
+    """Read a descriptor file.
 
     Raises
     ------
@@ -131,11 +156,19 @@ def read_descriptor(path: Path) -> Descriptor:
         if not words or words[0].startswith("#"):
             continue
         try:
-            keyword, rest = words
-            if keyword in ("b", "d"):
-                current = _measurement(keyword, rest, levels)
-            else:
-                _add(read, current, keyword, rest.strip())
+            match words:
+                case ["b" | "d" as keyword, rest]:
+                    current = _measurement(keyword, rest, levels)
+                case ["v", rest]:
+                    read.release = rest.strip()
+                case ["n", rest]:
+                    read.bits = int(rest.split()[0])
+                case ["i", rest] if current is not None:
+                    read.frames.append(msgspec.structs.replace(current, file=rest.strip()))
+                case ["i", _]:
+                    raise ValueError("an image before any 'b' or 'd' line")
+                case [keyword, *_]:
+                    raise ValueError(f"'{keyword}' is none of v, n, b, d, i")
         except ValueError as failure:
             raise BadValue(
                 f"{path}: line {number}: '{line.strip():.80}' cannot be read ({failure}); correct it"
@@ -146,21 +179,6 @@ def read_descriptor(path: Path) -> Descriptor:
             "name the descriptor of a data set"
         )
     return read
-
-
-def _add(read: Descriptor, current: NoiseFrame | None, keyword: str, rest: str) -> None:
-    """Add a `v`, `n` or `i` line to a descriptor; `current` is the frame of the last `b` or `d` line."""
-    match keyword:
-        case "v":
-            read.release = rest
-        case "n":
-            read.bits = int(rest.split()[0])
-        case "i":
-            if current is None:
-                raise ValueError("an image before any 'b' or 'd' line")
-            read.frames.append(msgspec.structs.replace(current, file=rest))
-        case _:
-            raise ValueError(f"'{keyword}' is none of v, n, b, d, i")
 
 
 def _measurement(keyword: str, rest: str, levels: dict[float, int]) -> NoiseFrame:
@@ -179,45 +197,6 @@ def _measurement(keyword: str, rest: str, levels: dict[float, int]) -> NoiseFram
     return NoiseFrame("", "flat", exposure_s, None, level, numbers[1])
 
 
-def image_path(descriptor: Path, name: str) -> Path:
-    """Return the path of an image that a descriptor names with slashes of either kind."""
-    path = inside(descriptor.parent, PureWindowsPath(name).as_posix(), f"{descriptor}: image")
-    if not is_file(path):
-        raise MissingFile(f"{path}: is named by {descriptor} but missing; unpack all of the data set")
-    return path
-
-
-def descriptor_text(images: Sequence[tuple[Conditions, Sequence[str]]], bits: int, size_px: tuple[int, int]) -> str:
-    """Return the text of a descriptor file.
-
-    Parameters
-    ----------
-    images : sequence of (Conditions, sequence of str)
-        The series with the paths of their images; flats need their photons.
-    bits : int
-        Bits per pixel.
-    size_px : (int, int)
-        Width and height of an image.
-    """
-    lines = [f"v {_RELEASE}", f"n {bits} {size_px[0]} {size_px[1]}"]
-    for conditions, names in images:
-        exposure_ns = repr(conditions.exposure_s * _NS_PER_S)
-        lines.append(f"d {exposure_ns}" if conditions.kind == "dark" else f"b {exposure_ns} {conditions.photons!r}")
-        lines += ["i " + str(PureWindowsPath(name)) for name in names]
-    return "\n".join(lines) + "\n"
-
-
-def _ordered(series: dict[Conditions, list[Path]]) -> list[tuple[Conditions, list[Path]]]:
-    """Return the series with their frames, flats by their level and then darks, as the standard's data have them."""
-    for conditions, paths in series.items():
-        if conditions.kind == "flat" and not conditions.photons:
-            raise BadValue(
-                f"{paths[0]}: states no photons, which an EMVA 1288 descriptor gives for every bright image; add "
-                "photons to its entry, or leave it out"
-            )
-    return sorted(series.items(), key=lambda item: (item[0].kind != "flat", item[0].level, item[0].exposure_s))
-
-
 def _bits(settings: NoiseSet, first: Frame) -> int:
     """Return the bits per pixel; the format takes saturation for the last value of these."""
     end_dn = settings.saturation_dn or first.saturation_dn or float(np.iinfo(first.pixels_dn.dtype).max)
@@ -225,22 +204,3 @@ def _bits(settings: NoiseSet, first: Frame) -> int:
     if end_dn != 2**bits - 1:
         inform(f"saturation at {end_dn:g} DN cannot be stated; readers will take {2**bits - 1} DN, of {bits} bits")
     return bits
-
-
-def _region(settings: NoiseSet) -> tuple[slice, slice]:
-    """Return the rows and columns in use."""
-    region = settings.region
-    return (slice(*region.rows), slice(*region.columns)) if region else (slice(None), slice(None))
-
-
-def _write_image(source: Path, folder: Path, index: int, settings: NoiseSet, first: Frame) -> str:
-    """Write one image, and return its path within the folder."""
-    height, width = first.pixels_dn.shape[:2]
-    pixels = read_frame(source, (width, height), of="the first frame").pixels_dn
-    as_it_is = settings.region is None and source.suffix.lower() not in RAW_SUFFIXES
-    name = f"images/{index:05d}_{source.stem}{source.suffix if as_it_is else '.tiff'}"
-    if as_it_is:
-        shutil.copyfile(source, folder / name)
-    else:
-        write_frame(folder / name, pixels[_region(settings)])
-    return name

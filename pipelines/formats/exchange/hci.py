@@ -21,8 +21,6 @@ from faintfield.pipelines.formats.reading import is_file, read_text
 from faintfield.pipelines.formats.sets.ground_truth import TRUE_DEPTH_FILE, TrueDepth
 from faintfield.pipelines.formats.units import MAX_LENGTH_MM, MAX_NODE
 
-FILE_NAME = "parameters.cfg"
-
 # Size in bytes up to which the file is read; it has some two thousand.
 _MAX_BYTES = 1_000_000
 
@@ -34,20 +32,9 @@ _MM_PER_M = 1000.0
 
 @dataclass(frozen=True)
 class DescribedGrid:
-    """Content of `parameters.cfg`.
+    """Content of `parameters.cfg`: rows and columns of the cameras, width and height of a picture, focal length.
 
-    Attributes
-    ----------
-    file : Path
-        The file.
-    size : (int, int)
-        Rows and columns of the cameras.
-    picture_px : (int, int)
-        Width and height of a picture.
-    fx_px : float
-        Focal length.
-    pitch_mm, focus_mm : float
-        Distance between neighbouring cameras, and the depth that does not move from view to view.
+    `pitch_mm` is the distance between neighbouring cameras, `focus_mm` the depth that does not move from view to view.
     """
 
     file: Path
@@ -57,15 +44,10 @@ class DescribedGrid:
     pitch_mm: float
     focus_mm: float
 
-    @property
-    def disparity_px(self) -> float:
-        """Disparity of points at the depth of focus before the views were sheared (px)."""
-        return self.fx_px * self.pitch_mm / self.focus_mm
-
     def scale(
         self, pitch_mm: float | None, fx_px: float | None, disparity_px: float | None
     ) -> tuple[float, float, float]:
-        """Return pitch, focal length and disparity: those given, else those of the file."""
+        """Return pitch, focal length and disparity at the depth of focus: those given, else those of the file."""
         inform(
             f"{self.file}: cameras {self.pitch_mm:g} mm apart, focal length {self.fx_px:g} px, focus at "
             f"{self.focus_mm:g} mm" + ("; options take their place" if pitch_mm or fx_px or disparity_px else "")
@@ -87,7 +69,7 @@ def described_grid(folder: Path) -> DescribedGrid | None:
     BadValue
         A number is missing, or impossible.
     """
-    path = folder / FILE_NAME
+    path = folder / "parameters.cfg"
     if not is_file(path):
         return None
     parser = configparser.ConfigParser(interpolation=None)

@@ -48,14 +48,11 @@ class ImageGrid:
         regular grid.
     remarks : list of str
         Files left out and sizes guessed, in words.
-    ordered : bool
-        Names tell no more than an order, which may run by row or by column, and back and forth.
-    guessed : bool
-        That the grid is a square follows from the number of pictures only.
-    sources : list of Path
-        Files of the user that hold the pictures.
-    dn_per_value : float, optional
-        Factor by which float values became whole numbers; None for other pictures.
+    ordered, guessed : bool
+        Names tell no more than an order, which may run by row or by column, and back and forth; that the grid is a
+        square follows from the number of pictures only.
+    sources, dn_per_value : list of Path, float, optional
+        Files of the user that hold the pictures, and the factor by which float values became whole numbers.
     """
 
     paths: dict[Node, Path]

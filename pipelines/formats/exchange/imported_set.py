@@ -190,23 +190,10 @@ def write_imported_set(
 ) -> None:
     """Copy images into an elemental set whose reference frame is the camera of one of them.
 
-    What the options do not state of the sensor is estimated from the views, or assumed and said so.
-
-    Parameters
-    ----------
-    reference : int
-        Index of the image whose camera is the reference.
-    command, recorded : str, dict
-        The command and its options, for the record.
-    units : Units
-        Units of depths; light is stated in what noise and tone allow.
-    models, sources : sequence of Path
-        Files that lens and poses were read from, and those that the images were unpacked from, the images' own by
-        default: for the record, and none of them is overwritten.
-    arrangement : Arrangement, optional
-        What was found in the pictures of a grid.
-    also : callable, optional
-        Writes further files into the folder of the set.
+    What the options do not state of the sensor is estimated from the views, or assumed and said so. Light is stated in
+    what noise and tone allow. `also` writes further files into the folder of the set. For the record are the command,
+    its options `recorded`, and the files that lens and poses were read from, `models`, and that images were unpacked
+    from, `sources`, by default the images' own; none of these is overwritten.
 
     Raises
     ------

@@ -133,52 +133,44 @@ def _lens(content: _Transforms, frame: _Frame, image: Path, sizes: dict[Path, tu
 
     `sizes` keeps the size of the first picture, which is read if the file states none.
     """
-
-    def value(name: str) -> float | None:
-        own = getattr(frame, name)
-        found = getattr(content, name) if own is None else own
-        return None if found is None else float(found)
-
-    model = frame.camera_model or content.camera_model
-    if model not in _MODELS or frame.is_fisheye or content.is_fisheye or value("k4"):
-        told = "k4" if value("k4") else model if model not in _MODELS else "is_fisheye"
-        raise ValueError(f"its lens has no counterpart here ({told}); undistort the images to a pinhole camera")
-    width, height = value("w"), value("h")
+    own = {name: value for name, value in msgspec.structs.asdict(frame).items() if value is not None}
+    stated = msgspec.structs.asdict(content) | own
+    model = stated["camera_model"]
+    if model not in _MODELS or stated["is_fisheye"] or stated["k4"]:
+        kind = "k4" if stated["k4"] else model if model not in _MODELS else "is_fisheye"
+        raise ValueError(f"its lens has no counterpart here ({kind}); undistort the images to a pinhole camera")
+    width, height = stated["w"], stated["h"]
     if width is None or height is None:
         if not sizes:
             sizes[image] = read_frame(image).pixels_dn.shape[1::-1]
         width, height = next(iter(sizes.values()))
-    fx_px, fy_px = value("fl_x"), value("fl_y")
-    if fx_px is None and (angle := value("camera_angle_x")) is not None:
-        fx_px = _focal_px(width, angle, "camera_angle_x")
-    if fy_px is None and (angle := value("camera_angle_y")) is not None:
-        fy_px = _focal_px(height, angle, "camera_angle_y")
+    if not float(width).is_integer() or not float(height).is_integer():
+        raise ValueError(f"w, h = {width:g}, {height:g} are no whole numbers of pixels")
+    fx_px, fy_px = (_focal_px(stated, *names) for names in ((width, "fl_x", "x"), (height, "fl_y", "y")))
     if fx_px is None:
         raise ValueError("states neither fl_x nor camera_angle_x")
-    distortion = tuple(value(name) or 0.0 for name in ("k1", "k2", "p1", "p2", "k3"))
-    cx, cy = value("cx"), value("cy")
+    cx_px = width / 2 if stated["cx"] is None else stated["cx"]
+    cy_px = height / 2 if stated["cy"] is None else stated["cy"]
+    distortion = tuple(stated[name] or 0.0 for name in ("k1", "k2", "p1", "p2", "k3"))
     return Lens(
-        (_whole(width, "w"), _whole(height, "h")),
+        (int(width), int(height)),
         fx_px,
         fx_px if fy_px is None else fy_px,
-        (width / 2 if cx is None else cx) - _HALF_PX,
-        (height / 2 if cy is None else cy) - _HALF_PX,
+        cx_px - _HALF_PX,
+        cy_px - _HALF_PX,
         distortion if any(distortion) else (),
     )
 
 
-def _focal_px(size: float, angle: float, name: str) -> float:
-    """Return the focal length of a picture that spans an angle."""
+def _focal_px(stated: dict[str, Any], size: float, name: str, axis: str) -> float | None:
+    """Return the focal length that is stated, or that of a picture that spans the angle that is stated."""
+    focal_px: float | None = stated[name]
+    angle = stated[f"camera_angle_{axis}"]
+    if focal_px is not None or angle is None:
+        return focal_px
     if not 0 < angle < math.pi:
-        raise ValueError(f"{name} = {angle:g} rad is not between 0 and π")
+        raise ValueError(f"camera_angle_{axis} = {angle:g} rad is not between 0 and π")
     return 0.5 * size / math.tan(0.5 * angle)
-
-
-def _whole(number: float, name: str) -> int:
-    """Return a size in px."""
-    if not number.is_integer():
-        raise ValueError(f"{name} = {number:g} is no whole number of pixels")
-    return int(number)
 
 
 def _write_transforms(folder: Path, views: list[PosedImage]) -> None:

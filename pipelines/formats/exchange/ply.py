@@ -59,13 +59,11 @@ def write_points(
     path : Path
         The file; it appears whole or not at all.
     depth_mm : float array (row, column)
-        Depth along the axis of the camera in mm; NaN where it is not known.
+        Depth along the axis of the camera, in mm or, unless `in_mm`, in a unit of unknown length; NaN if not known.
     x, y : float array (column,), (row,)
         Directions of the samples: x/z and y/z, in ascending order.
     picture : uint8 array (row, column[, RGB])
         Their colours.
-    in_mm : bool
-        The depths are in mm; else in a unit of unknown length, which the file says.
 
     Raises
     ------

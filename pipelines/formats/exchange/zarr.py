@@ -28,23 +28,18 @@ _CHUNK_PX = 512
 _HELD = ("zarr.json", "[0-9]", "[0-9][0-9]")
 
 
-@dataclass(frozen=True)
-class PlaneStack:
-    """Planes of one folder that fit one stack, the nearest first.
+class ZarrExport(msgspec.Struct, frozen=True):
+    """The result of `faintfield export zarr`; the shape is colours, planes, rows, columns."""
 
-    Attributes
-    ----------
-    folder : Path
-        Where they lie.
-    planes : sequence of PlaneRecord
-        Their entries in reconstruction.json, one per plane.
-    shape : (int, int, int, int)
-        Colours, planes, rows, columns.
-    scale : Scale
-        Of the samples.
-    units : StatedUnits
-        Of depths and light.
-    """
+    out: str
+    shape: tuple[int, int, int, int]
+    levels: int
+    unit: str
+
+
+@dataclass(frozen=True)
+class _Stack:
+    """Planes of one folder that fit one stack, the nearest first."""
 
     folder: Path
     planes: Sequence[PlaneRecord]
@@ -61,46 +56,38 @@ class PlaneStack:
         return levels
 
 
-class ZarrExport(msgspec.Struct, frozen=True):
-    """The result of `faintfield export zarr`."""
-
-    out: str
-    shape: tuple[int, int, int, int]
-    levels: int
-    unit: str
-
-
 def export_planes(directory: Path, out: Path, *, overwrite: bool = False) -> ZarrExport:
-    """Write the planes in a folder, which one call and one method made (otherwise BadValue), as OME-Zarr."""
-    require_zarr()
+    """Write the planes in a folder as OME-Zarr.
+
+    Raises
+    ------
+    BadValue
+        Several calls or methods made the planes, none has a depth, or they differ in size or in the steps of depth.
+    MissingPackage
+        zarr or ome-zarr-models is not installed.
+    """
+    zarr = _require_zarr()
+    stack = _stack_in(directory)
+    held = _HELD if overwrite and _is_export(out) else ()
+    with writing_folder(out, replace_only=held, reads=[stack.folder]) as building:
+        group = zarr.open_group(building, mode="w", zarr_format=3)
+        _write_metadata(group, stack, directory.resolve().name)
+        for index, record in enumerate(progress(stack.planes, "writing planes")):
+            plane = np.atleast_3d(np.asarray(read_frame(stack.folder / Path(record.file).name).pixels_dn, np.float32))
+            for level in range(stack.levels):
+                group[str(level)][:, index] = np.moveaxis(plane, 2, 0)
+                plane = _halve(plane)
+    return ZarrExport(str(out), stack.shape, stack.levels, stack.scale.unit or "relative")
+
+
+def _stack_in(directory: Path) -> _Stack:
+    """Return the planes of a folder as one stack."""
     results = planes_below(directory)
     if len(results) > 1:
         names = ", ".join(map(str, results))
         raise BadValue(f"{directory}: holds planes of {len(results)} calls or methods; name one folder of {names}")
     ((folder, result),) = results.items()
-    stack = plane_stack(folder, result.planes, units_of(result))
-    write_zarr(out, stack, directory.resolve().name, overwrite=overwrite)
-    return ZarrExport(str(out), stack.shape, stack.levels, stack.scale.unit or "relative")
-
-
-def plane_stack(folder: Path, records: Sequence[PlaneRecord], units: StatedUnits) -> PlaneStack:
-    """Return the planes of a folder as one stack.
-
-    Parameters
-    ----------
-    folder : Path
-        Where they lie.
-    records : sequence of PlaneRecord
-        The `planes` of its reconstruction.json.
-    units : StatedUnits
-        The units that it states.
-
-    Raises
-    ------
-    BadValue
-        No plane has a depth, or they differ in size, or their depths are not in equal steps.
-    """
-    planes = planes_in_order(records)
+    units, planes = units_of(result), planes_in_order(result.planes)
     if not planes:
         raise BadValue(f"{folder}: holds no planes at depths, only planes given by a pose; reconstruct some at depths")
     shapes = sorted({record.shape for record in planes})
@@ -112,51 +99,12 @@ def plane_stack(folder: Path, records: Sequence[PlaneRecord], units: StatedUnits
             f"{folder}: the {len(planes)} planes are not in equal steps of {units.quantity}, and OME-Zarr states only "
             f"one; reconstruct with {'--sweep-px' if units.length == 'px' else '--sweep-mm'}"
         )
-    colours = len(at_depths(records)) // len(planes)
-    return PlaneStack(folder, planes, (colours, len(planes), *shapes[0]), scale, units)
+    colours = len(at_depths(result.planes)) // len(planes)
+    return _Stack(folder, planes, (colours, len(planes), *shapes[0]), scale, units)
 
 
-def write_zarr(out: Path, stack: PlaneStack, name: str, *, overwrite: bool = False) -> None:
-    """Write a stack of planes as OME-Zarr.
-
-    Parameters
-    ----------
-    out : Path
-        Folder to write.
-    stack : PlaneStack
-        The planes.
-    name : str
-        The name of the image.
-    overwrite : bool
-        Replace an earlier export in `out`.
-
-    Raises
-    ------
-    MissingPackage
-        zarr or ome-zarr-models is not installed.
-    OutputExists
-        `out` holds something else.
-    """
-    zarr = require_zarr()
-    earlier = _HELD if overwrite and _is_export(out) else ()
-    with writing_folder(out, replace_only=earlier, reads=[stack.folder]) as building:
-        group = zarr.open_group(building, mode="w", zarr_format=3)
-        _write_metadata(group, stack, name)
-        for index, record in enumerate(progress(stack.planes, "writing planes")):
-            plane = np.atleast_3d(np.asarray(read_frame(stack.folder / Path(record.file).name).pixels_dn, np.float32))
-            for level in range(stack.levels):
-                group[str(level)][:, index] = np.moveaxis(plane, 2, 0)
-                plane = _halve(plane)
-
-
-def require_zarr() -> Any:
-    """Return the zarr module, if it and ome-zarr-models are installed.
-
-    Raises
-    ------
-    MissingPackage
-        One of them is not installed.
-    """
+def _require_zarr() -> Any:
+    """Return the zarr module, if it and ome-zarr-models are installed."""
     try:
         import ome_zarr_models  # noqa: F401
         import zarr
@@ -177,7 +125,7 @@ def _is_export(folder: Path) -> bool:
     return isinstance(attributes, dict) and "faintfield" in attributes
 
 
-def _write_metadata(group: Any, stack: PlaneStack, name: str) -> None:
+def _write_metadata(group: Any, stack: _Stack, name: str) -> None:
     """Make the arrays of all resolutions, and describe their axes."""
     from ome_zarr_models.v05.axes import Axis
     from ome_zarr_models.v05.image import ImageAttrs
@@ -201,7 +149,7 @@ def _write_metadata(group: Any, stack: PlaneStack, name: str) -> None:
     }
 
 
-def _dataset(group: Any, stack: PlaneStack, level: int) -> Any:
+def _dataset(group: Any, stack: _Stack, level: int) -> Any:
     """Make the array of one resolution, and return its entry: where its samples lie."""
     from ome_zarr_models.v05.multiscales import Dataset
 
