@@ -81,7 +81,9 @@ def refine_corners(image: NDArray[np.float32], guesses: Array, squares_px: Array
     """
     if not len(guesses):
         return np.empty((0, 2)), np.empty(0)
-    state = _start(guesses, squares_px)
+    state = np.zeros((len(guesses), _COUNT))  # positions are relative to the guesses
+    state[:, _ANGLES] = np.arctan2(squares_px[..., 1], squares_px[..., 0])
+    state[:, _BLUR] = np.log(_INITIAL_BLUR_PX)
     for index, max_steps in enumerate(_MAX_STEPS):
         windows = _windows(image, guesses, state[:, _PLACE], squares_px, clear)
         if index == 0:
@@ -93,28 +95,14 @@ def refine_corners(image: NDArray[np.float32], guesses: Array, squares_px: Array
                 break
     points = guesses + state[:, _PLACE]
     variances = np.diagonal(np.linalg.inv(normal), axis1=1, axis2=2)
-    found = _accepted(state, variances, windows)
+    found = np.abs(state[:, _PLACE]).max(axis=1) <= _MAX_SHIFT_PX
+    found &= np.square(state[:, _CONTRAST]) >= _MIN_CONTRAST_SIGMAS**2 * variances[:, _CONTRAST]
+    # Where the pixels say nothing, rounding can make a variance of the inverted matrix negative.
+    found &= (variances[:, _CONTRAST] > 0) & (variances[:, _PLACE].mean(axis=1) > 0)
+    found &= windows.counts.sum(axis=1) >= _MIN_PIXELS
     found &= ((points >= 0) & (points <= np.array(image.shape[::-1]) - 1)).all(axis=1)
     place_variances = np.where(found, variances[:, _PLACE].mean(axis=1), np.nan)
     return np.where(found[:, np.newaxis], points, np.nan), np.hypot(np.sqrt(place_variances), _FLOOR_PX)
-
-
-def _accepted(state: Array, variances: Array, windows: _Windows) -> NDArray[np.bool_]:
-    """Return which corners (corner,) are near their guess, of sufficient contrast, and seen by enough pixels."""
-    near = np.abs(state[:, _PLACE]).max(axis=1) <= _MAX_SHIFT_PX
-    variance = variances[:, _CONTRAST]
-    contrast = np.square(state[:, _CONTRAST]) >= _MIN_CONTRAST_SIGMAS**2 * variance
-    # Where the pixels say nothing, rounding can make a variance of the inverted matrix negative.
-    known = (variance > 0) & (variances[:, _PLACE].mean(axis=1) > 0)
-    return np.asarray(near & known & contrast & (windows.counts.sum(axis=1) >= _MIN_PIXELS))
-
-
-def _start(guesses: Array, squares_px: Array) -> Array:
-    """Return the initial parameters (corner, 9), with positions relative to the guesses."""
-    state = np.zeros((len(guesses), _COUNT))
-    state[:, _ANGLES] = np.arctan2(squares_px[..., 1], squares_px[..., 0])
-    state[:, _BLUR] = np.log(_INITIAL_BLUR_PX)
-    return state
 
 
 def _windows(image: Pixels, guesses: Array, positions: Array, squares_px: Array, clear: float) -> _Windows:
@@ -140,7 +128,8 @@ def _windows(image: Pixels, guesses: Array, positions: Array, squares_px: Array,
 
 def _set_levels(state: Array, windows: _Windows) -> None:
     """Set a and c, in place, by a linear regression of the pixels on the pattern."""
-    pattern = _edges(state, windows).pattern
+    _, _, rise, *_ = _edges(state, windows)
+    pattern = rise[0] * rise[1]
     share = windows.counts / np.maximum(windows.counts.sum(axis=1, keepdims=True), 1)
     middle, level = ((share * what).sum(axis=1, keepdims=True) for what in (pattern, windows.values))
     slope = (share * (pattern - middle) * windows.values).sum(axis=1)
@@ -148,25 +137,11 @@ def _set_levels(state: Array, windows: _Windows) -> None:
     state[:, _LEVEL] = level[:, 0] - state[:, _CONTRAST] * middle[:, 0]
 
 
-@dataclass(frozen=True)
-class _Edges:
-    """Both edges of each corner (2, corner, pixel): distances along and across, f, its derivative by d, direction."""
+def _edges(state: Array, windows: _Windows) -> tuple[Pixels, Pixels, Pixels, Pixels, Pixels, Pixels]:
+    """Return both edges of each corner at the pixels of the windows, each (2, corner, pixel).
 
-    along: Pixels
-    across: Pixels
-    rise: Pixels
-    slope: Pixels
-    cos: Pixels
-    sin: Pixels
-
-    @property
-    def pattern(self) -> Pixels:
-        """Return f₁ f₂ (corner, pixel)."""
-        return np.asarray(self.rise[0] * self.rise[1])
-
-
-def _edges(state: Array, windows: _Windows) -> _Edges:
-    """Return the edges that the parameters describe at the pixels of the windows."""
+    These are distances along and across, f, its derivative by d, and the cosine and sine of the direction.
+    """
     numbers = state.astype(np.float32)[..., np.newaxis]
     x, y = (windows.places[..., axis] - numbers[:, axis] for axis in (0, 1))
     angles, bends = (np.swapaxes(numbers[:, which], 0, 1) for which in (_ANGLES, _BENDS))
@@ -176,36 +151,30 @@ def _edges(state: Array, windows: _Windows) -> _Edges:
     across = y * cos - x * sin - bends * along * along / 2
     blurs = across / (np.float32(np.sqrt(2)) * blur)
     slope = np.exp(-np.square(blurs)) * (np.float32(np.sqrt(2 / np.pi)) / blur)
-    return _Edges(along, across, erf(blurs), slope, cos, sin)
+    return along, across, erf(blurs), slope, cos, sin
 
 
 def _step(state: Array, windows: _Windows, width_px: int) -> tuple[Array, Array]:
     """Return the Gauss-Newton step of each corner (corner, 9), and its normal matrix (corner, 9, 9)."""
-    edges = _edges(state, windows)
-    pattern = edges.pattern
+    along, across, rise, slope, cos, sin = _edges(state, windows)
+    pattern = rise[0] * rise[1]
     level, contrast = (state[:, which, np.newaxis].astype(np.float32) for which in (_LEVEL, _CONTRAST))
     residuals = windows.values - level - contrast * pattern
-    tilt = contrast * edges.slope * edges.rise[::-1]  # ∂I/∂dᵢ
-    by_blur = -(tilt * edges.across).sum(axis=0) / (1 + _PIXEL_VARIANCE * np.exp(-2 * state[:, _BLUR, np.newaxis]))
-    by_place = (tilt * edges.sin).sum(axis=0), -(tilt * edges.cos).sum(axis=0)
-    by_angle = -tilt * edges.along
-    by_bend = by_angle * edges.along / 2
+    tilt = contrast * slope * rise[::-1]  # ∂I/∂dᵢ
+    by_blur = -(tilt * across).sum(axis=0) / (1 + _PIXEL_VARIANCE * np.exp(-2 * state[:, _BLUR, np.newaxis]))
+    by_place = (tilt * sin).sum(axis=0), -(tilt * cos).sum(axis=0)
+    by_angle = -tilt * along
+    by_bend = by_angle * along / 2
     flat = np.ones_like(pattern)
     slopes = np.stack([*by_place, *by_angle, *by_bend, by_blur, flat, pattern], axis=1, dtype=np.float32)
     weighted = slopes * (windows.counts / _variances(state, windows, pattern, residuals))[:, np.newaxis]
     normal = (weighted @ np.swapaxes(slopes, 1, 2)).astype(np.float64)
     right = (weighted @ residuals[..., np.newaxis])[..., 0].astype(np.float64)
-    known, weights = _prior(width_px)
-    normal[:, range(_COUNT), range(_COUNT)] += weights
-    return np.linalg.solve(normal, (right + weights * (known - state))[..., np.newaxis])[..., 0], normal
-
-
-def _prior(width_px: int) -> tuple[Array, Array]:
-    """Return the prior means of the parameters and the inverses of their variances."""
     known, weights = np.zeros(_COUNT), np.full(_COUNT, 1e-12)  # not zero, or windows without pixels would be singular
     weights[_BENDS] = (width_px / _BEND_SD) ** 2
     known[_BLUR], weights[_BLUR] = np.log(_BLUR_PX), _LOG_BLUR_SD**-2
-    return known, weights
+    normal[:, range(_COUNT), range(_COUNT)] += weights
+    return np.linalg.solve(normal, (right + weights * (known - state))[..., np.newaxis])[..., 0], normal
 
 
 def _variances(state: Array, windows: _Windows, pattern: Pixels, residuals: Pixels) -> Pixels:

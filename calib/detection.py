@@ -203,14 +203,18 @@ def _search_again(light: NDArray[np.float32], boards: Sequence[Board], first: _P
             parts.append(_search(light, [board], 1, whole))
         else:
             outlines, hull = _places(first, markers, board)
-            hulls.append(hull)
+            hulls.append(hull.astype(np.float32))
             low, high = outlines.min(axis=(1, 2)), (outlines - light.shape[::-1]).max(axis=(1, 2)) + 1
             inside = (low >= _BORDER_PX) & (high <= -_BORDER_PX)
             window = _window(hull, light.shape)
             if markers.ids.size < inside.sum() and light[window].size:
                 parts.append(_search(light, [board], 1, window))
     quads = [first.in_image(quad) for quad in first.unknown]
-    odd = [quad for quad in quads if not any(_holds(hull, quad.mean(axis=0)) for hull in hulls)]
+    odd = [
+        quad
+        for quad in quads
+        if not any(cv2.pointPolygonTest(hull, quad.mean(axis=0).tolist(), measureDist=False) >= 0 for hull in hulls)
+    ]
     if unseen and odd:
         parts.append(_search(light, unseen, 1, _window(np.concatenate(odd), light.shape)))
     return parts
@@ -225,11 +229,6 @@ def _places(part: _Part, markers: _Markers, board: Board) -> tuple[NDArray[np.fl
     ends = np.array([[[0, 0], [board.columns, 0], [board.columns, board.rows], [0, board.rows]]], float)
     placed = cv2.perspectiveTransform(np.concatenate([squares, ends]).astype(float), homography)
     return placed[:-1], placed[-1]
-
-
-def _holds(outline: NDArray[np.float64], place: NDArray[np.float64]) -> bool:
-    """Return whether a place (2,) is within an outline (4, 2)."""
-    return bool(cv2.pointPolygonTest(outline.astype(np.float32), place.tolist(), measureDist=False) >= 0)
 
 
 def _window(places: NDArray[np.float64], shape: tuple[int, ...]) -> _Window:

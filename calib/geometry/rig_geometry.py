@@ -25,7 +25,7 @@ class BoardPose:
 
 @dataclass(frozen=True)
 class Repeatability:
-    """Repeatability of the gantry between sweeps: standard deviation of the position at a node, per axis, and its error.
+    """Standard deviation of the gantry's position at a node between sweeps, per axis, and its standard error.
 
     It is zero if the corners' noise explains all differences.
     """

@@ -173,12 +173,11 @@ def _record(board_set: BoardSet, rig: RigGeometry, stage: StageReport, options: 
 
 def _homing_warnings(board_set: BoardSet, rig: RigGeometry) -> list[str]:
     """Return a warning where the stage homed within the only sweep, and may have come back to another place."""
-    sweeps = rig.undetermined_homings
-    if not sweeps or board_set.switches_repeat:
+    if not rig.undetermined_homings or board_set.switches_repeat:
         return []
     return [
-        f"the stage homed again within sweep {', '.join(map(str, sweeps))}, and no other sweep joins the nodes before "
-        "and after, which may be shifted by as much as its switches repeat; take one more sweep"
+        f"the stage homed again within sweep {', '.join(map(str, rig.undetermined_homings))}, and no other sweep joins "
+        "the nodes before and after, which may be shifted by as much as its switches repeat; take one more sweep"
     ]
 
 
@@ -201,32 +200,27 @@ def _board_record(board_set: BoardSet, pose: BoardPose, warp_mm: list[float]) ->
 def _files(rig: RigGeometry, observations: Sequence[BoardObservation]) -> dict[str, bytes | str]:
     """Return the files beside geometry.json by name: covariance, corners, and a camera model for each node.
 
-    The covariance is of fx, fy, cx, cy, the distortion, then rt_cam_ref of every node. The corners are those of the
-    boards whose pose was solved.
+    The covariance is of fx, fy, cx, cy, the distortion, then rt_cam_ref of every node. The corners, one row each, are
+    those of the boards whose pose was solved; with the homings of these poses if they are told apart.
     """
     solved = {(board.target.board, board.target.sweep) for board in rig.boards}
-    seen_boards = [seen for seen in observations if (seen.target.board, seen.target.sweep) in solved]
-    files: dict[str, bytes | str] = {
-        COVARIANCE_FILE: _npz(covariance=rig.covariance, nodes=np.array(rig.nodes), intrinsics=rig.lens.parameters),
-        CORNERS_FILE: _corners_npz(seen_boards, apart=bool(rig.homings)),
-    }
-    for node, rt_cam_ref in zip(rig.nodes, rig.rt_cam_ref, strict=True):
-        files[CAMERA_FILE.format(*node)] = camera_model_text(rig.lens, rig.lens_model, rt_cam_ref)
-    return files
-
-
-def _corners_npz(observations: Sequence[BoardObservation], *, apart: bool) -> bytes:
-    """Return all corners, one row per corner; with the homings of the boards' poses if these are told apart."""
-    counts = [len(seen.corners) for seen in observations]
-    return _npz(
-        pixels=np.concatenate([seen.pixels for seen in observations]),
-        sigma_px=np.concatenate([seen.sigma_px for seen in observations]),
-        corner=np.concatenate([seen.corners for seen in observations]),
-        node=np.repeat([seen.node for seen in observations], counts, axis=0),
-        sweep=np.repeat([seen.target.sweep for seen in observations], counts),
-        homing=np.repeat([seen.target.homing if apart else 0 for seen in observations], counts),
-        board=np.repeat([seen.target.board for seen in observations], counts),
+    kept = [seen for seen in observations if (seen.target.board, seen.target.sweep) in solved]
+    counts = [len(seen.corners) for seen in kept]
+    corners = _npz(
+        pixels=np.concatenate([seen.pixels for seen in kept]),
+        sigma_px=np.concatenate([seen.sigma_px for seen in kept]),
+        corner=np.concatenate([seen.corners for seen in kept]),
+        node=np.repeat([seen.node for seen in kept], counts, axis=0),
+        sweep=np.repeat([seen.target.sweep for seen in kept], counts),
+        homing=np.repeat([seen.target.homing if rig.homings else 0 for seen in kept], counts),
+        board=np.repeat([seen.target.board for seen in kept], counts),
     )
+    covariance = _npz(covariance=rig.covariance, nodes=np.array(rig.nodes), intrinsics=rig.lens.parameters)
+    cameras = {
+        CAMERA_FILE.format(*node): camera_model_text(rig.lens, rig.lens_model, rt_cam_ref)
+        for node, rt_cam_ref in zip(rig.nodes, rig.rt_cam_ref, strict=True)
+    }
+    return {COVARIANCE_FILE: covariance, CORNERS_FILE: corners, **cameras}
 
 
 def _npz(**arrays: Any) -> bytes:

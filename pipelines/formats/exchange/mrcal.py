@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from faintfield.calib.geometry.bundle import load_mrcal
+from faintfield.calib.geometry.bundle import LENS_MODELS, load_mrcal
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.exchange.imported_set import (
@@ -31,14 +31,8 @@ SUFFIX = ".cameramodel"
 
 _MM_PER_M = 1000.0
 
-# mrcal's name of each lens model, and how many distortion coefficients it has.
-_LENS_MODELS = {
-    "pinhole": ("LENSMODEL_PINHOLE", 0),
-    "opencv4": ("LENSMODEL_OPENCV4", 4),
-    "opencv5": ("LENSMODEL_OPENCV5", 5),
-    "opencv8": ("LENSMODEL_OPENCV8", 8),
-}
-
+# Number of distortion coefficients of each lens model.
+_COUNTS = {"pinhole": 0, "opencv4": 4, "opencv5": 5, "opencv8": 8}
 
 # Size in bytes up to which a camera model is read, without the measurements that it was calibrated from.
 _MAX_LITERAL_BYTES = 1_000_000
@@ -71,9 +65,9 @@ def camera_model_text(lens: Lens, lens_model: str, rt_cam_ref: ArrayLike) -> str
     The distortion is filled with zeros to the length that the lens model has: "pinhole", "opencv4", "opencv5" or
     "opencv8".
     """
-    name, count = _LENS_MODELS[lens_model]
+    padding = [0.0] * (_COUNTS[lens_model] - len(lens.distortion))
     model = load_mrcal().cameramodel(
-        intrinsics=(name, np.array([*lens.parameters, *[0.0] * (count - len(lens.distortion))])),
+        intrinsics=(LENS_MODELS[lens_model], np.array([*lens.parameters, *padding])),
         imagersize=np.array(lens.size_px, np.int32),
         rt_cam_ref=np.array(rt_cam_ref, np.float64) * [1, 1, 1, 1e-3, 1e-3, 1e-3],
     )
@@ -97,7 +91,7 @@ def export_camera_models(set_path: Path, out: Path, *, overwrite: bool) -> Expor
             if file.exists():
                 raise BadValue(f"{set_path}: {view.path} would become {file.name} like another view; rename its image")
             # The smallest model that holds the distortion
-            model = next(name for name, (_, count) in _LENS_MODELS.items() if count >= len(view.lens.distortion))
+            model = next(name for name, count in _COUNTS.items() if count >= len(view.lens.distortion))
             write_whole(file, camera_model_text(view.lens, model, view.rt_cam_world))
 
     return export_posed(set_path, out, "m", [f"*{SUFFIX}"] if overwrite else (), write)
@@ -120,7 +114,7 @@ def read_camera_models(folder: Path, images: Path) -> PosedModel:
 def _read(path: Path, images: Path) -> PosedImage:
     """Return the image of a camera model with its lens and pose."""
     model = _literal(path)
-    known = dict(sorted(_LENS_MODELS.values()))
+    known = {LENS_MODELS[name]: count for name, count in _COUNTS.items()}
     if model.lensmodel not in known:
         raise BadValue(
             f"{path}: its lens is {model.lensmodel}; convert it with mrcal-convert-lensmodel to one of {list(known)}"
