@@ -1,6 +1,6 @@
 """Views of a grid put in order by their pictures, with a report of what these show, or refused by name."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -25,12 +25,10 @@ _BRIGHT, _OVER_NOISE = 0.02, 1.2
 # Share of views that may be odd; of missing ones, `find_grid` decides.
 _MAX_ODD_SHARE = 0.25
 
-# Rotation in degrees and magnification against the other views that planes cannot use, and those worth a word.
+# Rotation in degrees and magnification against the other views that planes cannot use, and those worth a word; spread
+# of light between views, and displacement in px beyond what disparities explain, that are worth a word.
 _MAX_DEG, _MAX_SCALE = 5.0, 0.1
-_NOTABLE_DEG, _NOTABLE_SCALE = 0.3, 0.005
-
-# Spread of light between views, and displacement in px beyond what disparities explain, that are worth a word.
-_NOTABLE_LIGHT, _NOTABLE_PX = 0.1, 1.0
+_NOTABLE_DEG, _NOTABLE_SCALE, _NOTABLE_LIGHT, _NOTABLE_PX = 0.3, 0.005, 0.1, 1.0
 
 # Correlation by which the blocks must agree better in another order of a list.
 _MIN_LEVEL_GAIN = 0.05
@@ -135,20 +133,16 @@ def _choose_order(grid: ImageGrid, inspect: _Inspect, *, fixed: bool) -> tuple[l
         # The order as documented unless the other agrees clearly more
         if other.failure is None and other.axes.level > inspection.axes.level + _MIN_LEVEL_GAIN:
             nodes, inspection = by_column, other
-    remark = ""
     if inspection.fits.shift_rms_px > _DOUBTFUL_PX:
+        reversed_kind = None
         for kind, reversed_nodes in _back_and_forth(nodes).items():
             other = inspect(reversed_nodes)
-            if (
-                other.failure is None
-                and len(other.fits.odd) <= len(inspection.fits.odd)
-                and other.axes.level >= inspection.axes.level
-                and other.fits.shift_rms_px < _MAX_SHIFT_SHARE * inspection.fits.shift_rms_px
-            ):
-                nodes, inspection = reversed_nodes, other
-                remark = f"names run back and forth: the pictures agree if every other {kind} is reversed"
-    if remark:
-        inform(remark)
+            fits_as_well = other.failure is None and len(other.fits.odd) <= len(inspection.fits.odd)
+            straighter = other.fits.shift_rms_px < _MAX_SHIFT_SHARE * inspection.fits.shift_rms_px
+            if fits_as_well and straighter and other.axes.level >= inspection.axes.level:
+                nodes, inspection, reversed_kind = reversed_nodes, other, kind
+        if reversed_kind:
+            inform(f"names run back and forth: the pictures agree if every other {reversed_kind} is reversed")
     return nodes, inspection
 
 
@@ -159,10 +153,10 @@ def _line_of_views(
     (rows, columns), count = grid.size, len(grid.paths)
     nodes = [(0, place) for place in range(count)]
     line = inspect(nodes)
+    if line.order.verdict != "fits":
+        return None
     # The views of a square whose rows run back and forth make a line, too
-    if line.order.verdict != "fits" or any(
-        inspect(other).order.is_certain for other in _back_and_forth(list(grid.paths)).values()
-    ):
+    if any(inspect(other).order.is_certain for other in _back_and_forth(list(grid.paths)).values()):
         return None
     if square.failure or square.order.verdict == "denied":
         inform(f"the pictures show one line of {count} views, not {rows} x {columns}")
@@ -262,42 +256,35 @@ def _print_table(grid: ImageGrid, record: Arrangement, inspection: GridInspectio
     console.print(table)
 
 
-def _warnings(record: Arrangement, inspection: GridInspection, count: int) -> list[str]:
-    """Return what a person should know before using the set."""
+def _warnings(record: Arrangement, inspection: GridInspection, count: int) -> Iterator[str]:
+    """Yield what a person should know before using the set."""
     fits, order = inspection.fits, inspection.order
     if inspection.failure:
-        return [f"{_FAILURES[inspection.failure]}; the order of the names is kept"]
-    verdict = {
-        "fits": "",
-        "open": "all pictures fit one another equally well: they show the same, or are too dark to check their order",
-        "few": f"{count} pictures are too few for their order to be checked",
-        "denied": f"neighbours fit better than only {order.share:.0%} of other pictures, so the order may be wrong: in "
-        "a light field they fit better than nearly all",
-    }[order.verdict]
-    if verdict and inspection.still:
-        verdict = "all views show the same; no depth can be found"
+        yield f"{_FAILURES[inspection.failure]}; the order of the names is kept"
+        return
+    if inspection.contradicted:
+        yield "the pictures contradict the order that the options state; without them it is found from the pictures"
+    if order.verdict != "fits" and inspection.still:
+        yield "all views show the same; no depth can be found"
+    elif order.verdict == "open":
+        yield "all pictures fit one another equally well: they show the same, or are too dark to check their order"
+    elif order.verdict == "few":
+        yield f"{count} pictures are too few for their order to be checked"
+    elif order.verdict == "denied":
+        share = f"neighbours fit better than only {order.share:.0%} of other pictures"
+        yield f"{share}, so the order may be wrong: in a light field they fit better than nearly all"
+    if record.told_by == "names":
+        yield "the pictures do not tell where rows and columns begin; the order of the names is kept"
+    if record.odd_views:
+        yield f"fit none of their neighbours, and are left out: {', '.join(record.odd_views)}"
     x_px, y_px = fits.shift_px[int(np.argmax(np.abs(fits.shift_px).max(axis=1)))]
+    if max(abs(x_px), abs(y_px)) > _NOTABLE_PX:
+        yield (
+            f"views are shifted against their neighbours, by up to ({x_px:.1f}, {y_px:.1f}) px: the camera was off the "
+            "grid; planes are sharper with calibrated poses (import colmap)"
+        )
+    if record.turn_deg > _NOTABLE_DEG:
+        yield f"views are turned by up to {record.turn_deg:.2f}°; a grid's camera does not turn"
     magnification = float(np.abs(fits.magnification - 1).max())
-    remarks = [
-        (
-            inspection.contradicted,
-            "the pictures contradict the order that the options state; without them it is found from the pictures",
-        ),
-        (bool(verdict), verdict),
-        (
-            record.told_by == "names",
-            "the pictures do not tell where rows and columns begin; the order of the names is kept",
-        ),
-        (bool(record.odd_views), f"fit none of their neighbours, and are left out: {', '.join(record.odd_views)}"),
-        (
-            max(abs(x_px), abs(y_px)) > _NOTABLE_PX,
-            f"views are shifted against their neighbours, by up to ({x_px:.1f}, "
-            f"{y_px:.1f}) px: the camera was off the grid; planes are sharper with calibrated poses (import colmap)",
-        ),
-        (
-            record.turn_deg > _NOTABLE_DEG,
-            f"views are turned by up to {record.turn_deg:.2f}°; a grid's camera does not turn",
-        ),
-        (magnification > _NOTABLE_SCALE, f"views are magnified by up to {100 * magnification:.1f} %"),
-    ]
-    return [remark for holds, remark in remarks if holds]
+    if magnification > _NOTABLE_SCALE:
+        yield f"views are magnified by up to {100 * magnification:.1f} %"

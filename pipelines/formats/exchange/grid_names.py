@@ -77,13 +77,9 @@ def pictures_in(folder: Path, *, every: bool = False) -> tuple[list[Path], list[
     files = [path for path in entries if not path.name.startswith(".") and is_file(path)]
     pictures = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES]
     if not pictures:
-        folders = [path for path in entries if is_folder(path)]
-        if folders and not files:
-            raise MissingFile(
-                f"{folder}: holds folders only, such as {folders[0].name}; name the one with the pictures"
-            )
+        kinds_held = _count_kinds(files) or ("folders only" if any(map(is_folder, entries)) else "nothing")
         raise MissingFile(
-            f"{folder}: holds {_count_kinds(files) or 'nothing'}; convert pictures to PNG or TIFF (read are "
+            f"{folder}: holds {kinds_held}; convert pictures to PNG or TIFF (read are "
             f"{', '.join(sorted(IMAGE_SUFFIXES))}), or name the folder that holds them"
         )
     unread = [path for path in files if path.suffix.lower() not in IMAGE_SUFFIXES | _NO_PICTURES]
@@ -247,11 +243,11 @@ def _fields_of_one_number(names: Sequence[str], numbers: Sequence[str], varying:
 
 def _places(names: Sequence[str], texts: Sequence[dict[str, str]]) -> Places:
     """Return the numbers of all names by field; refuse those that are too large."""
-    for name, fields in zip(names, texts, strict=True):
-        for field, text in fields.items():
-            if not abs(float(text)) < _MAX_NUMBER:
-                raise BadValue(
-                    f"{name}: its name has the number {text}, beyond {_MAX_NUMBER:g}, for {field}; correct it, give "
-                    "--rows and --columns to take files in order, or --pattern without it"
-                )
+    stated = [(name, *item) for name, fields in zip(names, texts, strict=True) for item in fields.items()]
+    for name, field, text in stated:
+        if not abs(float(text)) < _MAX_NUMBER:
+            raise BadValue(
+                f"{name}: its name has the number {text}, beyond {_MAX_NUMBER:g}, for {field}; correct it, give --rows "
+                "and --columns to take files in order, or --pattern without it"
+            )
     return {field: [float(fields[field]) for fields in texts] for field in texts[0]}

@@ -59,8 +59,7 @@ class ImportedGrid(msgspec.Struct, frozen=True):
 
 def import_pictures(src: Path, out: Path, options: GridOptions) -> ImportedGrid:
     """Make an elemental set of the pictures in a folder or a file, put in order by what they show."""
-    recorded = asdict(options)
-    del recorded["overwrite"]
+    recorded = {name: value for name, value in asdict(options).items() if name != "overwrite"}
     pitch_mm, fx_px, disparity_px = options.pitch_mm, options.fx_px, options.disparity_px
     described = described_grid(src)
     own_scale = pitch_mm is None and fx_px is None and disparity_px is None
@@ -172,11 +171,6 @@ def _divide_file(src: Path, folder: Path, rows: int | None, columns: int | None)
     grid = ImageGrid(paths, remarks=remarks, guessed=guessed, sources=[src])
     if count > 1:
         return grid, lambda: ((path, read_frame(src, page=page).pixels_dn) for page, path in enumerate(paths.values()))
-    return grid, lambda: zip(paths.values(), _tiles(src, rows, columns), strict=True)
-
-
-def _tiles(src: Path, rows: int, columns: int) -> list[NDArray[Any]]:
-    """Return the equal tiles of a picture, row by row."""
     picture = read_frame(src).pixels_dn
     height, width = picture.shape[:2]
     if height % rows or width % columns:
@@ -184,7 +178,8 @@ def _tiles(src: Path, rows: int, columns: int) -> list[NDArray[Any]]:
             f"{src}: is {width} x {height} px, which {columns} columns and {rows} rows do not divide; correct --rows "
             "and --columns, or crop the margins away"
         )
-    return [tile for line in np.split(picture, rows) for tile in np.split(line, columns, axis=1)]
+    tiles = [tile for line in np.split(picture, rows) for tile in np.split(line, columns, axis=1)]
+    return grid, lambda: zip(paths.values(), tiles, strict=True)
 
 
 def _write_views(grid: ImageGrid, views: _Views, folder: Path) -> ImageGrid:
@@ -202,15 +197,7 @@ def _write_views(grid: ImageGrid, views: _Views, folder: Path) -> ImageGrid:
 
 
 def _dn_per_value(views: _Views) -> float:
-    """Return the factor by which float pictures become 16-bit ones.
-
-    Raises
-    ------
-    BadValue
-        A value is not finite, or below zero by more than rounding hides.
-    WrongBitDepth
-        A picture does not hold floats.
-    """
+    """Return the factor by which float pictures, whose values are finite and not negative, become 16-bit ones."""
     least, largest, darkest = 0.0, 0.0, Path()
     for path, pixels in views():
         if pixels.dtype.kind != "f":
