@@ -171,7 +171,6 @@ type _Window = tuple[slice, slice]
 
 
 def _search(light: NDArray[np.float32], boards: Sequence[Board], step: int, window: _Window | None = None) -> _Part:
-    """Look for the markers of boards in an image or in a window of it, reduced by `step`."""
     rows, columns = window or (slice(0, light.shape[0]), slice(0, light.shape[1]))
     part = light[rows, columns]
     if step > 1:

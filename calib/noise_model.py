@@ -148,7 +148,6 @@ class NoiseModel:
 
 
 def _slope(bends_per_dn: Sequence[Map], within: Any) -> Any:
-    """Return the derivative of the charge within the range of the bends."""
     return 1.0 + sum((power + 1) * bend * within**power for power, bend in enumerate(bends_per_dn, 1))
 
 

@@ -167,7 +167,6 @@ def solve_again(
 
 
 def _inputs(problem: BundleProblem) -> dict[str, Any]:
-    """Return mrcal's optimization inputs at the initial values."""
     observations = problem.observations
     focal_px, rt_cam_ref, rt_ref_board = initialize(observations, problem.size_px, problem.square_mm)
     model = LENS_MODELS[problem.lens_model]

@@ -239,7 +239,6 @@ def _lens_and_poses(bundle: Bundle, covariance: NDArray[np.float64], order: list
 
 
 def _require_fit(geometry: RigGeometry, settings: GeometrySettings) -> None:
-    """Check that the fit explains boards that were left out of it."""
     ratio, limit = geometry.holdout_ratio, settings.max_holdout_ratio
     if ratio is None or ratio <= limit:
         return

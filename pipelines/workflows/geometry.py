@@ -230,7 +230,6 @@ def _npz(**arrays: Any) -> bytes:
 
 
 def _inform_of(board_set: BoardSet, record: GeometryRecord) -> None:
-    """Print in a few lines how good the geometry is."""
     known = ", ".join(f"{sigma:.3f} px at {depth} mm" for depth, sigma in record.transfer_sigma_px.items())
     inform(f"{len(record.nodes)} nodes, {record.corners} corners, residual {record.rms_inlier_px:.3f} px")
     inform(f"transfer between views known to {known}")

@@ -220,13 +220,11 @@ def _refuse_unfit(inspection: GridInspection, paths: Sequence[Path], *, prescrib
 
 
 def _options(orientation: Orientation) -> str:
-    """Return the options that state an orientation."""
     flags = {"transpose": "--transpose", "flip_rows": "--flip-rows", "flip_columns": "--flip-columns"}
     return " ".join(option for name, option in flags.items() if getattr(orientation, name))
 
 
 def _print_table(grid: ImageGrid, record: Arrangement, inspection: GridInspection) -> None:
-    """Print what the pictures show."""
     counts = [*zip(grid.size, ("row", "column"), strict=True), (len(grid.paths), "view")]
     rows, columns, views = (f"{count} {noun}{'s' * (count != 1)}" for count, noun in counts)
     lines = {"grid": f"{rows} x {columns}, {views}", "order": "as in the names: the pictures do not tell"}

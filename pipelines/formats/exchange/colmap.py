@@ -150,7 +150,6 @@ def write_model(folder: Path, model: ColmapModel, *, binary: bool) -> None:
 
 
 def _lens(model: str, width: int, height: int, numbers: list[float]) -> Lens:
-    """Return a camera of COLMAP as a lens."""
     if model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
         numbers = [numbers[0], *numbers]  # one focal length for both axes
     fx_px, fy_px, cx_px, cy_px, *distortion = numbers

@@ -97,7 +97,6 @@ def described_grid(folder: Path) -> DescribedGrid | None:
 
 
 def _number(path: Path, parser: configparser.ConfigParser, section: str, key: str, largest: float) -> float:
-    """Return a positive number of the file."""
     text = parser.get(section, key, fallback=None)
     try:
         number = float(text or "")

@@ -199,7 +199,6 @@ def _assumed(stated: GridOptions, tone: Tone) -> tuple[float, float]:
 
 
 def _estimate_noise(stated: GridOptions, pictures: Pictures) -> "ViewNoise":
-    """Return the noise that neighbouring views show."""
     from faintfield.calib.noise.views import compared_blocks, estimate_view_noise  # loads much that is used here only
 
     first, saturation_dn = pictures.first, pictures.saturation_dn

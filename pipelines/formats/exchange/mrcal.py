@@ -112,7 +112,6 @@ def read_camera_models(folder: Path, images: Path) -> PosedModel:
 
 
 def _read(path: Path, images: Path) -> PosedImage:
-    """Return the image of a camera model with its lens and pose."""
     model = _literal(path)
     known = {LENS_MODELS[name]: count for name, count in _COUNTS.items()}
     if model.lensmodel not in known:

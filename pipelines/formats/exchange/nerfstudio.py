@@ -194,14 +194,12 @@ def _write_transforms(folder: Path, views: list[PosedImage]) -> None:
 
 
 def _matrix(rt_cam_world: NDArray[np.float64]) -> list[_Row]:
-    """Return the matrix from a camera of OpenGL to the world."""
     to_world = Rotation.from_rotvec(rt_cam_world[:3]).inv()
     rows = np.column_stack([to_world.as_matrix() @ _FLIP, -to_world.apply(rt_cam_world[3:])]).tolist()
     return [(a, b, c, d) for a, b, c, d in [*rows, [0.0, 0.0, 0.0, 1.0]]]
 
 
 def _stated(lens: Lens) -> dict[str, Any]:
-    """Return the values that state a lens."""
     k1, k2, p1, p2, k3 = [*lens.distortion, *[0.0] * 5][:5]
     stated: dict[str, Any] = {"camera_model": _WRITTEN_MODEL, "w": lens.size_px[0], "h": lens.size_px[1]}
     stated |= {"fl_x": lens.fx_px, "fl_y": lens.fy_px, "cx": lens.cx_px + _HALF_PX, "cy": lens.cy_px + _HALF_PX}

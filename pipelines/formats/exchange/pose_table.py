@@ -125,7 +125,6 @@ def _read_cells(path: Path) -> tuple[list[str], list[list[str]]]:
 
 
 def _numbers(place: str, cells: dict[str, str], columns: Sequence[str]) -> NDArray[np.float64]:
-    """Return finite numbers of a row."""
     values = []
     for column in columns:
         try:

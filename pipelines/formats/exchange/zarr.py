@@ -81,7 +81,6 @@ def export_planes(directory: Path, out: Path, *, overwrite: bool = False) -> Zar
 
 
 def _stack_in(directory: Path) -> _Stack:
-    """Return the planes of a folder as one stack."""
     results = planes_below(directory)
     if len(results) > 1:
         names = ", ".join(map(str, results))
@@ -104,7 +103,6 @@ def _stack_in(directory: Path) -> _Stack:
 
 
 def _require_zarr() -> Any:
-    """Return the zarr module, if it and ome-zarr-models are installed."""
     try:
         import ome_zarr_models  # noqa: F401
         import zarr
