@@ -3,8 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from faintfield.pipelines.arguments import Positive
-from faintfield.pipelines.formats.exchange.options import GridOptions, ImportOptions
+from faintfield.pipelines.formats.exchange.options import GridOptions, ImportOptions, LensOptions
 
 if TYPE_CHECKING:
     from faintfield.pipelines.formats.exchange.emva1288 import ImportedFrames
@@ -90,18 +89,7 @@ def import_nerfstudio(src: Path, out: Path, /, *, options: ImportOptions = _DEFA
     return import_transforms(src, out, options)
 
 
-def import_poses(
-    src: Path,
-    out: Path,
-    /,
-    *,
-    fx_px: Positive,
-    fy_px: Positive | None = None,
-    cx_px: float | None = None,
-    cy_px: float | None = None,
-    distortion: tuple[float, ...] = (),
-    options: ImportOptions = _DEFAULTS,
-) -> Result:
+def import_poses(src: Path, out: Path, /, *, lens: LensOptions, options: ImportOptions = _DEFAULTS) -> Result:
     """Make an elemental set from a table of camera positions and its images.
 
     The first line of the table names its columns: name, x, y, z or x_mm, y_mm, z_mm, and qw, qx, qy, qz if cameras are
@@ -114,20 +102,10 @@ def import_poses(
         The table: CSV, with commas, semicolons or tabs.
     out
         Folder to write.
-    fx_px
-        Focal length.
-    fy_px
-        Focal length of the other axis; the same by default.
-    cx_px
-        Principal point, where the first pixel's centre is 0; the middle of the picture by default.
-    cy_px
-        Likewise, of the other axis.
-    distortion
-        k1, k2, p1, p2, k3 … in OpenCV's order.
     """
     from faintfield.pipelines.formats.exchange.pose_table import import_table
 
-    return import_table(src, out, options, fx_px, fy_px or fx_px, (cx_px, cy_px), distortion)
+    return import_table(src, out, lens, options)
 
 
 def import_emva1288(descriptor: Path, out: Path, /, *, overwrite: bool = False) -> Frames:

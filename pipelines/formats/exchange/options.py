@@ -43,6 +43,32 @@ class ImportOptions:
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
+class LensOptions:
+    """Options that state the lens of images whose poses are in a table.
+
+    Parameters
+    ----------
+    fx_px
+        Focal length.
+    fy_px
+        Focal length of the other axis; the same by default.
+    cx_px
+        Principal point, where the first pixel's centre is 0; the middle of the picture by default.
+    cy_px
+        Likewise, of the other axis.
+    distortion
+        k1, k2, p1, p2, k3 … in OpenCV's order.
+    """
+
+    fx_px: Positive
+    fy_px: Positive | None = None
+    cx_px: float | None = None
+    cy_px: float | None = None
+    distortion: tuple[float, ...] = ()
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
 class GridOptions:
     """Options of the import of pictures taken on a regular grid.
 

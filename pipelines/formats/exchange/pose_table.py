@@ -20,7 +20,7 @@ from faintfield.pipelines.formats.exchange.imported_set import (
     pose_of,
     read_picture,
 )
-from faintfield.pipelines.formats.exchange.options import ImportOptions
+from faintfield.pipelines.formats.exchange.options import ImportOptions, LensOptions
 from faintfield.pipelines.formats.reading import read_text
 
 _NAMES = ("name", "file", "image", "filename")
@@ -36,15 +36,7 @@ _TOLERANCE = 1e-2
 _MAX_ROWS = 100_000
 
 
-def import_table(
-    src: Path,
-    out: Path,
-    options: ImportOptions,
-    fx_px: float,
-    fy_px: float,
-    centre_px: tuple[float | None, float | None],
-    distortion: tuple[float, ...],
-) -> ImportedSet:
+def import_table(src: Path, out: Path, lens_options: LensOptions, options: ImportOptions) -> ImportedSet:
     """Make an elemental set of a table and its images, with the lens given; by default its centre is the picture's.
 
     Raises
@@ -57,11 +49,11 @@ def import_table(
         raise WrongUsage(f"{src}: its header states the unit of positions; leave --mm-per-unit out")
     options = replace(options, mm_per_unit=options.mm_per_unit or mm_per_unit)
     height, width = read_picture(next(iter(poses))).pixels_dn.shape[:2]
-    cx_px, cy_px = centre_px
+    fx_px, cx_px, cy_px = lens_options.fx_px, lens_options.cx_px, lens_options.cy_px
     cx_px = (width - 1) / 2 if cx_px is None else cx_px
     cy_px = (height - 1) / 2 if cy_px is None else cy_px
     try:
-        lens = Lens((width, height), fx_px, fy_px, cx_px, cy_px, distortion)
+        lens = Lens((width, height), fx_px, lens_options.fy_px or fx_px, cx_px, cy_px, lens_options.distortion)
     except ValueError as failure:
         raise WrongUsage(f"the lens of the options cannot be: {failure}; correct them") from failure
     images = [PosedImage(path, lens, pose) for path, pose in poses.items()]
