@@ -46,8 +46,7 @@ class PixelFormat:
                 f"camera.pixel_format = {name!r} is not read; give Mono or BayerRG, GR, GB or BG, then 8, 10, 12, "
                 "14 or 16, or 10p, 12p, 10Packed or 12Packed"
             )
-        first_row = match[1]
-        mosaic = (first_row, _SECOND_ROW[first_row]) if first_row else None
+        mosaic = (match[1], _SECOND_ROW[match[1]]) if match[1] else None
         return cls(name, int(match[2] or match[3]), match[4] or "", mosaic)
 
     @property

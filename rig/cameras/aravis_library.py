@@ -109,10 +109,13 @@ class AravisLibrary:
             raise MissingExtra(f"backend 'aravis' needs {LIBRARY}; run: apt-get install libaravis-0.8-0") from failure
         self._gobject.g_object_unref.restype, self._gobject.g_object_unref.argtypes = None, (c_void_p,)
         self._glib.g_error_free.restype, self._glib.g_error_free.argtypes = None, (c_void_p,)
-        for name, (result, arguments) in _PLAIN.items():
-            self._declare(name, result, arguments)
-        for name, (result, arguments) in _FAILING.items():
-            self._declare(name, result, (*arguments, POINTER(POINTER(_GError))))
+        for name, (result, arguments) in (_PLAIN | _FAILING).items():
+            try:
+                function = getattr(self._aravis, name)
+            except AttributeError as failure:
+                raise MissingExtra(f"backend 'aravis' needs {LIBRARY} {_VERSION} or newer; install it") from failure
+            error = (POINTER(POINTER(_GError)),) if name in _FAILING else ()
+            function.restype, function.argtypes = result, (*arguments, *error)
 
     def call(self, name: str, *arguments: Any) -> Any:
         """Call a function by name; raises `AravisError` with the library's message if the function reports an error.
@@ -151,10 +154,3 @@ class AravisLibrary:
         size = c_size_t()
         data = self.call("arv_buffer_get_data", buffer, byref(size))
         return ctypes.string_at(data, size.value) if data else b""
-
-    def _declare(self, name: str, result: Any, arguments: tuple[Any, ...]) -> None:
-        try:
-            function = getattr(self._aravis, name)
-        except AttributeError as failure:
-            raise MissingExtra(f"backend 'aravis' needs {LIBRARY} {_VERSION} or newer; install it") from failure
-        function.restype, function.argtypes = result, arguments

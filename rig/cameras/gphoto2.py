@@ -129,9 +129,8 @@ class GPhoto2Camera:
             if name in present:
                 raise
             names = ", ".join(sorted(present))
-            raise CameraError(
-                f"camera.settings.{name} = {value!r}: the camera has no setting {name}, it has: {names}; correct it"
-            ) from failure
+            problem = f"camera.settings.{name} = {value!r}: the camera has no setting {name}, it has: {names}"
+            raise CameraError(f"{problem}; correct it") from failure
         widget.set_value(self._accepted(widget, name, value))
         self._camera.set_single_config(name, widget)
 

@@ -120,8 +120,7 @@ def call_within[T](
     try:
         return result_within(bound_s, call, "camera")
     except TimeoutError as failure:
-        raise CameraTimeout(
-            f"the camera did not finish {what} in {bound_s:g} s; check cable and battery, switch it off and on"
-        ) from failure
+        problem = f"the camera did not finish {what} in {bound_s:g} s"
+        raise CameraTimeout(f"{problem}; check cable and battery, switch it off and on") from failure
     except failures as failure:
         raise CameraError(f"the camera failed at {what}: {in_one_line(failure)}; {remedy}") from failure

@@ -167,12 +167,8 @@ class DriftWatch:
     def _inward_point(self, distance_mm: float) -> Point:
         """Return the point that lies `distance_mm` from where homing ends, along both axes."""
         travel = self._stage.travel()
-        return Point(
-            *(
-                value + distance_mm * (1.0 if value - low < high - value else -1.0)
-                for value, (low, high) in zip(self._home, (travel.x_mm, travel.y_mm), strict=True)
-            )
-        )
+        axes = zip(self._home, (travel.x_mm, travel.y_mm), strict=True)
+        return Point(*(end + (distance_mm if end - low < high - end else -distance_mm) for end, (low, high) in axes))
 
     def _require_open_switches(self) -> None:
         """Move to where a switch closes if its axis has drifted by the limit, and raise if one is closed."""

@@ -70,9 +70,8 @@ class Gantry:
         try:
             return reported.intersection(configured)
         except ValueError as failure:
-            raise OutsideTravel(
-                f"the travel {configured} lies outside the controller's {reported}; correct stage.travel_mm"
-            ) from failure
+            problem = f"the travel {configured} lies outside the controller's {reported}"
+            raise OutsideTravel(f"{problem}; correct stage.travel_mm") from failure
 
     def workspace(self) -> StageWorkspace:
         """Return the allowed positions and the keep-out boxes."""

@@ -265,9 +265,8 @@ class MicroManagerController:
             if waits_s and self._clock.now_s() - begun_s >= waits_s:
                 problem = f"the stage did not finish {what} within {waits_s:.1f} s ({reason})"
                 raise StageTimeout(f"{problem}; look for an obstacle, or lower stage.rate_mm_per_s") from failure
-            raise StageLost(
-                f"the stage failed at {what}: {reason}; check its cable, its power and the configuration, then home it"
-            ) from failure
+            problem = f"the stage failed at {what}: {reason}"
+            raise StageLost(f"{problem}; check its cable, its power and the configuration, then home it") from failure
 
 
 def _in_um(point: Point) -> tuple[float, float]:

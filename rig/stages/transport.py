@@ -84,9 +84,8 @@ class SerialPort:
         try:
             yield
         except (OSError, TypeError) as failure:  # the latter from a closed port
-            raise StageLost(
-                f"{self._url}: the connection is lost ({in_one_line(failure)}); check cable and power, then home it"
-            ) from failure
+            problem = f"{self._url}: the connection is lost ({in_one_line(failure)})"
+            raise StageLost(f"{problem}; check cable and power, then home it") from failure
 
 
 class LineTransport:
