@@ -1,5 +1,6 @@
 """XY stages of Micro-Manager, on a core that fails when it is told to."""
 
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -11,7 +12,7 @@ from msgspec.structs import replace
 from faintfield.rig.cameras.micromanager import MicroManagerCamera
 from faintfield.rig.cameras.settings import MicroManagerSettings, SimulatedSettings
 from faintfield.rig.devices import open_rig
-from faintfield.rig.errors import NotHomed, PlanRefused, PositionLost, StageLost, StageTimeout, StageUnfit
+from faintfield.rig.errors import MissingExtra, NotHomed, PlanRefused, PositionLost, StageLost, StageTimeout, StageUnfit
 from faintfield.rig.micromanager import SharedCore
 from faintfield.rig.plan import Grid
 from faintfield.rig.settings import DriftSettings, RigSettings, StepSettings
@@ -174,6 +175,13 @@ def test_missing_device_or_value_is_refused_with_choices(options: Any, message: 
         stage.connect()
     assert "setProperty" not in shared.core.calls
     assert "unloadAllDevices" in shared.core.calls
+
+
+def test_missing_package_names_its_installation(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pymmcore_plus", None)
+    controller = MicroManagerController(SharedCore(), MicroManagerStage(), TRAVEL, SimulatedClock())
+    with pytest.raises(MissingExtra, match=r"pip install 'faintfield\[micromanager\]'"):
+        controller.connect()
 
 
 def test_report_counts_once_the_next_is_equal() -> None:
