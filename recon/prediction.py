@@ -22,8 +22,8 @@ _STEPS, _DEVIATIONS = 2000, 10
 def pixel_information(mean_e: float, read_noise_e: float) -> float:
     """Return the Fisher information in 1/e⁻² of a pixel `Poisson(λ) + N(0, σ²)` about its mean λ.
 
-    It is 1/λ without read noise, and with it between 1/λ and 1/(λ + σ²). From 3 e⁻ of read noise on, and above 100 e⁻
-    of light, it is what the likelihood `auto` makes of a pixel, 1/(λ + σ²): 5 % less at most.
+    It lies between 1/λ, without read noise, and 1/(λ + σ²). From 3 e⁻ of read noise on, and above 100 e⁻ of light, it
+    is what the likelihood `auto` makes of a pixel, 1/(λ + σ²): 5 % less at most.
     """
     variance_e2 = mean_e + read_noise_share(mean_e, read_noise_e) * read_noise_e**2
     return math.inf if variance_e2 == 0 else 1 / variance_e2
@@ -36,12 +36,10 @@ def information_of_views(
 
     Parameters
     ----------
-    light_e : float
-        Expected electrons of light where the response is 1.
-    dark_e, read_noise_e : float
-        Expected electrons of dark current, and read noise.
+    light_e, dark_e, read_noise_e : float
+        Expected electrons of light where the response is 1, those of dark current, and read noise.
     response : array (view,)
-        Relative response where each view sees the sample, by vignetting for example; 0 where it does not.
+        Relative response where each view sees the sample (vignetting); 0 where it does not.
     """
     mean_e = light_e * float(np.mean(response)) + dark_e
     known_e2 = 1 / pixel_information(mean_e, read_noise_e) - mean_e + dark_e
@@ -54,8 +52,8 @@ def information_of_views(
 def interpolation(views: int) -> float:
     """Return `Σ h² / Σ h` of the bilinear weights h of the pixels that meet a sample on the axis.
 
-    The pixels of the reference view lie on the samples, those of the other views on all places between them. It is 1
-    for a rig that moves the picture by whole pixels, and never less than 1/4.
+    The pixels of the reference view lie on the samples, those of the other views on all places between them. For a rig
+    that moves the picture by whole pixels it would be 1; it is never less than 1/4.
     """
     return _SPREAD_EVENLY + (1 - _SPREAD_EVENLY) / views
 
@@ -69,10 +67,9 @@ def sample_sigma_e(information: float, views: int) -> float:
 
     Parameters
     ----------
-    information : float
-        About the sample in 1/e⁻², summed over the views; times the part of the pixels that have its colour.
-    views : int
-        Number of views that see it, the reference view among them.
+    information, views : float, int
+        In 1/e⁻², summed over the views that see the sample, times the part of the pixels that have its colour; and the
+        number of these views, the reference view among them.
     """
     return math.sqrt(interpolation(views) / information)
 
@@ -81,14 +78,8 @@ def feature_area_px2(side_px: float, blur_px: float = 0.0) -> float:
     """Return the area in px² that counts of a square of a given side: the sum over pixels of its squared share in each.
 
     It is `side²` of a large square, and less of a small one, whose light pixels share with its surroundings: along each
-    axis `side − 1/3` from one pixel on, in the mean over its places between pixels.
-
-    Parameters
-    ----------
-    side_px : float
-        Side in pixels, parallel to theirs.
-    blur_px : float
-        Standard deviation of the blur by the lens.
+    axis `side − 1/3` from one pixel on, in the mean over its places between pixels. The side is parallel to the pixels;
+    `blur_px` is the standard deviation of the blur by the lens.
     """
     return _length_px(side_px, blur_px) ** 2
 
@@ -99,8 +90,8 @@ def smallest_contrast(
     """Return the contrast at which a square stands out of its surroundings by k standard deviations (Rose 1948).
 
     Its light differs from that of its surroundings, `light_e`, by this fraction. All pixels of all views that show it
-    count, weighted by its share in each. It may exceed 1: then even a black square is not visible. `information` is as
-    for `sample_sigma_e`.
+    count, weighted by its share in each. Above 1 even a black square is not visible. `information` is as for
+    `sample_sigma_e`, `side_px` and `blur_px` as for `feature_area_px2`.
     """
     return k / (light_e * math.sqrt(information * feature_area_px2(side_px, blur_px)))
 
@@ -125,14 +116,11 @@ def depth_sigma_mm(
     ----------
     depth_mm, f_px : float
         Depth, and focal length in pixels.
-    centres_mm : array (view, 2)
-        Positions of the cameras in the plane of the grid.
-    information : array (view,)
-        As `information_of_views`; times the part of the pixels that have a colour.
-    side_px, blur_px : float
-        Side of the square, parallel to the pixels, and standard deviation of the lens's blur.
-    difference_e : float
-        Difference of its light to that of its surroundings.
+    centres_mm, information : array (view, 2), array (view,)
+        Positions of the cameras in the plane of the grid, and `information_of_views` times the part of the pixels that
+        have a colour.
+    side_px, blur_px, difference_e : float
+        As for `feature_area_px2`, and the difference of the square's light to that of its surroundings.
     """
     mean_mm = information @ centres_mm / information.sum()
     spread = float(information @ np.square(centres_mm - mean_mm).sum(axis=1))
@@ -150,7 +138,7 @@ def depth_resolution_mm(depth_mm: float, f_px: float, aperture_mm: float) -> flo
 
 
 def _length_px(side_px: float, blur_px: float) -> float:
-    """Return the sum over pixels of the squared share of a bar of a width in each, along one axis."""
+    """Return the sum over pixels of the squared share of a bar of this width in each, along one axis."""
     at = np.linspace(0.0, min(side_px, 1 + _DEVIATIONS * blur_px), _STEPS + 1)
     return 2 * float(np.trapezoid([(side_px - u) * _overlap(u, blur_px) for u in at.tolist()], at))
 

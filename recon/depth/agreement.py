@@ -11,17 +11,12 @@ from faintfield.recon.likelihood.images import ElementalImages, Image, blurred
 from faintfield.recon.operator.scene_operator import SceneOperator
 from faintfield.recon.solver.initialization import back_projection
 
-# Smallest ratio of the light's power to the variance of a bin's noise; bins are made large enough for it.
-_MIN_POWER_RATIO = 2.0
+# Smallest ratio of the light's power to the variance of a bin's noise, and smallest and largest bins in pixels.
+_MIN_POWER_RATIO, _MIN_BINS, _MAX_BINS = 2.0, 2, 32
 
-# Smallest and largest bins, in pixels.
-_MIN_BINS, _MAX_BINS = 2, 32
-
-# Relative difference between views of one point beyond noise (shine, interpolation, poses).
-_MODEL_ERROR = 0.04
-
-# Largest squared deviation of one number, in variances: an object that hides a point in a few views must not decide.
-_MAX_SQUARES = 16.0
+# Relative difference between views of one point beyond noise (shine, interpolation, poses), and largest squared
+# deviation of one number, in variances: an object that hides a point in a few views must not decide.
+_MODEL_ERROR, _MAX_SQUARES = 0.04, 16.0
 
 # Spacings of the blur that gathers evidence, of standard deviation σ of about 1.6 samples, and its effective 4π σ².
 _WINDOW = (1, 2)
@@ -60,11 +55,10 @@ class DepthEstimate:
 
     Attributes
     ----------
-    index : float array (row, column)
-        The plane, interpolated by a parabola; given everywhere, even where nothing is known.
-    confidence : float array (row, column)
-        Probability that the depth is right within a step or 2 % of the depth, from the likelihood of the views alone;
-        zero where no light stands out of the noise, and where the depth is the first or last of the sweep.
+    index, confidence : float array (row, column)
+        The plane, interpolated by a parabola, even where nothing is known; and the probability that the depth is right
+        within a step or 2 % of the depth, from the likelihood of the views alone: zero where no light stands out of the
+        noise, and where the depth is the first or last of the sweep.
     """
 
     index: Image
@@ -74,9 +68,8 @@ class DepthEstimate:
 def bins_for(operator: SceneOperator, images: ElementalImages) -> int:
     """Return the size of bins of pixels, a power of two, that makes single views comparable.
 
-    Where a pixel has less light than noise, single views cannot be told apart, whatever their number; sums of k × k
-    pixels have k² times the ratio of power to variance. The bins make that ratio 2 at a typical lit sample. They are at
-    least two pixels wide: single pixels differ by their positions between samples.
+    Sums of k × k pixels have k² times a pixel's ratio of power to variance; the bins make it 2 at a typical lit sample.
+    They are at least two pixels wide: single pixels differ by their positions between samples.
     """
     light = np.maximum(blurred(back_projection(operator, images), _WINDOW), 0)
     lit_e = float(np.sum(np.square(light, dtype=np.float64)) / max(float(light.sum(dtype=np.float64)), 1e-12))
@@ -89,8 +82,7 @@ def bins_for(operator: SceneOperator, images: ElementalImages) -> int:
 def agreement(operator: SceneOperator, images: ElementalImages) -> Agreement:
     """Return how much the views of each sample differ from a common brightness.
 
-    The variance v follows from a smoothed f, the same for all views, so that no view counts more because it is dark by
-    chance.
+    The variance v follows from a smoothed f, so that no view counts more because it is dark by chance.
     """
     sensitivity, coverage = operator.sensitivity(), operator.coverage()
     f = back_projection(operator, images, coverage=coverage)
@@ -110,12 +102,12 @@ def agreement(operator: SceneOperator, images: ElementalImages) -> Agreement:
 
 
 def depth_map(planes: list[Agreement], depths_mm: NDArray[np.floating]) -> DepthEstimate:
-    """Return the depths that make the views most likely, regularised.
+    """Return the depths that make the views most likely, regularised (`depths_mm` are those of the planes).
 
     If the brightness of views differs with variance τ² in units of the noise, the log-likelihood ratio of "each its
     own" to "one common brightness" is `½ χ² τ²/(1 + τ²)`, up to terms equal at all depths. τ² is taken from the worst
-    depth: where views agree at every depth it is zero, and no depth is preferred. Evidence is averaged over a small
-    window; `_regularised` then chooses consistent depths of neighbours.
+    depth: where views agree at every depth it is zero. Evidence is averaged over a small window; `_regularised` then
+    chooses consistent depths of neighbours.
     """
     evidence, comparable = _evidence(planes)
     best = _regularised(evidence).argmax(axis=0)
@@ -125,15 +117,11 @@ def depth_map(planes: list[Agreement], depths_mm: NDArray[np.floating]) -> Depth
     step = np.abs(np.gradient(depths_mm))[best]
     near = np.abs(depths_mm[:, np.newaxis, np.newaxis] - chosen) <= np.maximum(1.01 * step, 0.02 * chosen)
     confidence = np.where(near, posterior, 0).sum(axis=0)
-    within = (best > 0) & ((best < len(planes) - 1) | _ends_at_infinity(depths_mm))  # else it may lie beyond the sweep
+    # The depth may lie beyond the sweep, unless that ends less than half a step of 1/depth before infinity
+    before, last = 1 / depths_mm[-2:]
+    within = (best > 0) & ((best < len(planes) - 1) | (last < 0.5 * (before - last)))
     confidence[~(within & comparable & _lit(planes, best))] = 0
     return DepthEstimate(_refined(evidence, best).astype(np.float32), confidence.astype(np.float32))
-
-
-def _ends_at_infinity(depths_mm: NDArray[np.floating]) -> bool:
-    """Return whether the last depth is less than half a step of 1/depth before infinity: nothing lies beyond."""
-    before, last = 1 / depths_mm[-2:]
-    return bool(last < 0.5 * (before - last))
 
 
 def _evidence(planes: list[Agreement]) -> tuple[Image, NDArray[np.bool_]]:
@@ -176,7 +164,6 @@ def _regularised(evidence: Image) -> Image:
 
 
 def _refined(evidence: Image, best: NDArray[np.intp]) -> Image:
-    """Return the maximum of the parabola through each best plane and its neighbours, in planes."""
     inner = np.clip(best, 1, len(evidence) - 2)
     before, at, after = (np.take_along_axis(evidence, (inner + k)[np.newaxis], 0)[0] for k in (-1, 0, 1))
     bend = before - 2 * at + after
@@ -185,7 +172,6 @@ def _refined(evidence: Image, best: NDArray[np.intp]) -> Image:
 
 
 def _lit(planes: list[Agreement], best: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Return which samples have light that stands out of the noise at their depth."""
     light, variance = (
         np.take_along_axis(np.stack([getattr(plane, name) for plane in planes]), best[np.newaxis], 0)[0]
         for name in ("light", "light_variance")
@@ -208,7 +194,7 @@ class Significance:
         (1 + the number of shuffles that agree at least as well) / (1 + shuffles). If places meant nothing, it would be
         α or less in at most a share α of all sets.
     z : float
-        By how many standard deviations of the shuffled the stated are better than their mean; 0 if one of them is
+        By how many standard deviations of the shuffled orders the true one is better than their mean; 0 if it is
         infinite, since views that see nothing together cannot be compared.
     shuffles : int
         Number of shuffles.
@@ -225,14 +211,12 @@ def disagreement(
     """Return the mean over samples of how much the views disagree at the best depth of each.
 
     It is the least, over the depths, of the squared deviations from the mean of the views per degree of freedom, in
-    variances. The search for the depth is part of it: of shuffled views, the best depth is taken, too.
+    variances. Of shuffled views the best depth is taken, too.
 
     Parameters
     ----------
-    light_e : float array (place, view, depth, sample)
-        What each view shows of each sample if it was taken from each place.
-    visible : bool array (place, depth, sample)
-        Whether the sample is in view from there.
+    light_e, visible : float array (place, view, depth, sample), bool array (place, depth, sample)
+        Light of each sample in each view if it was taken from each place, and whether the sample is in view from there.
     places : int array (view,)
         The place of each view.
     known_variance_e2 : float
@@ -268,6 +252,6 @@ def significance(statistic: float, shuffled: Sequence[float]) -> Significance:
     as_good = int(np.count_nonzero(values <= statistic + _EQUAL * abs(statistic)))
     known = values[np.isfinite(values)]
     z = 0.0
-    if np.isfinite(statistic) and known.size:
+    if known.size:
         z = float((known.mean() - statistic) / max(float(known.std()), _EQUAL * abs(statistic), 1e-30))
     return Significance((1 + as_good) / (1 + len(values)), z, len(values))

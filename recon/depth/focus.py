@@ -16,19 +16,15 @@ from faintfield.recon.solver.initialization import back_projection
 _FINE = (1, 1)
 _COARSE = (1, 1, 1, 1, 2, 2, 2, 4)
 
-# Smallest prominence of a peak: relative to the range of a focus curve or to the highest peak of a distribution over
+# Smallest prominence of a peak, relative to the range of a focus curve or to the highest peak of a distribution over
 # depth, and in standard deviations of a focus curve's noise.
 _MIN_PROMINENCE, _MIN_SIGMAS = 0.1, 5.0
 
 # Smallest probability of a sample's depth for the sample to count.
 SURE = 0.9
 
-# Fewest samples of a plane: a number, and a fraction of the sure samples.
-MIN_SAMPLES = 12
-_MIN_SHARE = 0.02
-
-# Largest distance of a plane's samples from it, in steps of the sweep.
-_REACH = 1.5
+# Fewest samples of a plane, a number and a share of the sure samples, and their largest distance in steps of the sweep.
+MIN_SAMPLES, _MIN_SHARE, _REACH = 12, 0.02, 1.5
 
 # Correlated samples of a product of two smoothed noises: 2π times the fine scale squared.
 _CORRELATED_SAMPLES = 2 * np.pi
@@ -44,19 +40,11 @@ class FocusMeasure(NamedTuple):
 def focus_measure(
     operator: SceneOperator, images: ElementalImages, halves: tuple[NDArray[np.intp], NDArray[np.intp]]
 ) -> FocusMeasure:
-    """Return the power of fine detail that two halves of the views agree on.
+    """Return the power of fine detail of a plane that two halves of the views agree on.
 
     Each half is back-projected separately and band-passed. Noise is independent between the halves and averages out of
     the product, while detail of an object at this depth is the same in both. Detail of objects elsewhere is blurred.
-
-    Parameters
-    ----------
-    operator : SceneOperator
-        H of a plane.
-    images : ElementalImages
-        All views.
-    halves : two int arrays
-        The views of each half, preferably the two colours of a checkerboard of nodes.
+    The halves are preferably the two colours of a checkerboard of nodes.
     """
     first, second = (back_projection(operator, images, half) for half in halves)
     both = (operator.sensitivity(halves[0]) >= 1) & (operator.sensitivity(halves[1]) >= 1)
@@ -74,8 +62,8 @@ def shared_detail(first: Image, second: Image, both: NDArray[np.bool_]) -> Focus
 def sharp_depths_mm(depths_mm: Sequence[float], curve: Sequence[FocusMeasure]) -> list[float]:
     """Return the depths at which a focus curve peaks, each refined by a parabola through its neighbours.
 
-    A peak counts when it stands out by a tenth of the curve's range and by five standard deviations of the noise. The
-    noise is the median over the depths, because sharp detail adds to it where it is.
+    A peak stands out by a tenth of the curve's range and by five standard deviations of the noise: the median over the
+    depths, because sharp detail adds to it where it is.
     """
     if len(curve) < 3:
         return []
@@ -91,22 +79,14 @@ def sharp_depths_mm(depths_mm: Sequence[float], curve: Sequence[FocusMeasure]) -
 def places_of_focus(depths: DepthEstimate, planes: int) -> list[NDArray[np.bool_]]:
     """Return the samples (row, column) of each depth at which much of the picture lies, in the order of depths.
 
-    These are the peaks of the sure samples' distribution over depth that stand out by a tenth of the highest and hold
-    at least one in fifty of these samples. There are none if fewer than `MIN_SAMPLES` samples are sure.
-
-    Parameters
-    ----------
-    depths : DepthEstimate
-        Depths from a sweep.
-    planes : int
-        Number of planes of the sweep.
+    These are the peaks of the sure samples' distribution over the `planes` of the sweep that stand out by a tenth of
+    the highest and hold at least one in fifty of these samples. There are none if fewer than `MIN_SAMPLES` are sure.
     """
     sure = depths.confidence >= SURE
     if np.count_nonzero(sure) < MIN_SAMPLES:
         return []
-    counts = np.convolve(np.bincount(np.rint(depths.index[sure]).astype(int), minlength=planes), (0.25, 0.5, 0.25))[
-        1:-1
-    ]
+    histogram = np.bincount(np.rint(depths.index[sure]).astype(int), minlength=planes)
+    counts = np.convolve(histogram, (0.25, 0.5, 0.25))[1:-1]
     fewest = max(MIN_SAMPLES, _MIN_SHARE * np.count_nonzero(sure))
     peaks = [peak for peak in range(planes) if prominence(counts, peak) > _MIN_PROMINENCE * counts.max()]
     places = [sure & (np.abs(depths.index - peak) <= _REACH) for peak in peaks]
@@ -114,16 +94,9 @@ def places_of_focus(depths: DepthEstimate, planes: int) -> list[NDArray[np.bool_
 
 
 def likeliest_depth_mm(planes: Sequence[Agreement], depths_mm: Sequence[float], place: NDArray[np.bool_]) -> float:
-    """Return the depth at which the views agree best on all samples of a place, by a parabola between depths.
+    """Return the depth at which the views agree best on all samples of a place (row, column), by a parabola.
 
-    Parameters
-    ----------
-    planes : sequence of Agreement
-        Agreement at each depth, on samples of the same angular pitch.
-    depths_mm : sequence of float
-        The depths, in equal steps of 1/depth.
-    place : bool array (row, column)
-        The samples.
+    The depths are in equal steps of 1/depth, and the planes have samples of the same angular pitch.
     """
     squares = np.array([plane.squares[place].sum(dtype=np.float64) for plane in planes])
     degrees = np.array([(plane.sensitivity[place] - 1).sum(dtype=np.float64) for plane in planes])
@@ -150,7 +123,6 @@ def prominence(curve: NDArray[np.floating], peak: int) -> float:
 
 
 def _detail(plane: Image) -> Image:
-    """Return the plane between the fine and the coarse scale."""
     return blurred(plane, _FINE) - blurred(plane, _COARSE)
 
 
@@ -167,7 +139,7 @@ _MIN_COVERAGE = 0.5
 
 
 class SeenByView(NamedTuple):
-    """Contribution of one view to a plane: its light Hᵀ(g − b), and its coverage Hᵀ H 1, both (row, column)."""
+    """Light Hᵀ(g − b) and coverage Hᵀ H 1 of one view on a plane, both (row, column)."""
 
     light: Image
     coverage: Image
@@ -178,16 +150,9 @@ class SeenByView(NamedTuple):
 
 
 def seen_by_view(operator: PlaneOperator, images: ElementalImages, share: float = 1.0) -> SeenByView:
-    """Return what the views of an operator, usually one, say of a plane.
+    """Return the light and coverage of the views of an operator, usually one.
 
-    Parameters
-    ----------
-    operator : PlaneOperator
-        H of these views alone.
-    images : ElementalImages
-        Their images.
-    share : float
-        Exposure of the images relative to that of a whole view: the mean is in electrons of a whole view.
+    `share` is the exposure of the images relative to that of a whole view: the mean is in electrons of a whole view.
     """
     light = operator.adjoint(images.electrons)
     if np.any(images.background_e):
@@ -196,15 +161,10 @@ def seen_by_view(operator: PlaneOperator, images: ElementalImages, share: float 
 
 
 class RunningPlane:
-    """Sums over the views of one plane so far, in two halves; adding a view takes no other view.
+    """Sums over the views of one plane (row, column) so far, in two halves; adding a view takes no other view.
 
-    Once all views are added, `mean` is `recon.solver.initialization.back_projection` of them within rounding. It takes
-    four arrays of the size of the plane, however many views there are.
-
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns of the plane.
+    Once all views are added, `mean` is their `back_projection` within rounding. It takes four arrays of the size of the
+    plane, however many views there are.
     """
 
     def __init__(self, shape: tuple[int, int]) -> None:
@@ -212,12 +172,12 @@ class RunningPlane:
         self._coverage = np.zeros((2, *shape), np.float32)
 
     def add(self, view: SeenByView, half: int) -> None:
-        """Add what a view says to one half, 0 or 1."""
+        """Add a view to one half, 0 or 1."""
         self._light[half] += view.light
         self._coverage[half] += view.coverage
 
     def remove(self, view: SeenByView, half: int) -> None:
-        """Take away what was added before; what rounding leaves is a part in ten million."""
+        """Take away a view that was added before; rounding leaves a part in ten million."""
         self._light[half] -= view.light
         self._coverage[half] -= view.coverage
 
@@ -238,5 +198,4 @@ class RunningPlane:
 
 
 def _quotient(light: Image, coverage: Image) -> Image:
-    """Return light over coverage, zero where next to nothing is covered."""
     return np.divide(light, coverage, out=np.zeros_like(light), where=coverage > 1e-3)

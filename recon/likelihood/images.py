@@ -41,10 +41,9 @@ class PixelLikelihood:
     name : str
         The model; "poisson" ignores the read noise, and takes negative numbers for zero.
     level_e : float
-        Light at which least squares takes the variance of a pixel of response one; other models ignore it.
+        Light at which least squares takes the variance of a pixel of response one.
     read_noise_share : float
-        Fraction of σ² that counts as variance where the exact model tells counts apart: the information of a pixel
-        about its mean is that of a variance `λ + share · σ²`. Solvers use it in their metric; the likelihood does not.
+        Fraction κ of σ² that solvers count as variance, see `read_noise_share`; the likelihood ignores it.
     """
 
     name: LikelihoodName = "shifted-poisson"
@@ -53,12 +52,12 @@ class PixelLikelihood:
 
     @property
     def model(self) -> int:
-        """The model's number in `recon.likelihood.pixel_models`."""
+        """Number of the model in `recon.likelihood.pixel_models`."""
         return _MODELS[self.name]
 
     @property
     def knows_read_noise(self) -> bool:
-        """Return whether the model takes the read noise into account."""
+        """True unless the model ignores the read noise."""
         return self.name != "poisson"
 
 
@@ -67,21 +66,19 @@ class ElementalImages:
     """All views of one scene, `g` of eq. (1), with the known part of their statistics.
 
     A view's pixels are `Poisson(H f + b) + N(0, σ²)`. The images of one colour of a mosaic lie on *lattices* (of every
-    second pixel, for example); each view then appears once per lattice, and maps are given per lattice. The operator
-    knows the lattice of each view and its rays.
+    second pixel, for example); each view then appears once per lattice, and maps are given per lattice.
 
     Parameters
     ----------
     electrons : float array (view, row, column)
         Offset removed and divided by the gain; values may be negative, dark current is not subtracted.
-    background_e : float or array broadcastable to (lattice, row, column)
-        b: expected electrons that are not light of the scene (dark current times exposure).
-    read_variance_e2 : float or array broadcastable to (lattice, row, column)
-        σ²: variance without any electron.
+    background_e, read_variance_e2 : float or array broadcastable to (lattice, row, column)
+        b, expected electrons that are not light of the scene (dark current times exposure); σ², the variance without
+        any electron.
     valid : bool array (view, row, column), optional
         False where a pixel has no valid number (is saturated, for example); the operator must be made with the same.
     likelihood : PixelLikelihood
-        The statistical model of the numbers.
+        Shifted Poisson by default.
 
     Raises
     ------
@@ -108,8 +105,7 @@ class ElementalImages:
     def binned(self, bins: int) -> "ElementalImages":
         """Return the images with `bins` by `bins` pixels added up, as a detector of larger pixels would count them.
 
-        Sums of Poisson counts are Poisson, and sums of normal read noises normal, so the statistics stay the same. A
-        bin counts if all its pixels are `valid`; the operator leaves out pixels that never count.
+        The statistics stay the same. A bin counts if all its pixels are `valid`.
         """
         if bins == 1:
             return self
@@ -139,11 +135,11 @@ def binned(maps: NDArray[Any], bins: int) -> NDArray[Any]:
 def select_likelihood(
     images: ElementalImages, name: LikelihoodName | Literal["auto"], level_e: float
 ) -> PixelLikelihood:
-    """Return the likelihood of the given name; "auto" chooses it by the read noise.
+    """Return the likelihood of the given name, for a typical light `level_e` in electrons.
 
     "auto" takes Poisson without read noise, shifted Poisson from 3 e⁻, and between them the exact Poisson–Gaussian,
-    which is 15 times slower. Least squares takes the variance of a pixel at the typical light `level_e`, so that its
-    weights do not depend on the data.
+    which is 15 times slower. Least squares takes the variance of a pixel at the typical light, so that its weights do
+    not depend on the data.
     """
     if name == "least-squares":
         return PixelLikelihood(name, max(level_e, _NEGLIGIBLE_VARIANCE_E2))
@@ -162,10 +158,8 @@ def select_likelihood(
 def read_noise_share(mean_e: float, read_noise_e: float) -> float:
     """Return the fraction of σ² that counts as variance in the exact model: κ in `1/I = λ + κ σ²`.
 
-    I is Fisher's information of a pixel about its mean λ.
-
-    Read noise well below one electron leaves counts distinguishable and does not count; above two electrons, or in
-    bright light, nearly all of it counts.
+    I is Fisher's information of a pixel about its mean λ. Read noise well below one electron leaves counts
+    distinguishable, so κ is nearly 0; above two electrons, or in bright light, it is nearly 1.
     """
     if mean_e > _BRIGHT_E or read_noise_e > _MIN_SHIFTED_READ_NOISE_E or read_noise_e**2 < _NEGLIGIBLE_VARIANCE_E2:
         return 1.0

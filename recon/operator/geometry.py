@@ -26,31 +26,20 @@ class DetectorMaps:
 
     Parameters
     ----------
-    rays : array (row, column, 2) or (lattice, row, column, 2)
-        Ray (x, y, 1) of each pixel, without distortion.
-    flat : array (row, column) or (lattice, row, column), optional
-        Relative response of each pixel (vignetting); zero for pixels that never count.
-    dtype : dtype
-        Type of the maps, samples and images.
+    rays, flat, dtype
+        As for `recon.operator.scene_operator.SceneOperator`.
 
     Attributes
     ----------
     layers : array (3, lattice, row, column)
         x and y of the rays, and the response. Rows are padded by NaN to whole blocks of columns.
-    shape : tuple of int
+    shape : (int, int, int)
         Lattices, rows and columns.
 
     Raises
     ------
     GeometryMismatch
         Shapes do not fit together, a number is not finite, or a response is negative.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from faintfield.recon.operator.geometry import DetectorMaps
-    >>> DetectorMaps(np.zeros((2, 3, 2))).shape
-    (1, 2, 3)
     """
 
     def __init__(
@@ -86,8 +75,7 @@ class DetectorMaps:
             return cls(rays, flat, dtype)
         if flat is not None or rays.layers.dtype != dtype:
             raise GeometryMismatch(
-                f"detector maps of type {rays.layers.dtype} already have a flat field; give no other, and dtype their "
-                "type"
+                f"detector maps of type {rays.layers.dtype} already have a flat field; give no other, and their dtype"
             )
         return rays
 
@@ -112,11 +100,7 @@ def scene_geometry(
     """Return the geometry of planes (plane, view, 3, 3) and the detector's pixels; `reach` covers whole rows.
 
     With a `surface`, the only plane is the one at 1/depth `origin` of its relief, and pixels meet it nearer or farther.
-
-    Raises
-    ------
-    GeometryMismatch
-        Shapes do not fit together, or a number is not finite.
+    GeometryMismatch is raised where shapes do not fit together, or a number is not finite.
     """
     (lattices, rows, columns), padded, dtype = maps.shape, maps.layers.shape[3], maps.layers.dtype
     planes, views = len(grids), plane_from_ray.shape[1] if plane_from_ray.ndim == 4 else 0
@@ -189,12 +173,12 @@ def _advance(homography: NDArray[np.float64], rays: NDArray[Any]) -> int:
 def _pixels_of(
     homography: NDArray[np.float64], shape: tuple[int, int], rays: NDArray[Any]
 ) -> tuple[int, int, int, int]:
-    """Return a range of rows and one of columns that hold all pixels whose rays (2, row, column) meet some samples.
+    """Return ranges of rows and columns that hold all pixels whose rays (2, row, column) meet some samples.
 
     Each part of the detector between two nodes of a coarse lattice lies in the range if one of its neighbours does.
     """
     rows, columns = rays.shape[1:]
-    row_nodes, column_nodes = (_nodes(count) for count in (rows, columns))
+    row_nodes, column_nodes = (np.unique([*range(0, count, _NODE_PX), count - 1]) for count in (rows, columns))
     x, y = rays[:, row_nodes[:, np.newaxis], column_nodes].astype(np.float64)
     x, y, scale = np.tensordot(homography, np.stack([x, y, np.ones_like(x)]), 1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -206,22 +190,11 @@ def _pixels_of(
     meets = (column > -reach) & (column < shape[1] + reach) & (row > -reach) & (row < shape[0] + reach)
     if not meets.any():
         return 0, 0, 0, 0
-    met_rows, met_columns = np.flatnonzero(meets.any(axis=1)), np.flatnonzero(meets.any(axis=0))
-    return (
-        int(row_nodes[met_rows[0]]),
-        int(row_nodes[met_rows[-1]]) + 1,
-        int(column_nodes[met_columns[0]]),
-        int(column_nodes[met_columns[-1]]) + 1,
-    )
-
-
-def _nodes(count: int) -> NDArray[np.intp]:
-    """Return pixels a few apart, the first and the last among them."""
-    return np.unique([*range(0, count, _NODE_PX), count - 1])
+    met_rows, met_columns = row_nodes[meets.any(axis=1)], column_nodes[meets.any(axis=0)]
+    return int(met_rows[0]), int(met_rows[-1]) + 1, int(met_columns[0]), int(met_columns[-1]) + 1
 
 
 def _check_views(valid: NDArray[Any], lattice_of_view: NDArray[np.intp], sizes: tuple[int, int, int, int]) -> None:
-    """Refuse masks of the wrong shape, and lattices that do not exist."""
     views, lattices, *detector = sizes
     if valid.size and valid.shape != (views, *detector):
         raise GeometryMismatch(f"valid has shape {valid.shape}, the pixels {(views, *detector)}; give it that shape")

@@ -12,10 +12,8 @@ class PlaneGrid:
 
     Parameters
     ----------
-    shape : (int, int)
-        Rows and columns.
-    pitch_mm : float
-        Distance between neighbouring samples.
+    shape, pitch_mm : (int, int), float
+        Rows and columns, and the distance between neighbouring samples.
     origin_mm : (float, float)
         x, y of the first sample's centre.
 

@@ -21,12 +21,8 @@ _TRANSPARENT, _OPAQUE = 0.15, 0.35
 class Occluders(NamedTuple):
     """Planes that hide those behind them: light of a plane is multiplied by `Π (1 − H_z' α_z')` over nearer planes z'.
 
-    Attributes
-    ----------
-    opacities : sequence of float array (row, column)
-        α of each plane, 0 to 1; H_z' without the response of the pixels.
-    depths_mm : sequence of float
-        Depth of each plane. Planes of the same depth do not hide one another.
+    H_z' is without the response of the pixels. `opacities` are α of each plane (row, column), 0 to 1. Planes of the
+    same depth do not hide one another.
     """
 
     opacities: Sequence[Image]
@@ -36,9 +32,8 @@ class Occluders(NamedTuple):
 def opacity(plane: Image) -> Image:
     """Return the opacity of a plane, 0 to 1 (row, column), judged by its light.
 
-    The typical light is the mean of the light weighted by the light itself, so that empty surroundings do not count.
     Black objects are taken for transparent, although they hide what is behind them. Light fainter than a seventh of the
-    typical light is taken for noise, or for the blur of something at another depth.
+    typical light, the mean of the light weighted by itself, is taken for noise or the blur of another depth.
     """
     light = blurred(plane, _BLUR_BEFORE)
     total = float(light.sum(dtype=np.float64))
@@ -50,13 +45,7 @@ def opacity(plane: Image) -> Image:
 
 
 def hiding_of(occluders: Occluders | None, grids: Sequence[PlaneGrid], dtype: np.dtype[Any]) -> Hiding:
-    """Return what hides what as the kernel reads it.
-
-    Raises
-    ------
-    GeometryMismatch
-        There is not one opacity and one depth for each plane, or an opacity is negative or not a finite number.
-    """
+    """Return occluders as the kernel reads them; raise GeometryMismatch where they do not fit the planes."""
     if occluders is None:
         return Hiding(np.zeros(0, dtype), np.zeros(0, np.intp), np.zeros(0))
     opacities, depths_mm = occluders
@@ -75,7 +64,7 @@ def hiding_of(occluders: Occluders | None, grids: Sequence[PlaneGrid], dtype: np
 
 
 def _opaque_columns(alpha: Image) -> NDArray[np.intp]:
-    """Return the first and the past-the-last column with some opacity (row, 2); one without begins nowhere."""
+    """Return the first and the past-the-last column with some opacity (row, 2); a row without begins nowhere."""
     some = alpha > 0
     first = np.where(some.any(axis=1), some.argmax(axis=1), np.iinfo(np.int32).max)
     return np.column_stack([first, alpha.shape[1] - some[:, ::-1].argmax(axis=1)])

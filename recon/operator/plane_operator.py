@@ -75,7 +75,7 @@ class PlaneOperator(SceneOperator):
             The samples, with a start and a stop.
         workers : int, optional
             Number of threads; as many as this operator has by default.
-        kept_maps : dict of float to float array (lattice, row, column), optional
+        kept_maps : dict, optional
             Place for maps of numbers, which windows can share: making one takes as long as a sweep of a window.
 
         Raises
@@ -90,7 +90,6 @@ class PlaneOperator(SceneOperator):
         return part
 
     def _take_window(self, grid: PlaneGrid, geometry: SceneGeometry) -> None:
-        """Become the operator of a window of the plane that this was."""
         for cached in ("_sensitivity", "seeing_views"):
             self.__dict__.pop(cached, None)
         self.grid = grid

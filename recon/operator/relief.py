@@ -37,17 +37,13 @@ class Relief(NamedTuple):
     ----------
     codes : int16 array (view, row, column)
         In units of `step`; `UNSEEN` where a pixel sees no part of the surface, or its edge.
-    step : float
-        Unit of the codes, in 1/depth.
-    origin : float
-        1/depth of code zero, midway between the nearest sample and the farthest.
+    step, origin : float
+        Unit of the codes, and 1/depth of code zero, midway between the nearest sample and the farthest.
 
     Notes
     -----
     Rounding to codes moves the place that a pixel sees by at most 1/131 064 of the parallax between the nearest sample
-    and the farthest: less than 0.01 px up to a parallax of 1310 px. A view 150 mm from the reference has that much, if
-    the focal length is 7500 px (6000 px over 44°), between 300 mm and 455 mm or from 870 mm to infinity; from 300 mm to
-    infinity the place moves by up to 0.03 px.
+    and the farthest: by less than 0.01 px up to a parallax of 1310 px.
     """
 
     codes: NDArray[np.int16]
@@ -71,26 +67,19 @@ def draw_relief(
 
     Parameters
     ----------
-    inverse_depth : array (row, column)
-        1/depth of each sample, in 1/mm; NaN where there is no surface.
-    grid : PlaneGrid
-        The samples at unit depth.
+    inverse_depth, grid : array (row, column), PlaneGrid
+        1/depth of each sample in 1/mm, NaN where there is no surface; the samples at unit depth.
     ray_from_surface : array (view, 3, 4)
         From (x, y, 1, 1/depth) of a sample to the ray of a view, homogeneous.
-    rays : array (lattice, row, column, 2)
-        Where detector pixels look: x, y at unit depth.
-    lattice_of_view : sequence of int
-        The lattice of each view.
+    rays, lattice_of_view : array (lattice, row, column, 2), sequence of int
+        Direction of each detector pixel, x, y at unit depth; the lattice of each view.
     workers : int, optional
         Number of threads; as many as the process may use by default. The result does not depend on it.
     """
     known = inverse_depth[np.isfinite(inverse_depth)].astype(np.float64)
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
-    relief = Relief(
-        np.empty((len(ray_from_surface), *rays.shape[1:3]), np.int16),
-        (high - low) / (2 * (_HIGHEST - 1)),
-        0.5 * (low + high),
-    )
+    codes = np.empty((len(ray_from_surface), *rays.shape[1:3]), np.int16)
+    relief = Relief(codes, (high - low) / (2 * (_HIGHEST - 1)), 0.5 * (low + high))
     farthest = float(np.abs(ray_from_surface[:, :2, 3]).max())
     tear = _MAX_STEP * grid.pitch_mm / farthest if farthest > 0 else np.inf
     whole = np.pad(_whole_cells(inverse_depth, tear), _BORDER, mode="edge")
@@ -135,7 +124,6 @@ def _whole_cells(inverse_depth: NDArray[np.floating], tear: float) -> NDArray[np
 
 
 def _continued(heights: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return heights continued linearly by `_BORDER` samples on every side."""
     for _ in range(_BORDER):
         heights = np.pad(heights, 1, mode="reflect", reflect_type="odd")
     return heights

@@ -36,7 +36,7 @@ class SceneOperator:
         Homographies from a ray (x, y, 1) to the coordinates (x, y, 1) of each plane in mm; the homogeneous scale is
         positive for points in front of the camera.
     rays : array (row, column, 2) or (lattice, row, column, 2), or DetectorMaps
-        Where each detector pixel looks: x, y at unit depth, lens distortion undone. Operators that are given the same
+        Direction of each detector pixel: x, y at unit depth, lens distortion undone. Operators that are given the same
         maps, which include `flat`, share their memory.
     grids : sequence of PlaneGrid
         The samples of each plane.
@@ -45,7 +45,7 @@ class SceneOperator:
     valid : bool array (view, row, column), optional
         False for pixels that do not count in one view.
     occluders : Occluders, optional
-        What the planes hide of those behind them, in H and Hᵀ; nothing by default.
+        Opacities by which planes hide those behind them, in H and Hᵀ; none by default.
     lattice_of_view : int array (view,), optional
         The lattice of detector pixels of each view; the first by default.
     dtype : dtype
@@ -53,9 +53,9 @@ class SceneOperator:
     workers : int, optional
         Number of threads; as many as the process may use by default. The last digits of sums depend on it.
     surface : (array (view, 3, 3), Relief), optional
-        For `recon.operator.surface_operator.SurfaceOperator`: what bends the only plane to a surface.
+        Bend of the only plane to a surface, for `recon.operator.surface_operator.SurfaceOperator`.
     sweeps : class, optional
-        What passes over the pixels, on which processor: see `recon.operator.sweeps`.
+        Passes over the pixels on another processor: see `recon.operator.sweeps`.
 
     Raises
     ------
@@ -98,12 +98,18 @@ class SceneOperator:
         self._see(geometry, grids)
 
     def _see(self, geometry: kernels.SceneGeometry, grids: tuple[PlaneGrid, ...]) -> None:
-        """Take the planes that the views see, and find which pixels see them."""
+        """Take the planes, and find which pixels see them; refuse planes that none sees."""
         self._geometry, self.grids = geometry, grids
         self._sweeps = self._make_sweeps(geometry, self._hiding, self.workers)
         self.samples_shape: tuple[int, ...] = (kernels.size_of(geometry),)
         self._sweeps.run(kernels.REACH, self.all_views, self.all_views)
-        self._check_seen()
+        for grid, sensitivity in zip(grids, self.planes_of(self.sensitivity()), strict=True):
+            if not sensitivity.any():
+                raise GeometryMismatch(
+                    f"no pixel of any of the {len(self.all_views)} views sees the plane of {grid.shape[1]} x "
+                    f"{grid.shape[0]} samples; check its depth, the poses and their signs, "
+                    "and that not all pixels are masked (saturated, hot)"
+                )
 
     def forward(self, samples: Image, views: ViewSelection = None) -> Image:
         """Return H f: the planes as each view sees them together, (view, row, column)."""
@@ -142,30 +148,15 @@ class SceneOperator:
     ) -> Image:
         """Return `Hᵀ[ (H 1)/(H f + b + σ²) ]` (samples), with no array as large as the images.
 
-        Parameters
-        ----------
-        samples : float array (samples)
-            f.
-        images : ElementalImages
-            Where b, σ² and the likelihood are taken from; least squares takes its own level for the light.
-        min_light_e : float
-            Least light of a pixel in electrons, > 0.
-        views : sequence of int, optional
-            The views that count; all by default.
-        of_each : bool, optional
-            Return `H_zᵀ[ (H_z 1)/(H f + b + σ²) ]` of each plane z instead.
+        The light of a pixel is at least `min_light_e` > 0, or for least squares that of its level. With `of_each`,
+        return `H_zᵀ[ (H_z 1)/(H f + b + σ²) ]` of each plane z instead.
         """
-        likelihood = images.likelihood
-        known = self._map(images.known_variance_e2())
+        likelihood, known = images.likelihood, self._map(images.known_variance_e2())
         level = likelihood.level_e if likelihood.name == "least-squares" else min_light_e
+        pixels = kernels.PixelModel(likelihood.model, known, known, level)
         operation = kernels.PRECISION_OF_EACH if of_each else kernels.PRECISION
-        _, sums = self._sweeps.run(
-            operation,
-            self._views(views),
-            self.all_views,
-            samples=self._checked("samples", samples, self.samples_shape),
-            pixels=kernels.PixelModel(likelihood.model, known, known, level),
-        )
+        samples = self._checked("samples", samples, self.samples_shape)
+        sums = self._sweeps.run(operation, self._views(views), self.all_views, samples=samples, pixels=pixels)[1]
         return sums.reshape(self.samples_shape)
 
     def adjoint_of_map(self, value: float | Image, views: ViewSelection = None) -> Image:
@@ -178,7 +169,6 @@ class SceneOperator:
 
     @cached_property
     def _sensitivity(self) -> Image:
-        """Sensitivity to all views, which every solver asks for several times."""
         sensitivity = self.adjoint_of_map(1.0)
         sensitivity.flags.writeable = False
         return sensitivity
@@ -191,13 +181,13 @@ class SceneOperator:
 
     @cached_property
     def _binary_response(self) -> bool:
-        """Return whether each pixel's response is 1 or 0: then Hᵀ H 1 = Hᵀ 1."""
+        """True if each pixel's response is 1 or 0: then Hᵀ H 1 = Hᵀ 1."""
         response = self.response()
         return bool(((response == 0) | (response == 1)).all())
 
     @cached_property
     def seeing_views(self) -> NDArray[np.intp]:
-        """The views in which some pixel that counts sees one of the planes."""
+        """Views in which some pixel that counts sees one of the planes."""
         reach = self._geometry.reach
         reaching = np.flatnonzero((reach[:, :, 1] > reach[:, :, 0]).any(axis=1))
         if self._geometry.valid.size == 0 and (self.response() > 0).all():
@@ -212,10 +202,9 @@ class SceneOperator:
     def value_and_ratio(
         self, samples: Image, images: ElementalImages, views: ViewSelection = None
     ) -> tuple[float, Image]:
-        """Return the negative log-likelihood of samples and Hᵀ r (samples), in one sweep.
+        """Return the negative log-likelihood of samples, up to a constant, and Hᵀ r (samples), in one sweep.
 
         r is the ratio of `recon.likelihood.pixel_models`: the gradient of the negative log-likelihood is s − Hᵀ r.
-        Terms that do not depend on f are left out.
         """
         value, sums = self._likelihood(kernels.VALUE_AND_RATIO, samples, images, views)
         return value, sums.reshape(self.samples_shape)
@@ -225,10 +214,10 @@ class SceneOperator:
         return self._likelihood(kernels.RATIO, samples, images, views)[1].reshape(self.samples_shape)
 
     def negative_log_likelihood(self, samples: Image, images: ElementalImages, views: ViewSelection = None) -> float:
-        """Return the negative log-likelihood alone, without terms that do not depend on f, in a sweep that only reads.
+        """Return the negative log-likelihood alone, up to a constant, in a sweep that only reads.
 
-        For the shifted Poisson model it is `Σ m − y + y ln(y/m)`, with `y = (g + σ²)₊` and `m = H f + b + σ²`. The sum
-        runs over the pixels that see a plane.
+        For the shifted Poisson model it is `Σ m − y + y ln(y/m)`, with `y = (g + σ²)₊` and `m = H f + b + σ²`, over the
+        pixels that see a plane.
         """
         return self._likelihood(kernels.VALUE, samples, images, views)[0]
 
@@ -240,8 +229,7 @@ class SceneOperator:
     def samples_of(self, planes: Sequence[Image]) -> Image:
         """Return the samples of planes (row, column); a single plane is not copied."""
         if [plane.shape for plane in planes] != [grid.shape for grid in self.grids]:
-            shapes = " and ".join(str(plane.shape) for plane in planes)
-            wanted = " and ".join(str(grid.shape) for grid in self.grids)
+            shapes, wanted = (" and ".join(str(part.shape) for part in parts) for parts in (planes, self.grids))
             raise GeometryMismatch(
                 f"the planes given have the shapes {shapes}, those of the operator {wanted}; give them those"
             )
@@ -252,24 +240,12 @@ class SceneOperator:
         """Return a map (lattice, row, column) as each view has it, (view, row, column); a number as it is."""
         return float(value) if np.ndim(value) == 0 else self._map(value)[self.lattice_of_view[views]]
 
-    def _check_seen(self) -> None:
-        """Refuse planes that no pixel sees."""
-        for grid, sensitivity in zip(self.grids, self.planes_of(self.sensitivity()), strict=True):
-            if not sensitivity.any():
-                raise GeometryMismatch(
-                    f"no pixel of any of the {len(self.all_views)} views sees the plane of {grid.shape[1]} x "
-                    f"{grid.shape[0]} samples; check its depth, the poses and their signs, "
-                    "and that not all pixels are masked (saturated, hot)"
-                )
-
     def _adjoint(self, images: Image, views: NDArray[np.intp], image_of_view: NDArray[np.intp]) -> Image:
-        """Return Hᵀ (samples) of images that have been checked."""
         return self._sweeps.run(kernels.ADJOINT, views, image_of_view, images=images)[1].reshape(self.samples_shape)
 
     def _likelihood(
         self, operation: int, samples: Image, images: ElementalImages, views: ViewSelection
     ) -> tuple[float, Image]:
-        """Run one of the sweeps that compare samples with the data."""
         if images.valid is not None and not self._geometry.valid.size:
             raise GeometryMismatch("the images have pixels that do not count; make the operator with their `valid`")
         likelihood = images.likelihood
@@ -280,10 +256,9 @@ class SceneOperator:
             likelihood.level_e,
         )
         samples = self._checked("samples", samples, self.samples_shape)
-        electrons = self._checked("images", images.electrons, self.images_shape)
-        return self._sweeps.run(
-            operation, self._views(views), self.all_views, samples=samples, images=electrons, pixels=pixels
-        )
+        data = self._checked("images", images.electrons, self.images_shape)
+        chosen = self._views(views)
+        return self._sweeps.run(operation, chosen, self.all_views, samples=samples, images=data, pixels=pixels)
 
     def _checked(self, name: str, array: Image, shape: tuple[int, ...]) -> Image:
         """Return samples or images in the operator's dtype, copied only where they have to be."""
@@ -302,8 +277,8 @@ class SceneOperator:
             return np.ascontiguousarray(np.broadcast_to(value, self.maps_shape), self.dtype)
         except ValueError:
             raise GeometryMismatch(
-                f"a map has shape {np.shape(value)}, the operator's lattices {self.maps_shape}; give "
-                "one map per lattice, or a number"
+                f"a map has shape {np.shape(value)}, the operator's lattices {self.maps_shape}; give one map per "
+                "lattice, or a number"
             ) from None
 
     def _views(self, views: ViewSelection) -> NDArray[np.intp]:

@@ -23,15 +23,8 @@ def homographies_of_surface(
 
     whose third component is s₃: the direction, and so the place on the samples, is linear in q.
 
-    Parameters
-    ----------
-    ray_from_surface : array (view, 3, 4)
-        [A | b] of each view.
-
-    Returns
-    -------
-    homographies, slopes : array (view, 3, 3)
-        `homographies + q slopes` maps rays (x, y, 1) to directions, homogeneous; the third row of the slopes is zero.
+    `ray_from_surface` (view, 3, 4) is [A | b]. The homographies plus q times the slopes, both (view, 3, 3), map rays
+    (x, y, 1) to directions, homogeneous; the third row of the slopes is zero.
     """
     inverse = np.linalg.inv(ray_from_surface[:, :, :3])
     centre = -np.einsum("vij,vj->vi", inverse, ray_from_surface[:, :, 3])
@@ -45,9 +38,8 @@ class SurfaceOperator(PlaneOperator):
 
     As for a plane, H interpolates the picture bilinearly at each pixel, and Hᵀ spreads with the same weights. Where a
     pixel sees the picture depends on the depth of the surface there, which `recon.operator.relief` draws into each
-    view with a depth buffer. Pixels that see no part of the surface (they look past it, or behind a step) or both sides
-    of a step have weights of zero: they take no part in any likelihood. A surface of one depth d is the plane at d,
-    whose samples are those of `grid` times d.
+    view with a depth buffer. Pixels that look past the surface, behind a step, or at both sides of one have weights of
+    zero: they take no part in any likelihood. A surface of one depth d is the plane of `grid` times d.
 
     Parameters
     ----------
@@ -117,7 +109,7 @@ def _check_surface(
     inverse_depth: NDArray[np.floating],
     lattice_of_view: NDArray[np.intp],
 ) -> None:
-    """Refuse what cannot be drawn; the rest is checked with the geometry."""
+    """Refuse what cannot be drawn (GeometryMismatch); the rest is checked with the geometry."""
     if ray_from_surface.ndim != 3 or ray_from_surface.shape[1:] != (3, 4):
         raise GeometryMismatch(f"matrices of shape {ray_from_surface.shape} do not fit; give (view, 3, 4)")
     if lattice_of_view.shape != (len(ray_from_surface),) or not set(lattice_of_view.tolist()) <= set(range(lattices)):

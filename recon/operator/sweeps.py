@@ -19,17 +19,9 @@ from faintfield.recon.threads import run_in_threads
 class Sweeps(Protocol):
     """Sweeps over the pixels of views of one geometry.
 
-    An implementation may copy the geometry to memory of its own when it is made. It must not keep samples or images
-    between calls: callers change them.
-
-    Parameters
-    ----------
-    geometry : SceneGeometry
-        Where the pixels see the planes. The sweep `kernels.REACH` writes its `reach`; nothing else is written.
-    hiding : Hiding
-        What nearer planes hide.
-    workers : int
-        Number of threads, which an implementation without threads ignores.
+    An implementation may copy the geometry and the hiding to memory of its own when it is made. It must not keep
+    samples or images between calls: callers change them. Of the geometry it writes `reach` alone, in `kernels.REACH`.
+    Without threads it ignores the number of workers.
     """
 
     def __init__(self, geometry: kernels.SceneGeometry, hiding: Hiding, workers: int) -> None: ...
@@ -49,29 +41,22 @@ class Sweeps(Protocol):
 
         Parameters
         ----------
-        operation : int
-            One of `kernels.FORWARD` and its neighbours.
-        views : int array (chosen view,)
-            The views that are processed, each once.
-        image_of_view : int array (view,)
-            Index of each view's image in `images` and `seen`.
+        views, image_of_view : int array (chosen view,), int array (view,)
+            The views that are processed, each once; index of each view's image in `images` and `seen`.
         samples : float array (sample,) or of any shape with as many elements, optional
             The light of all planes; every operation but `ADJOINT` and `REACH` needs it.
-        images : float array (image, row, column), optional
-            What the operation reads of each view: `ADJOINT` and those that compare with data need it.
-        seen : float array (image, row, column), optional
-            Zeros, into which `FORWARD` writes H `samples`.
+        images, seen : float array (image, row, column), optional
+            Images that `ADJOINT` and the operations that compare with data read; zeros, into which `FORWARD` writes
+            H `samples`.
         pixels : PixelModel, optional
-            Statistics of the pixels: those operations need it that compare with data or take a precision.
+            Statistics of the pixels, for operations that compare with data or take a precision.
 
         Returns
         -------
-        value : float
-            The negative log-likelihood, of `VALUE` and `VALUE_AND_RATIO` alone.
-        sums : float array (sample,)
-            What the operation adds to the samples; of size 1 for those that add nothing.
+        value, sums : float, float array (sample,)
+            The negative log-likelihood, of `VALUE` and `VALUE_AND_RATIO` alone; what the operation adds to the samples,
+            of size 1 for those that add nothing.
         """
-        ...
 
 
 class CompiledSweeps:
@@ -92,7 +77,7 @@ class CompiledSweeps:
         seen: Image | None = None,
         pixels: kernels.PixelModel | None = None,
     ) -> tuple[float, Image]:
-        """Run the kernel in all threads; return the sums of their values and of what they added."""
+        """Run the kernel in all threads; return the sums of their values and of their samples."""
         nothing = _read_only(np.zeros(1, self._dtype))
         planes, data = (nothing if array is None else _read_only(array) for array in (samples, images))
         background, variance = (nothing, nothing) if pixels is None else map(_read_only, pixels[1:3])
@@ -114,10 +99,7 @@ class CompiledSweeps:
 
 
 def _read_only[Number: np.generic](array: NDArray[Number]) -> NDArray[Number]:
-    """Return the elements of an array (element,) as a view that cannot be written to.
-
-    To the compiler, arrays that can and cannot be written to are different types, and a memory map may be of either.
-    """
+    # To the compiler, arrays that can and cannot be written to are different types, and a memory map may be of either
     flat = array.reshape(-1)
     flat.flags.writeable = False
     return flat

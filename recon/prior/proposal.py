@@ -19,7 +19,7 @@ from faintfield.recon.solver.initialization import mean_light_e
 from faintfield.recon.solver.penalties import differences
 from faintfield.recon.solver.pmlem import pmlem
 from faintfield.recon.solver.proximal import DualField
-from faintfield.recon.solver.uncertainty import Expected, LocalProblem, UsualErrors, Weights
+from faintfield.recon.solver.uncertainty import Answers, Expected, LocalProblem, UsualErrors, Weights
 
 # Fewest folds: the choice by one is noisy.
 _MIN_FOLDS = 2
@@ -47,14 +47,10 @@ type Regions = dict[str, Image]
 
 @dataclass(frozen=True)
 class Scores:
-    """The squared error of any mixture `Σ aₖ xₖ` of candidates against a picture, up to a constant: `aᵀG a − 2 tᵀa`.
+    """Squared error of any mixture `Σ aₖ xₖ` of candidates against a picture, up to a constant: `aᵀG a − 2 tᵀa`.
 
-    Attributes
-    ----------
-    gram : float array (candidate, candidate)
-        G, the weighted sums of products of two candidates.
-    towards : float array (candidate,)
-        t, those of each candidate with the picture.
+    G, `gram` (candidate, candidate), are the weighted sums of products of two candidates, and t, `towards`, those of
+    each candidate with the picture.
     """
 
     gram: NDArray[np.float64]
@@ -69,7 +65,7 @@ class Scores:
 
 
 def scores(candidates: Sequence[Image], picture: Image, weight: Image) -> Scores:
-    """Return the scores of candidates against a picture, all (row, column), each sample with a weight."""
+    """Return the scores of candidates against a picture, given a weight of each sample, all (row, column)."""
     count = len(candidates)
     gram, towards = np.zeros((count, count)), np.zeros(count)
     for k, one in enumerate(candidates):
@@ -83,8 +79,7 @@ def scores(candidates: Sequence[Image], picture: Image, weight: Image) -> Scores
 def best_mixture(scores: Scores) -> NDArray[np.float64]:
     """Return the weights a ≥ 0, Σ a = 1 of least error: (candidate,).
 
-    Convex with few unknowns, so every set of candidates with positive weight is tried. Where the error falls no
-    further, fewer candidates are preferred.
+    Every set of candidates with positive weight is tried. Where the error falls no further, fewer are preferred.
     """
     count = scores.towards.size
     best: NDArray[np.float64] = np.eye(count)[0]
@@ -100,7 +95,7 @@ def best_mixture(scores: Scores) -> NDArray[np.float64]:
 
 def _mixture_of(scores: Scores, chosen: list[int]) -> NDArray[np.float64] | None:
     """Return the weights of least error with sum one of some candidates; None if one of them is negative."""
-    # The first of them takes what the others leave of one: so the sum is exact whatever the scale of the errors
+    # The first of them takes the rest: so the sum is one whatever the scale of the errors
     first, *others = chosen
     differences = np.eye(scores.towards.size)[others] - np.eye(scores.towards.size)[first]
     curvature = differences @ scores.gram @ differences.T
@@ -119,16 +114,12 @@ class PlaneProposal:
 
     Attributes
     ----------
-    picture : float array (row, column)
-        x̂ ≥ 0, in electrons.
-    sigma : float array (row, column)
-        Standard deviation of the back-projection, in electrons; infinite where no view sees.
+    picture, sigma : float array (row, column)
+        x̂ ≥ 0 and the standard deviation of the back-projection, in electrons; σ is infinite where no view sees.
     mixture : dict of str to dict of str to float
         Weight of each candidate, by region: "light" or "dark", "detail" or "smooth".
-    evidence : Evidence
-        What it is made of.
-    again : callable
-        Returns the picture that the same mixture makes of other evidence and total variation's plane.
+    evidence, again : Evidence, callable
+        Its evidence; a function that makes the picture of other evidence and total variation's plane by this mixture.
     """
 
     picture: Image
@@ -154,14 +145,10 @@ def propose(
 
     Parameters
     ----------
-    problem : SceneProblem
-        The operator and the images.
-    samples : float array (samples)
-        f, the planes that total variation gives.
+    problem, samples, penalty_weight : SceneProblem, float array (samples), float
+        Operator and images; f, the planes of total variation; their β.
     evidences : sequence of Evidence
-        What all views say of each plane.
-    penalty_weight : float
-        β of these.
+        Evidence of all views for each plane.
     candidates : callable
         Returns the candidates for one plane by name, given its evidence: always the same names. The first is chosen
         where all predict alike.
@@ -183,19 +170,17 @@ def propose(
         held_out = views[validation_views(len(views), fold)]
         planes = _planes_of_fold(problem, samples, penalty_weight, np.setdiff1d(views, held_out))
         found = _fold_scores(problem, planes, held_out, candidates, regions, other_colours)
-        totals = [_summed(*of_plane) for of_plane in zip(totals, found, strict=True)]
+        totals = [
+            [a + b for a, b in zip(total, more, strict=True)] if total else more
+            for total, more in zip(totals, found, strict=True)
+        ]
     mixtures = [[best_mixture(of_region) for of_region in of_plane] for of_plane in totals]
     pictures = operator.planes_of(samples)
     return [_proposal(candidates, *of_plane) for of_plane in zip(pictures, evidences, regions, mixtures, strict=True)]
 
 
-def _summed(total: list[Scores], more: list[Scores]) -> list[Scores]:
-    """Return the scores of all regions with those of one more fold."""
-    return [a + b for a, b in zip(total, more, strict=True)] if total else more
-
-
 def regions_of(plane: Image, evidence: Evidence) -> Regions:
-    """Return the regions of a plane with light or without, with detail or without."""
+    """Return the regions of a plane: with light or without, with detail or without."""
     lit = blurred((opacity(plane) > 0.5).astype(np.float32), _BORDER_BLUR)
     seen = np.isfinite(evidence.noise.variance)
     change = np.hypot(*differences(evidence.pilot))
@@ -250,7 +235,6 @@ def _planes_of_fold(problem: SceneProblem, samples: Image, penalty_weight: float
 def _proposal(
     candidates: Candidates, plane: Image, evidence: Evidence, regions: Regions, mixture: list[NDArray[np.float64]]
 ) -> PlaneProposal:
-    """Return the proposal for one plane from the evidence of all views."""
     made = candidates(evidence)
     named = {
         region: dict(zip(made, weights.tolist(), strict=True)) for region, weights in zip(regions, mixture, strict=True)
@@ -281,7 +265,6 @@ def _sharpened(mixed: Image, plane: Image, evidence: Evidence) -> Image:
 
 
 def _mixed(made: dict[str, Image], regions: Regions, mixture: list[NDArray[np.float64]]) -> Image:
-    """Return the mixture of candidates."""
     picture = np.zeros_like(next(iter(made.values())))
     for weights, share in zip(mixture, regions.values(), strict=True):
         for weight, candidate in zip(weights, made.values(), strict=True):
@@ -290,20 +273,11 @@ def _mixed(made: dict[str, Image], regions: Regions, mixture: list[NDArray[np.fl
     return picture
 
 
-class ProposalAnswers:
-    """The answers of the certified optimum about a proposal.
+class ProposalAnswers(Answers):
+    """The answers of the certified optimum about a proposal, with `pilot` total variation's plane in electrons.
 
     For each change of the data total variation's plane, the proposal from it, by the same mixture, and the optimum
     about that are found again, on the quadratic that L is near the optimum: no pass over the data.
-
-    Parameters
-    ----------
-    problem : LocalProblem
-        What the views say near the optimum about the proposal.
-    proposal : PlaneProposal
-        The proposal.
-    pilot : float array (row, column)
-        Total variation's plane, in electrons.
     """
 
     # A filter that is told the noise of its data answers to more of it as to a picture: the noise added is small.
@@ -312,14 +286,14 @@ class ProposalAnswers:
 
     def __init__(self, problem: LocalProblem, proposal: PlaneProposal, pilot: Image) -> None:
         self.problem, self._proposal = problem, proposal
-        shapes, kind = [pilot.shape], np.dtype(np.float32)
-        self._pilot_dual, self._dual = DualField.zero(shapes, kind), DualField.zero(shapes, kind)
+        nothing = DualField.zero([pilot.shape], np.dtype(np.float32))
+        self._pilot_dual = nothing.copy()
         self._pilot = problem.optimum(None, np.asarray(pilot, np.float32), self._pilot_dual)
-        self._dual = replace(self._dual, proposal=np.asarray(proposal.picture, np.float32))
+        self._dual = replace(nothing, proposal=np.asarray(proposal.picture, np.float32))
         self._optimum = problem.optimum(None, problem.plane, self._dual)
 
     def __call__(self, change: Image) -> Image:
-        """Return by how much the optimum changes if −∇L changes."""
+        """Return the change of the optimum (row, column) for a change of −∇L."""
         problem, evidence = self.problem, self._proposal.evidence
         plane = problem.optimum(change, self._pilot, self._pilot_dual.copy())
         seen = np.isfinite(evidence.noise.variance)

@@ -48,8 +48,7 @@ class CrossValidatedWeight:
     passes : float
         Passes over all the data that the search took; passes over some of the views count in proportion.
     solution : PmlemIterate, optional
-        The best candidate's plane, from most of the views: a start for the reconstruction. None if only windows of the
-        plane were reconstructed.
+        The best candidate's plane, from most of the views; None if only windows of the plane were reconstructed.
     """
 
     weight: float
@@ -59,10 +58,9 @@ class CrossValidatedWeight:
 
 
 def validation_views(views: int, fold: int = 0) -> NDArray[np.intp]:
-    """Return the views that a fold leaves out: about a seventh, spread over the grid; folds are disjoint.
+    """Return the views that a fold leaves out: about one in seven; folds are disjoint.
 
-    One view in seven is left out, three places further on each time: on a grid of seven columns, one in each row and
-    one in each column.
+    Each is three places further on in the next seven: on a grid of seven columns, one in each row and in each column.
     """
     folds = _folds(views)
     index = np.arange(views)
@@ -71,7 +69,6 @@ def validation_views(views: int, fold: int = 0) -> NDArray[np.intp]:
 
 
 def _folds(views: int) -> int:
-    """Return the number of folds that views are divided into."""
     return max(2, min(MAX_FOLDS, views // 2))
 
 
@@ -85,12 +82,10 @@ def cross_validated_weight(
 
     Parameters
     ----------
-    problem : SceneProblem
-        One plane, or several planes together.
+    problem, penalty : SceneProblem, Penalty
+        One plane, or several planes together; φ.
     guess : float
         A weight to start from, for all views.
-    penalty : Penalty
-        φ.
     level_e : float, optional
         Mean light of the samples that the views see, in electrons, for windows; by default that of each window.
 
@@ -125,7 +120,6 @@ def cross_validated_weight(
 
 
 def _folds_of(problem: SceneProblem, penalty: Penalty, count: int, level_e: float | None = None) -> list["_Fold"]:
-    """Return the first folds of a problem, at most as many as it has."""
     views = problem.operator.seeing_views
     left_out = [views[validation_views(len(views), n)] for n in range(min(count, _folds(len(views))))]
     return [_Fold(problem, penalty, validation, level_e) for validation in left_out]
@@ -139,7 +133,7 @@ def folds_to_predict(problem: SceneProblem) -> int:
 
 
 class _Fold:
-    """A division into training and validation views, and the solutions so far."""
+    """Training and validation views, and the solutions so far."""
 
     def __init__(
         self, problem: SceneProblem, penalty: Penalty, validation: NDArray[np.intp], level_e: float | None
@@ -181,7 +175,7 @@ def _in_turn(work: Callable[[_Fold], float], folds: Sequence[_Fold]) -> list[flo
 def _losses(
     folds: list[_Fold], guess: float, apply: Callable[[Callable[[_Fold], float], Sequence[_Fold]], list[float]]
 ) -> dict[int, float]:
-    """Return the loss of each candidate `guess · ratioⁿ` that was tried, by n; `apply` scores all folds."""
+    """Return the loss of each candidate `guess · ratioⁿ` by n; `apply` scores all folds."""
     losses: dict[int, float] = {}
 
     def best() -> int:
@@ -224,12 +218,7 @@ _SHARE, _MIN_SAMPLES = 1 / 16, 2**20
 def windows_of(problem: SceneProblem, min_views: int) -> list[SceneProblem]:
     """Return the problems of windows in rows and columns over a large plane; none for smaller planes, and for several.
 
-    Parameters
-    ----------
-    problem : SceneProblem
-        One plane. The windows share its images. Each is worked on by one thread, so that several can be at a time.
-    min_views : int
-        Windows that fewer views see are left out.
+    The windows share the images. Each is solved by one thread. Windows that fewer than `min_views` see are left out.
     """
     operator = problem.operator
     if not isinstance(operator, PlaneOperator):
@@ -252,6 +241,5 @@ def windows_of(problem: SceneProblem, min_views: int) -> list[SceneProblem]:
 
 
 def _middle(part: int, size: int, parts: int) -> slice:
-    """Return the samples in the middle of one of several equal parts of a side."""
     first = ((2 * part + 1) * size // parts - SIDE) // 2
     return slice(first, first + SIDE)

@@ -29,10 +29,8 @@ class DataFit:
 
     Parameters
     ----------
-    operator : SceneOperator
-        H.
-    images : ElementalImages
-        g, with their likelihood.
+    operator, images : SceneOperator, ElementalImages
+        H; g with its likelihood.
     level_e : float
         Typical light of a pixel in electrons, > 0.
     views : sequence of int, optional
@@ -43,8 +41,7 @@ class DataFit:
     sensitivity : float array (samples)
         s = Hᵀ 1.
     may_reach_zero : bool
-        Whether the gradient of L is of use wherever f ≥ 0. It is not where about all electrons of some pixel are light:
-        a sample for which there are data cannot be zero then.
+        False where about all electrons of some pixel are light: its samples cannot be zero, where L has no gradient.
     """
 
     def __init__(
@@ -70,10 +67,8 @@ class DataFit:
 
         These are the row sums of the Hessian that L has on average, those between planes included. They bound it:
         `xᵀ(∇²L)x ≤ Σ w x²`, because the weights of H are not negative. Data scatter around their average, so that a
-        solver must still check that it descends.
-
-        For one plane this takes no pass over the data: the inverse variance is averaged over a sample's neighbours,
-        which is no less than what the pixels between them have. Several planes take one pass.
+        solver must still check that it descends. For one plane this takes no pass over the data: the inverse variance
+        is averaged over a sample's neighbours, which is no less than what the pixels between them have.
         """
         if self._operator.row_sums_are_response:
             return self._metric_of_plane(samples)
@@ -89,7 +84,6 @@ class DataFit:
         return [_positive(of_plane) for of_plane in operator.planes_of(metric)]
 
     def _metric_of_plane(self, samples: Image) -> Image:
-        """Return the metric of a single plane from the light of its samples."""
         likelihood = self._images.likelihood
         fixed = likelihood.name == "least-squares"
         # Each array is as large as the plane: work in place
@@ -114,7 +108,6 @@ class DataFit:
 
 
 def _positive(metric: Image) -> Image:
-    """Return a metric that is also positive where no view sees anything."""
     seen = metric[metric > 0]
     return np.maximum(metric, _MIN_METRIC * np.median(seen[:: 1 + seen.size // _MEDIAN_SAMPLES]))
 
@@ -127,7 +120,7 @@ class SceneProblem:
     images: ElementalImages
 
     def start(self, views: ViewSelection = None) -> Image:
-        """Return the smooth start from some views."""
+        """Return `smooth_start` of some views."""
         return smooth_start(self.operator, self.images, views)
 
     def fit(self, level_e: float, views: ViewSelection = None) -> DataFit:
@@ -140,6 +133,6 @@ class SceneProblem:
         return replace(dual, workers=self.operator.workers)
 
     def well_seen(self) -> NDArray[np.bool_]:
-        """Return which samples represent the planes, each plane judged by its own best seen sample."""
+        """Return `well_seen_samples` of each plane, together (samples)."""
         seen = [well_seen_samples(plane).ravel() for plane in self.operator.planes_of(self.operator.sensitivity())]
         return np.concatenate(seen).reshape(self.operator.samples_shape)

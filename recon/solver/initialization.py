@@ -16,10 +16,10 @@ _MIN_LEVEL_E = 1e-6
 def back_projection(
     operator: SceneOperator, images: ElementalImages, views: ViewSelection = None, *, coverage: Image | None = None
 ) -> Image:
-    """Return `Hᵀ(g − b) / Hᵀ H 1` (samples): the mean of what the views say of each sample.
+    """Return `Hᵀ(g − b) / Hᵀ H 1` (samples), the mean of the views at each sample; zero where none sees it.
 
-    It is zero where no view sees the sample. Without flat field the denominator is s, the number of views that
-    contribute, as in the paper. It is computed unless it is given as `coverage`.
+    Without flat field the denominator is s, the number of views that contribute, as in the paper. It is computed unless
+    it is given as `coverage`.
     """
     light = operator.adjoint(images.electrons, views)
     if np.any(images.background_e):
@@ -31,9 +31,8 @@ def back_projection(
 def smooth_start(operator: SceneOperator, images: ElementalImages, views: ViewSelection = None) -> Image:
     """Return positive samples to start from: the back-projection, blurred, at least a hundredth of its mean.
 
-    A multiplicative iteration can neither leave zero nor start below it. The blur weights by coverage, so that samples
-    that no view sees take the level of their neighbours. Several planes share the light, since the coverage of each
-    counts what its pixels see of all.
+    The blur weights by coverage, so that samples that no view sees take the level of their neighbours. Several planes
+    share the light, since the coverage of each counts what its pixels see of all.
     """
     coverages = operator.planes_of(operator.coverage(views))
     lights = operator.planes_of(
@@ -64,9 +63,8 @@ def mean_light_e(operator: SceneOperator, samples: Image) -> float:
 def universal_penalty_weight(operator: SceneOperator, images: ElementalImages, samples: Image) -> float:
     """Return a penalty weight from the noise alone: β = 0.7 √( s / (f + b + σ²) ), from the median of s and means.
 
-    The noise of the likelihood's gradient has the standard deviation √( s / (f + b + σ²) ) at each sample, and eq. (3)
-    is of the order of one, so this weight removes fluctuations of about that size. It is a starting point that needs no
-    tuning, not the best weight for a scene.
+    The root is the standard deviation of the likelihood's gradient at each sample, and eq. (3) is of the order of one,
+    so this weight removes fluctuations of about that size. It is a starting point, not the best weight for a scene.
     """
     sensitivity = operator.sensitivity()
     seen = well_seen_samples(sensitivity)

@@ -1,11 +1,10 @@
 """One-step-late PMLEM, the iteration of eq. (2) as published; with a weight of zero it is MLEM.
 
-It is a generator of iterates; the caller decides when to stop, what to show and what to save. It does not know whether
-it has converged (`recon.solver.pmlem` does): `settled` and `oscillates` judge the steps made so far.
+It does not know whether it has converged, as `recon.solver.pmlem` does: `settled` and `oscillates` judge its steps.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,18 +19,11 @@ from faintfield.recon.solver.penalties import total_variation_gradient
 _MAX_PENALTY_GRADIENT = 2 + 2**0.5
 
 
-@dataclass(frozen=True)
-class IterationStep:
+class IterationStep(NamedTuple):
     """Change of the plane in one pass over the data.
 
-    Attributes
-    ----------
-    passes : int
-        Passes over all views so far.
-    relative_change : float
-        ‖f⁽ᵏ⁺¹⁾ − f⁽ᵏ⁾‖ / ‖f⁽ᵏ⁾‖.
-    alternation : float
-        Cosine of the angle between this step and the last: −1 when the iteration oscillates, 0 at the first pass.
+    `relative_change` is ‖f⁽ᵏ⁺¹⁾ − f⁽ᵏ⁾‖ / ‖f⁽ᵏ⁾‖, and `alternation` the cosine of the angle between this step and the
+    last: −1 when the iteration oscillates, 0 at the first pass.
     """
 
     passes: int
@@ -39,17 +31,8 @@ class IterationStep:
     alternation: float
 
 
-@dataclass(frozen=True)
-class Iterate:
-    """The plane after one pass over the data.
-
-    Attributes
-    ----------
-    plane : float array (row, column)
-        Expected electrons per detector pixel.
-    step : IterationStep
-        How it differs from the last iterate; small enough to be kept for all passes.
-    """
+class Iterate(NamedTuple):
+    """Plane (row, column) in electrons after one pass over the data, and its change."""
 
     plane: Image
     step: IterationStep
@@ -65,12 +48,10 @@ def pmlem_one_step_late(
 
     Parameters
     ----------
-    start : float array (row, column)
-        Positive.
-    penalty_weight : float
-        β ≥ 0, in the unit of s; zero for maximum likelihood, which fits the noise after many passes.
-    epsilon : float
-        ε > 0 of eq. (3), in the unit of f squared.
+    operator, images, start : PlaneOperator, ElementalImages, float array (row, column)
+        H, g, and a positive plane to start from.
+    penalty_weight, epsilon : float
+        β ≥ 0, in the unit of s, zero for maximum likelihood; ε > 0 of eq. (3), in the unit of f squared.
 
     Raises
     ------
@@ -82,19 +63,13 @@ def pmlem_one_step_late(
     Notes
     -----
     The denominator is positive for every f only where `s > (2 + √2) β`. Samples seen by fewer views keep their start
-    value, see `updated_samples`; the denominator is not clamped. Iterates need not converge: with a large β they
-    oscillate without end, which `oscillates` detects.
+    value, see `updated_samples`. With a large β iterates may oscillate without end, which `oscillates` detects.
     """
     if not (penalty_weight >= 0 and epsilon > 0):
         raise ValueError(f"need penalty_weight >= 0 and epsilon > 0, got {penalty_weight} and {epsilon}")
     if not (start > 0).all():
         raise ValueError(f"start must be positive everywhere, its least value is {start.min()}")
-    _check_weight(operator.sensitivity(), penalty_weight)
-    return _one_step_late(operator, images, start, penalty_weight, epsilon)
-
-
-def _check_weight(sensitivity: Image, penalty_weight: float) -> None:
-    """Refuse a weight that could make most denominators negative (NotConverged)."""
+    sensitivity = operator.sensitivity()
     updated, seen = updated_samples(sensitivity, penalty_weight), well_seen_samples(sensitivity)
     if np.count_nonzero(updated & seen) < np.count_nonzero(seen) / 2:
         limit = float(np.median(sensitivity[seen])) / _MAX_PENALTY_GRADIENT
@@ -102,15 +77,14 @@ def _check_weight(sensitivity: Image, penalty_weight: float) -> None:
             f"penalty weight {penalty_weight:.3g} makes most denominators of eq. (2) negative; with these views it "
             f"must stay below {limit:.3g}: give a smaller one"
         )
+    return _one_step_late(operator, images, np.array(start, operator.dtype), penalty_weight, epsilon)
 
 
 def _one_step_late(
-    operator: PlaneOperator, images: ElementalImages, start: Image, penalty_weight: float, epsilon: float
+    operator: PlaneOperator, images: ElementalImages, plane: Image, penalty_weight: float, epsilon: float
 ) -> Iterator[Iterate]:
-    """Iterate eq. (2) without end."""
     sensitivity = operator.sensitivity()
     updated = updated_samples(sensitivity, penalty_weight)
-    plane = np.array(start, operator.dtype)
     step = np.zeros_like(plane)
     passes = 0
     while True:
@@ -147,8 +121,8 @@ def settled(steps: Sequence[IterationStep], tolerance: float) -> bool:
 def oscillates(steps: Sequence[IterationStep], tolerance: float, window: int = 10) -> bool:
     """Return whether the iteration oscillates instead of settling.
 
-    True when over the last `window` passes successive steps mostly oppose each other (mean cosine below −0.5), are
-    larger than `tolerance`, and do not shrink (the second half of the window moves at least 0.8 times as far).
+    Over the last `window` passes, successive steps then mostly oppose each other (mean cosine below −0.5), are larger
+    than `tolerance`, and do not shrink (the second half of the window moves at least 0.8 times as far).
     """
     if len(steps) < window:
         return False

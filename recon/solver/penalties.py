@@ -16,17 +16,7 @@ class Penalty:
     "tv": φ = t, isotropic total variation, not smoothed. "quadratic": φ = t²/2δ. "huber-tv": φ = t²/2δ up to t = δ and
     t − δ/2 beyond. "none": 0.
 
-    Parameters
-    ----------
-    name : str
-        One of the above.
-    smoothing_e : float
-        δ in electrons; zero for total variation.
-
-    Raises
-    ------
-    ValueError
-        δ is not positive where it is needed.
+    δ is `smoothing_e`, in electrons. ValueError is raised if it is not positive where it is needed.
     """
 
     name: PenaltyName = "tv"
@@ -40,16 +30,15 @@ class Penalty:
     def for_noise(cls, name: PenaltyName, noise_e: Callable[[], float]) -> "Penalty":
         """Return a penalty whose δ suits a back-projection with noise of standard deviation `noise_e()`.
 
-        Total variation has no δ, so `noise_e` is not called. The quadratic penalty weights differences as large as the
-        noise about as much as total variation does; Huber's is total variation for differences above a tenth of the
-        noise.
+        The quadratic penalty weights differences as large as the noise about as much as total variation does; Huber's
+        is total variation above a tenth of the noise.
         """
         share = {"quadratic": 1.0, "huber-tv": 0.1}.get(name, 0.0)
         return cls(name, share * noise_e() if share else 0.0)
 
     @property
     def bounded(self) -> bool:
-        """Return whether the derivative of φ never exceeds one."""
+        """True if the derivative of φ never exceeds one."""
         return self.name != "quadratic"
 
 
@@ -83,7 +72,6 @@ def differences(plane: Image) -> tuple[Image, Image]:
 
 
 def _gradient_magnitude(down: Image, right: Image, epsilon: float) -> Image:
-    """Return u of eq. (3)."""
     magnitude: Image = np.square(down)
     magnitude += np.square(right)
     magnitude += magnitude.dtype.type(epsilon)

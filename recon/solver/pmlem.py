@@ -17,11 +17,8 @@ from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.solver.proximal import DualField
 from faintfield.recon.solver.proximal_kernels import squared_distance
 
-# An inner problem is solved until its error is this fraction of the last step, or of the tolerance.
-_INNER_OF_STEP, _INNER_OF_TOLERANCE = 0.3, 0.8
-
-# Limit on the steps of an inner problem.
-_MAX_INNER_STEPS = 600
+# An inner problem is solved until its error is this fraction of the last step, or of the tolerance; limit on its steps.
+_INNER_OF_STEP, _INNER_OF_TOLERANCE, _MAX_INNER_STEPS = 0.3, 0.8, 600
 
 # Relative rise of the objective that rounding may cause; a step with a larger rise is undone.
 _ROUNDING = 1e-7
@@ -29,11 +26,9 @@ _ROUNDING = 1e-7
 # The metric is updated in this many passes only, so that the iteration converges.
 _PASSES_WITH_NEW_METRIC = 4
 
-# Factor by which an enlarged metric shrinks after each good step.
-_RELAXATION = 0.7
-
-# Largest factor on the metric: the objective must fall long before the metric is this many times the curvature.
-_MAX_SCALE = 2.0**10
+# Factor by which an enlarged metric shrinks after each good step, and largest factor on the metric: the objective must
+# fall long before the metric is this many times the curvature.
+_RELAXATION, _MAX_SCALE = 0.7, 2.0**10
 
 # Smallest ratio of a sample to its last value, where samples must not become zero.
 _MIN_FALL = 0.05
@@ -50,10 +45,8 @@ class Certificate:
 
     Attributes
     ----------
-    distance : float
-        The bound; zero only at the optimum.
-    stationarity, slack : float
-        Its parts a/‖f‖ and √(2e)/‖f‖.
+    distance, stationarity, slack : float
+        The bound, zero only at the optimum, and its parts a/‖f‖ and √(2e)/‖f‖.
     """
 
     distance: float
@@ -69,14 +62,10 @@ class PmlemIterate:
     ----------
     plane : float array (samples)
         Expected electrons per detector pixel, at least zero; (sample,) for several planes together.
-    objective : float
-        L(f) + β Σ φ(|∇f|).
-    certificate : Certificate
-        Its distance from the optimum.
-    passes : int
-        Passes over the data so far.
-    inner_steps : int
-        Steps of inner problems so far.
+    objective, certificate : float, Certificate
+        L(f) + β Σ φ(|∇f|), and the distance from the optimum.
+    passes, inner_steps : int
+        Passes over the data, and steps of inner problems, so far.
     dual : DualField
         The penalty's dual field, from which a similar problem can start. The next iterate changes it.
     """
@@ -101,20 +90,18 @@ def pmlem(
     """Yield planes of decreasing objective, each with its certificate; the caller decides when to stop.
 
     Proximal gradient in the metric of the data. A step that raised the objective is undone and repeated with twice the
-    metric; the objective is known from the pass that the next step needs anyway.
+    metric; the next step needs the pass that gives the objective anyway.
 
     Parameters
     ----------
     fit, penalty : DataFit, Penalty
         L and φ; total variation by default.
-    start : float array (samples)
-        Positive.
-    penalty_weight : float
-        β ≥ 0, in the unit of s.
+    start, penalty_weight : float array (samples), float
+        Positive samples to start from; β ≥ 0, in the unit of s.
     tolerance : float
         The distance that the caller wants to reach, which sets the accuracy of inner problems.
     dual : DualField, optional
-        That of a similar problem, which is changed; by default that of one constant plane (row, column).
+        That of a similar problem, which is changed; by default that of one constant plane.
 
     Raises
     ------
@@ -135,8 +122,6 @@ def pmlem(
 
 
 class _Pmlem:
-    """The iteration and its state."""
-
     def __init__(self, fit: DataFit, weight: float, penalty: Penalty, tolerance: float) -> None:
         self._fit, self._weight, self._penalty, self._tolerance = fit, weight, penalty, tolerance
         self._scale = 1.0
@@ -195,7 +180,6 @@ class _Pmlem:
         return plane
 
     def _certificate(self, plane: Image, gradient: Image, metric: Image, dual: DualField) -> Certificate:
-        """Return the certificate of a plane in the metric it was found with."""
         reach = plane.dtype.type(self._weight) / metric
         after = dual.primal(plane - gradient / metric, reach)
         residual = distance(plane, np.maximum(after, 0), metric)

@@ -16,11 +16,9 @@ from faintfield.recon.solver import proximal_kernels
 from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.threads import run_in_threads
 
-# Steps that a strip makes before it exchanges its edges with its neighbours.
-_STEPS_PER_EXCHANGE = 20
-
-# Fewest rows of a strip: each strip also works on that many steps' rows of its neighbours.
-_MIN_STRIP_ROWS = 64
+# Steps that a strip makes before it exchanges its edges with its neighbours, and its fewest rows: it also works on as
+# many rows of its neighbours as it makes steps.
+_STEPS_PER_EXCHANGE, _MIN_STRIP_ROWS = 20, 64
 
 # The gap is measured after this share of the steps so far, at least after one exchange.
 _CHECK_SHARE = 0.1
@@ -38,10 +36,8 @@ class ProxResult:
     ----------
     plane : float array (samples)
         x, at least zero.
-    gap : float
-        Bound on how much its objective exceeds the minimum, in the unit of the objective.
-    steps : int
-        Steps made.
+    gap, steps : float, int
+        Bound on the objective's excess over its minimum, and steps made.
     """
 
     plane: Image
@@ -53,8 +49,8 @@ class ProxResult:
 class DualField:
     """p, the dual field of the penalty: a start for the next problem, which is nearly the same.
 
-    Samples are those of one plane (row, column), or those of several planes (sample,), one plane after the other. Each
-    plane is penalised separately.
+    Samples are those of one plane (row, column), or of several planes (sample,), one after the other and each penalised
+    separately.
 
     Attributes
     ----------
@@ -82,8 +78,8 @@ class DualField:
     def primal(self, point: Image, reach: Image) -> Image:
         """Return `v − β/w ∇ᵀp` (samples), not clipped at zero, for a point v and a reach β/w."""
         plane = np.empty(point.shape, point.dtype)
-        for vectors, (v, r, x) in zip(self.vectors, self._planes(point, reach, plane), strict=True):
-            _set_primal(vectors, v, r, x, self.workers)
+        for vectors, part in zip(self.vectors, self._planes(point, reach, plane), strict=True):
+            _on_strips(proximal_kernels.primal_of_dual, _edges(vectors.shape[1], self.workers), vectors, *part)
         return plane
 
     def penalty_and_slack(self, plane: Image, penalty: Penalty) -> tuple[float, float]:
@@ -108,12 +104,8 @@ class DualField:
 
         Parameters
         ----------
-        point, metric : float array (samples)
-            v and w > 0.
-        weight : float
-            β > 0.
-        penalty : Penalty
-            φ.
+        point, metric, weight, penalty : float array (samples), float array (samples), float, Penalty
+            v, w > 0, β > 0 and φ.
         gap_tolerance : callable
             Returns the gap to reach, given x so far. Planes share it equally.
         max_steps : int
@@ -165,7 +157,6 @@ class _PrimalDual:
         self._edges, self._workers = _edges(len(plane), workers), workers
 
     def advance(self) -> None:
-        """Make the steps up to the next check of the gap."""
         for _ in range(max(round(_CHECK_SHARE * self.steps / _STEPS_PER_EXCHANGE), 1)):
             arguments = *self._changed, *self._fixed, *self._next_steps()
             # Neighbours change their rows while a strip is in work
@@ -179,7 +170,7 @@ class _PrimalDual:
             self.steps += _STEPS_PER_EXCHANGE
 
     def gap(self) -> float:
-        """Return the gap between x and p, relative to the weight."""
+        """Return the gap relative to the weight."""
         vectors, plane, _ = self._changed
         arguments = (plane, vectors, self._point, self._reach)
         distance: float = sum(_on_strips(proximal_kernels.distance_from_primal, self._edges, *arguments))
@@ -187,7 +178,6 @@ class _PrimalDual:
         return distance + _penalty_and_slack(vectors, change, self._penalty, self._workers)[1]
 
     def _next_steps(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the lengths of the next steps on x, and their extrapolations."""
         lengths, momenta = np.empty((2, _STEPS_PER_EXCHANGE))
         for n in range(_STEPS_PER_EXCHANGE):
             lengths[n], momenta[n] = self._length, (1 + 2 * _CONVEXITY * self._length) ** -0.5
@@ -209,13 +199,7 @@ def step_sizes(reach: Image) -> Image:
     return np.divide(reach.dtype.type(0.125), largest, out=largest)
 
 
-def _set_primal(vectors: Image, point: Image, reach: Image, plane: Image, workers: int) -> None:
-    """Set a plane (row, column) to `v − β/w ∇ᵀp`."""
-    _on_strips(proximal_kernels.primal_of_dual, _edges(len(plane), workers), vectors, point, reach, plane)
-
-
 def _penalty_and_slack(vectors: Image, plane: Image, penalty: Penalty, workers: int) -> tuple[float, float]:
-    """Return the penalty and the slack of one plane (row, column)."""
     arguments = (plane, vectors, penalty.smoothing_e, penalty.bounded)
     sums = _on_strips(proximal_kernels.penalty_and_slack, _edges(len(plane), workers), *arguments)
     return sum(part[0] for part in sums), sum(part[1] for part in sums)
@@ -228,5 +212,5 @@ def _edges(rows: int, workers: int) -> list[int]:
 
 
 def _on_strips[Result](kernel: Callable[..., Result], edges: Sequence[int], *arguments: object) -> list[Result]:
-    """Call a kernel with the first and past-the-last row of every strip, in threads when there are several strips."""
+    """Call a kernel with the first and past-the-last row of every strip, in threads."""
     return run_in_threads(lambda strip: kernel(*strip, *arguments), list(pairwise(edges)))

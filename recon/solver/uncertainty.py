@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,23 +22,15 @@ _DRAWS, _SMALL_CHANGE = 4, 0.2
 # Proximal steps of each answer; error of a step relative to its change and to the plane, and limit on its inner steps.
 _STEPS, _OF_CHANGE, _OF_PLANE, _MAX_INNER_STEPS = 3, 0.1, 3e-3, 300
 
-# How much the squared error relative to the mean square answer differs from scene to scene.
-_DOUBT = 0.6
-
-# Deviations of the ratio that are added to it.
-_CAUTION = 0.5
+# Deviation of the ratio of squared error and mean square answer from scene to scene; deviations that are added to it.
+_DOUBT, _CAUTION = 0.6, 0.5
 
 # Blurs of the square answer, and of the square gradient.
 _NARROW, _WIDE, _OF_GRADIENT = (1, 2, 4), (1, 2, 4, 8, 8, 16), (1,)
 
-# Least variance, relative to that of a sample without penalty.
-_LEAST_VARIANCE = 1e-4
-
-# Keeps quotients finite.
-_TINY = 1e-30
-
-# Least part of alternating samples that HᵀH is taken to leave.
-_LEAST_ALTERNATION = 0.01
+# Least variance, relative to that of a sample without penalty; least part of alternating samples that HᵀH is taken to
+# leave; smallest divisor.
+_LEAST_VARIANCE, _LEAST_ALTERNATION, _TINY = 1e-4, 0.01, 1e-30
 
 
 @dataclass(frozen=True)
@@ -47,13 +39,11 @@ class LocalFit:
 
     Attributes
     ----------
-    plane, metric, gradient : float array (row, column)
-        f at its optimum, W > 0 and ∇L there.
-    noise_share : float array (row, column)
-        Variance of the gradient by the noise of the data, divided by W; zero where hardly a view sees anything.
+    plane, metric, gradient, noise_share : float array (row, column)
+        f at its optimum, W > 0 and ∇L there, and the variance of the gradient by the noise of the data, divided by W;
+        the last is zero where hardly a view sees anything.
     alternation : (float, float)
-        What HᵀH leaves of samples that alternate in sign along rows (down) and columns (right), relative to constant
-        ones.
+        Part that HᵀH leaves of samples that alternate in sign along rows (down) and columns (right).
     """
 
     plane: Image
@@ -64,19 +54,10 @@ class LocalFit:
 
 
 def local_fits(operator: SceneOperator, fit: DataFit, samples: Image) -> list[LocalFit]:
-    """Return the local fit of each plane as if the others were known, in one pass over the data and some without them.
+    """Return the local fit of each plane as if the others were known, given H, L of all views, and f at its optimum.
 
     Samples are coupled with their eight neighbours only. The signs `z` of four patterns, constant or alternating along
     rows and columns, therefore give the diagonal of HᵀH exactly, as the mean of `z · HᵀH z`.
-
-    Parameters
-    ----------
-    operator : SceneOperator
-        H.
-    fit : DataFit
-        L of all views.
-    samples : float array (samples)
-        f at its optimum, in electrons.
     """
     gradients = operator.planes_of(fit.value_and_gradient(samples)[1])
     found = []
@@ -100,24 +81,15 @@ def standard_deviation(local: LocalFit, weight: float, penalty: Penalty, generat
     beside them, and weighted against the usual ratio. What the error has beyond the usual ratio is the contrast that
     the penalty removed; it is spread evenly, because it is not where the answers are.
 
-    Without a penalty, the variance is 1/W.
-
-    Parameters
-    ----------
-    local : LocalFit
-        The plane, and what the views say of it.
-    weight, penalty : float, Penalty
-        β ≥ 0 of the optimum, and φ.
-    generator : Generator
-        Random generator of the noise.
+    `weight` and `penalty` are β ≥ 0 of the optimum, and φ. Without a penalty, the variance is 1/W.
     """
     if weight == 0 or penalty.name == "none":
         return np.asarray(1 / np.sqrt(local.metric), local.plane.dtype)
-    return error_of_answers(PenaltyAnswers(LocalProblem(local, weight, penalty)), generator)
+    return error_of_answers(Answers(LocalProblem(local, weight, penalty)), generator)
 
 
 def error_of_answers(answers: "Answers", generator: np.random.Generator) -> Image:
-    """Return the root of the expected squared error (row, column) of an estimate, from its answers to noise."""
+    """Return the standard deviation (row, column) of an estimate from its answers to noise."""
     problem, usual = answers.problem, answers.usual
     noises = [problem.noise(generator) for _ in range(_DRAWS)]
     size = np.float32(usual.change)
@@ -133,10 +105,8 @@ def error_of_answers(answers: "Answers", generator: np.random.Generator) -> Imag
 
 def _spread(local: LocalFit, usual: "UsualErrors", squares: Image, seen_squares: Image, errors: Image) -> Image:
     """Return σ (row, column), from the answers' squares scaled in each region to the error expected there."""
-    variance = np.zeros_like(squares)
-    local_part = np.zeros_like(squares)
-    weights = usual.weights
-    slopes = None
+    variance, local_part = np.zeros_like(squares), np.zeros_like(squares)
+    weights, slopes = usual.weights, None
     if weights.gradient:
         slopes = blurred(np.square(np.hypot(*differences(local.plane))).astype(squares.dtype), _OF_GRADIENT)
     for region, seen, expected in _regions(local, usual):
@@ -189,8 +159,6 @@ class LocalProblem:
         return x
 
     def _step(self, before: Image, point: Image, dual: DualField) -> Image:
-        """Return the plane nearest to a point under the penalty; the dual field becomes its own."""
-
         def gap_tolerance(x: Image) -> float:
             moved = norm(x - before, self._metric)
             return 0.5 * max(_OF_CHANGE * moved, _OF_PLANE * self._size) ** 2
@@ -199,10 +167,7 @@ class LocalProblem:
 
 
 class Expected(NamedTuple):
-    """The squared error of a region relative to the mean square answer: usually, at most where the answers are, least.
-
-    What it has beyond `most` is spread evenly.
-    """
+    """Squared error of a region relative to the mean square answer; its excess over `most` is spread evenly."""
 
     usually: float
     most: float
@@ -212,8 +177,7 @@ class Expected(NamedTuple):
 class Weights(NamedTuple):
     """Composition of σ²: the square answers under two blurs, their mean over the region, and the square gradient.
 
-    The last is for edges, which are more uncertain than the answers show: their place is. It is scaled such that its
-    mean over the region is that of the square answers.
+    The last, scaled to the mean of the square answers, is for edges, whose place is more uncertain than answers show.
     """
 
     narrow: float
@@ -230,12 +194,10 @@ class UsualErrors:
     ----------
     change : float
         Size of the noise that is added to see the answers, relative to that of the data.
-    opaque, beside : Expected
-        On opaque samples and beside them.
-    weights : Weights
-        How they are spread over a region.
+    opaque, beside, weights : Expected, Expected, Weights
+        On opaque samples and beside them; their spread over a region.
     for_small_objects : float
-        What is added to the usual ratio of opaque samples, times the part of the plane that is dark.
+        Addition to the usual ratio of opaque samples, times the part of the plane that is dark.
     """
 
     change: float
@@ -245,23 +207,8 @@ class UsualErrors:
     for_small_objects: float = 0.0
 
 
-class Answers(Protocol):
-    """By how much an estimate changes (row, column) if −∇L changes by so much."""
-
-    @property
-    def problem(self) -> LocalProblem:
-        """Local model of the views near the estimate."""
-
-    @property
-    def usual(self) -> UsualErrors:
-        """Prior knowledge of its errors."""
-
-    def __call__(self, change: Image) -> Image:
-        """Return the change of the estimate."""
-
-
-class PenaltyAnswers:
-    """The answers of the optimum of likelihood and penalty."""
+class Answers:
+    """Changes of an estimate if −∇L changes; here of the optimum of likelihood and penalty."""
 
     # Small objects: the weight that predicts best suits their dark surroundings.
     usual = UsualErrors(1.0, Expected(1.1, 1.1, 1.0), Expected(1.1, 1.1, 1.0), Weights(0.3, 0.5, 0.2), 0.9)
@@ -272,7 +219,7 @@ class PenaltyAnswers:
         self._optimum = problem.optimum(None, problem.plane, self._dual)
 
     def __call__(self, change: Image) -> Image:
-        """Return by how much the optimum changes."""
+        """Return the change of the estimate (row, column) for a change of −∇L."""
         return self.problem.optimum(change, self._optimum, self._dual.copy()) - self._optimum
 
 
@@ -295,8 +242,7 @@ def _ratio_and_excess(
 
     The squared error is the mean of the measured and of the usual, by their variances, plus half the deviation of that
     mean, since a σ that is too small does more harm. It is no less than the measured surely is: if the penalty leaves
-    nothing, there are no answers either. The variance of the measured is nearly that of the mean of q², of correlated
-    noise.
+    nothing, there are no answers either. The measured varies nearly as the mean of q², of correlated noise.
     """
     if not errors.size:
         return expected.usually, 0.0
@@ -342,5 +288,4 @@ def _three_sample_blur(image: Image, alternation: NDArray[np.floating]) -> Image
 
 
 def _mean(planes: Sequence[Image]) -> Image:
-    """Return the mean of planes."""
     return np.asarray(sum(planes) / np.float32(len(planes)))
