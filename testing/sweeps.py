@@ -290,11 +290,7 @@ def _homographies(generator: np.random.Generator, views: int, depth_mm: float) -
     moved_mm[-1, 0] = 900.0
     homographies = np.zeros((views, 3, 3))
     for homography, (yaw, pitch, roll), (x_mm, y_mm) in zip(homographies, turns, moved_mm, strict=True):
-        homography[:] = [
-            [depth_mm, -roll * depth_mm, x_mm],
-            [roll * depth_mm, depth_mm, y_mm],
-            [yaw, pitch, 1.0],
-        ]
+        homography[:] = [[depth_mm, -roll * depth_mm, x_mm], [roll * depth_mm, depth_mm, y_mm], [yaw, pitch, 1.0]]
     return homographies
 
 

@@ -43,10 +43,7 @@ class DetectorMaps:
     """
 
     def __init__(
-        self,
-        rays: NDArray[np.floating],
-        flat: NDArray[np.floating] | None = None,
-        dtype: Precision = np.float32,
+        self, rays: NDArray[np.floating], flat: NDArray[np.floating] | None = None, dtype: Precision = np.float32
     ) -> None:
         rays = rays[np.newaxis] if rays.ndim == 3 else rays
         if rays.ndim != 4 or rays.shape[3] != 2:
@@ -65,10 +62,7 @@ class DetectorMaps:
 
     @classmethod
     def of(
-        cls,
-        rays: "NDArray[np.floating] | DetectorMaps",
-        flat: NDArray[np.floating] | None,
-        dtype: Precision,
+        cls, rays: "NDArray[np.floating] | DetectorMaps", flat: NDArray[np.floating] | None, dtype: Precision
     ) -> "DetectorMaps":
         """Return maps as they are, or those of rays and a flat field."""
         if not isinstance(rays, DetectorMaps):

@@ -59,11 +59,7 @@ class PlaneOperator(SceneOperator):
         self.samples_shape = grid.shape
 
     def window(
-        self,
-        rows: slice,
-        columns: slice,
-        workers: int | None = None,
-        kept_maps: dict[float, Image] | None = None,
+        self, rows: slice, columns: slice, workers: int | None = None, kept_maps: dict[float, Image] | None = None
     ) -> "PlaneOperator":
         """Return H of a part of the samples, on the same images; pixels that see another part see nothing.
 

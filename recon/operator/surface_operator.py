@@ -11,9 +11,7 @@ from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.operator.relief import draw_relief
 
 
-def homographies_of_surface(
-    ray_from_surface: NDArray[np.floating],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def homographies_of_surface(ray_from_surface: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the homographies from rays to a plane at infinity, and their change with 1/depth.
 
     A point in direction a = (x, y, 1) of the reference view at 1/depth q is seen along the ray `r ∝ A a + q b` of a

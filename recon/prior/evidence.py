@@ -120,12 +120,7 @@ def _divided(sums: Image, coverage: Image) -> Image:
 
 
 def noise_of_back_projection(
-    operator: SceneOperator,
-    images: ElementalImages,
-    plane: Image,
-    *,
-    seed: int = 0,
-    draws: int = 1,
+    operator: SceneOperator, images: ElementalImages, plane: Image, *, seed: int = 0, draws: int = 1
 ) -> Noise:
     """Return the covariance of the back-projection's noise, for data of variance `H f + b + σ²`.
 

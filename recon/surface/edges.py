@@ -68,13 +68,7 @@ def moved_edges(index: NDArray[np.float32], ratios: Image, light: Image) -> NDAr
     scale = np.float32(4 * np.pi * _WINDOW**2 * _INDEPENDENT)
     preference = gaussian(values_at(ratios, near) - values_at(ratios, far), _WINDOW) * scale
     share = is_near.astype(np.float32)
-    _divide(
-        np.clip(preference, -_MAX_PREFERENCE, _MAX_PREFERENCE),
-        *_edge_costs(light),
-        free,
-        share,
-        _STEPS,
-    )
+    _divide(np.clip(preference, -_MAX_PREFERENCE, _MAX_PREFERENCE), *_edge_costs(light), free, share, _STEPS)
     return np.where(free, np.where(share > 0.5, near, far), index)
 
 

@@ -173,10 +173,7 @@ def predicted(
 
 
 def _by_neighbours(
-    evidence: DepthEvidence,
-    views: NDArray[np.intp],
-    neighbours: Sequence[NDArray[np.intp]],
-    counted: NDArray[np.bool_],
+    evidence: DepthEvidence, views: NDArray[np.intp], neighbours: Sequence[NDArray[np.intp]], counted: NDArray[np.bool_]
 ) -> float | None:
     """Return the deviance of views predicted by the mean of those beside them, under the best blur."""
     if not neighbours or min(map(len, neighbours)) == 0:
