@@ -14,10 +14,10 @@ from faintfield.recon.likelihood.pixel_models import LEAST_SQUARES, POISSON_GAUS
 from faintfield.recon.operator import kernels
 from faintfield.recon.operator.geometry import DetectorMaps, scene_geometry
 from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.kernels import Hiding
 from faintfield.recon.operator.occlusion import Occluders, hiding_of
 from faintfield.recon.operator.placement import EDGE_TOLERANCE, UNSEEN
 from faintfield.recon.operator.relief import Relief
-from faintfield.recon.operator.scene_blocks import Hiding
 from faintfield.recon.operator.sweeps import Sweeps
 
 type Scene = tuple[kernels.SceneGeometry, Hiding]

@@ -101,7 +101,7 @@ def agreement(operator: SceneOperator, images: ElementalImages) -> Agreement:
     return Agreement(operator.adjoint(squares), sensitivity, f, light_variance)
 
 
-def depth_map(planes: list[Agreement], depths_mm: NDArray[np.floating]) -> DepthEstimate:
+def depth_map(planes: list[Agreement], depths_mm: Image) -> DepthEstimate:
     """Return the depths that make the views most likely, regularised (`depths_mm` are those of the planes).
 
     If the brightness of views differs with variance τ² in units of the noise, the log-likelihood ratio of "each its
@@ -206,7 +206,7 @@ class Significance:
 
 
 def disagreement(
-    light_e: NDArray[np.floating], visible: NDArray[np.bool_], places: NDArray[np.intp], known_variance_e2: float
+    light_e: Image, visible: NDArray[np.bool_], places: NDArray[np.intp], known_variance_e2: float
 ) -> float:
     """Return the mean over samples of how much the views disagree at the best depth of each.
 

@@ -111,7 +111,7 @@ def likeliest_depth_mm(planes: Sequence[Agreement], depths_mm: Sequence[float], 
     return float(1 / (inverse[best] + offset * (inverse[best + 1] - inverse[best])))
 
 
-def prominence(curve: NDArray[np.floating], peak: int) -> float:
+def prominence(curve: Image, peak: int) -> float:
     """Return the prominence of a peak: its height above the lower ground that separates it from a higher one."""
     height = curve[peak]
     lowest = []
@@ -126,7 +126,7 @@ def _detail(plane: Image) -> Image:
     return blurred(plane, _FINE) - blurred(plane, _COARSE)
 
 
-def _vertex(depth: NDArray[np.floating], curve: NDArray[np.floating], peak: int) -> float:
+def _vertex(depth: Image, curve: Image, peak: int) -> float:
     """Return the maximum of the parabola through a peak and its neighbours; at an end of the curve, the end."""
     if not 0 < peak < len(depth) - 1:
         return float(depth[peak])

@@ -21,6 +21,7 @@ from faintfield.recon.numba_tools import advanced, compiled, index, inlined, pre
 from faintfield.recon.operator.placement import (
     BLOCK_PX,
     COLUMN,
+    COLUMN_TAPS,
     COUNTED,
     EXPECTED,
     HALF_PX,
@@ -43,6 +44,9 @@ from faintfield.recon.operator.placement import (
 
 # Numbers per cache line of 64 bytes in float32.
 _LINE_PX = 16
+
+# Smallest weight that α is divided by.
+_TINY = 1e-37
 
 
 @compiled
@@ -78,14 +82,14 @@ def gather(samples, layout, planes, scratch, blocks):
             for k in range(index(BLOCK_PX)):
                 at = index(COUNTED) + k
                 scratch[at] = max(scratch[at], scratch[weights_of(plane) + k])
-        gather_plane(samples, layout, plane, scratch, blocks)
+        visit_plane(False, samples, layout, plane, scratch, blocks)
 
 
 @compiled
 def scatter(samples, layout, planes, scratch, blocks):
     """Add `EXPECTED` to all planes."""
     for plane in range(index(planes)):
-        scatter_plane(samples, layout, plane, scratch, blocks)
+        visit_plane(True, samples, layout, plane, scratch, blocks)
 
 
 @inlined
@@ -95,8 +99,8 @@ def meets(plane, blocks):
 
 
 @compiled
-def gather_plane(samples, layout, plane, scratch, blocks):
-    """Add to `EXPECTED` what a block's pixels see of one plane."""
+def visit_plane(scatters, samples, layout, plane, scratch, blocks):
+    """Add `EXPECTED` to one plane if `scatters`; else add to `EXPECTED` what a block's pixels see of the plane."""
     place, on_plane = place_of(plane), advanced(layout, index(LAYOUT_SIZE) * plane)
     for number in range(2):
         half, first = advanced(blocks, half_of(plane, index(number))), index(number * HALF_PX)
@@ -104,30 +108,12 @@ def gather_plane(samples, layout, plane, scratch, blocks):
         if how > SCATTERED:
             prefetch_block(samples, start + ROW_TAPS * width)
             taps = advanced(samples, index(start))
-            if on_plane[index(3)] == 1:
-                _gather_side_by_side(how, taps, width, half, scratch, place, first)
+            if scatters:
+                _scatter_in_step(how, on_plane[index(3)], taps, width, half, scratch, place, first)
             else:
-                _gather_every_other(how, taps, width, half, scratch, place, first)
+                _gather_in_step(how, on_plane[index(3)], taps, width, half, scratch, place, first)
         elif how == SCATTERED:
-            _gather_scattered(samples, on_plane, scratch, place, first)
-
-
-@compiled
-def scatter_plane(samples, layout, plane, scratch, blocks):
-    """Add `EXPECTED` to one plane."""
-    place, on_plane = place_of(plane), advanced(layout, index(LAYOUT_SIZE) * plane)
-    for number in range(2):
-        half, first = advanced(blocks, half_of(plane, index(number))), index(number * HALF_PX)
-        how, start, width = half[index(0)], half[index(1)], on_plane[index(2)]
-        if how > SCATTERED:
-            prefetch_block(samples, start + ROW_TAPS * width)
-            taps = advanced(samples, index(start))
-            if on_plane[index(3)] == 1:
-                _scatter_side_by_side(how, taps, width, half, scratch, place, first)
-            else:
-                _scatter_every_other(how, taps, width, half, scratch, place, first)
-        elif how == SCATTERED:
-            _scatter_scattered(samples, on_plane, scratch, place, first)
+            _visit_scattered(scatters, samples, on_plane, scratch, place, first)
 
 
 @compiled
@@ -138,9 +124,59 @@ def copy(source, at, target, to, count):
 
 
 @compiled
-def _gather_side_by_side(how, samples, stride, half, scratch, place, first):
-    """Interpolate between samples side by side with as few taps as the pixels need, each number compiled separately."""
-    if how == IN_STEP_2_2:
+def hide(opacities, opaque, depths, layout, planes, scratch, blocks):
+    """Multiply the weights of a block's pixels on every plane by `Π (1 − α)` over the nearer planes that they see.
+
+    The weights of a plane are divided out of what they gather of its α. Where they are zero, so are those of all
+    farther planes, or the pixel does not see the plane.
+    """
+    number = type(scratch[0])
+    zero, one, tiny = number(0), number(1), number(_TINY)
+    first_row = 0
+    for near in range(index(planes)):
+        on_plane = advanced(layout, index(LAYOUT_SIZE) * near)
+        if _may_hide(opaque, first_row, on_plane, near, blocks):
+            weight = weights_of(near)
+            for k in range(index(BLOCK_PX)):
+                scratch[index(EXPECTED) + k] = zero
+            visit_plane(False, opacities, layout, near, scratch, blocks)
+            for k in range(index(BLOCK_PX)):
+                alpha = scratch[index(EXPECTED) + k] / max(scratch[weight + k], tiny)
+                scratch[index(EXPECTED) + k] = max(one - alpha, zero)
+            for far in range(index(planes)):
+                if depths[far] > depths[near]:
+                    weight = weights_of(far)
+                    for k in range(index(BLOCK_PX)):
+                        scratch[weight + k] *= scratch[index(EXPECTED) + k]
+        first_row += on_plane[index(1)]
+
+
+@compiled
+def _may_hide(opaque, first_row, layout, near, blocks):
+    """Return whether a block's pixels may see something opaque; of pixels in step, whether their taps reach it."""
+    height, advance = layout[index(1)], layout[index(3)]
+    for number in range(2):
+        half = advanced(blocks, half_of(near, index(number)))
+        if half[index(0)] == SCATTERED:
+            return True
+        if half[index(0)] == OUTSIDE:
+            continue
+        row, column = half[index(2)], half[index(3)] + number * HALF_PX * advance
+        for tap in range(row, min(row + ROW_TAPS, height)):
+            at = index(2 * (first_row + tap))
+            if opaque[at] < column + half[index(4)] * advance + COLUMN_TAPS and column < opaque[at + index(1)]:
+                return True
+    return False
+
+
+@compiled
+def _gather_in_step(how, advance, samples, stride, half, scratch, place, first):
+    """Interpolate with as few rows and columns of taps as the pixels need, each number compiled separately."""
+    if advance > 1 and how <= IN_STEP_2_3:
+        _gather_taps(2, 3, 2, samples, stride, half, scratch, place, first)
+    elif advance > 1:
+        _gather_taps(3, 4, 2, samples, stride, half, scratch, place, first)
+    elif how == IN_STEP_2_2:
         _gather_taps(2, 2, 1, samples, stride, half, scratch, place, first)
     elif how == IN_STEP_2_3:
         _gather_taps(2, 3, 1, samples, stride, half, scratch, place, first)
@@ -151,18 +187,13 @@ def _gather_side_by_side(how, samples, stride, half, scratch, place, first):
 
 
 @compiled
-def _gather_every_other(how, samples, stride, half, scratch, place, first):
-    """Interpolate where pixels advance by two samples."""
-    if how <= IN_STEP_2_3:
-        _gather_taps(2, 3, 2, samples, stride, half, scratch, place, first)
-    else:
-        _gather_taps(3, 4, 2, samples, stride, half, scratch, place, first)
-
-
-@compiled
-def _scatter_side_by_side(how, samples, stride, half, scratch, place, first):
-    """Scatter with the taps of `_gather_side_by_side`."""
-    if how == IN_STEP_2_2:
+def _scatter_in_step(how, advance, samples, stride, half, scratch, place, first):
+    """Scatter with the taps of `_gather_in_step`."""
+    if advance > 1 and how <= IN_STEP_2_3:
+        _scatter_taps(2, 3, 2, samples, stride, half, scratch, place, first)
+    elif advance > 1:
+        _scatter_taps(3, 4, 2, samples, stride, half, scratch, place, first)
+    elif how == IN_STEP_2_2:
         _scatter_taps(2, 2, 1, samples, stride, half, scratch, place, first)
     elif how == IN_STEP_2_3:
         _scatter_taps(2, 3, 1, samples, stride, half, scratch, place, first)
@@ -170,15 +201,6 @@ def _scatter_side_by_side(how, samples, stride, half, scratch, place, first):
         _scatter_taps(3, 3, 1, samples, stride, half, scratch, place, first)
     else:
         _scatter_taps(3, 4, 1, samples, stride, half, scratch, place, first)
-
-
-@compiled
-def _scatter_every_other(how, samples, stride, half, scratch, place, first):
-    """Scatter with the taps of `_gather_every_other`."""
-    if how <= IN_STEP_2_3:
-        _scatter_taps(2, 3, 2, samples, stride, half, scratch, place, first)
-    else:
-        _scatter_taps(3, 4, 2, samples, stride, half, scratch, place, first)
 
 
 @inlined
@@ -286,31 +308,17 @@ def _corner(scratch, place, k, start, height, stride, advance):
 
 
 @compiled
-def _gather_scattered(samples, layout, scratch, place, first):
-    """Add to `EXPECTED` what the block's pixels see, pixel by pixel."""
+def _visit_scattered(scatters, samples, layout, scratch, place, first):
+    """Scatter or interpolate pixel by pixel, with the same weights."""
     start, height, stride = layout[index(0)], layout[index(1)], layout[index(2)]
     advance = type(scratch[0])(layout[index(3)])
     zero, one, below = type(scratch[0])(0), index(1), index(stride)
     for k in range(first, first + index(HALF_PX)):
         weight = scratch[place + index(WEIGHT) + k]
-        if weight != zero:
-            at, down, right = _corner(scratch, place, k, start, height, stride, advance)
-            upper, lower = samples[at], samples[at + below]
-            upper += right * (samples[at + one] - upper)
-            lower += right * (samples[at + below + one] - lower)
-            scratch[index(EXPECTED) + k] += weight * (upper + down * (lower - upper))
-
-
-@compiled
-def _scatter_scattered(samples, layout, scratch, place, first):
-    """Add `EXPECTED` to the plane with the same weights, pixel by pixel."""
-    start, height, stride = layout[index(0)], layout[index(1)], layout[index(2)]
-    advance = type(scratch[0])(layout[index(3)])
-    zero, one, below = type(scratch[0])(0), index(1), index(stride)
-    for k in range(first, first + index(HALF_PX)):
-        weight = scratch[place + index(WEIGHT) + k]
-        if weight != zero:
-            at, down, right = _corner(scratch, place, k, start, height, stride, advance)
+        if weight == zero:
+            continue
+        at, down, right = _corner(scratch, place, k, start, height, stride, advance)
+        if scatters:
             value = weight * scratch[index(EXPECTED) + k]
             lower = value * down
             upper = value - lower
@@ -318,3 +326,8 @@ def _scatter_scattered(samples, layout, scratch, place, first):
             samples[at + one] += upper * right
             samples[at + below] += lower - lower * right
             samples[at + below + one] += lower * right
+        else:
+            upper, lower = samples[at], samples[at + below]
+            upper += right * (samples[at + one] - upper)
+            lower += right * (samples[at + below + one] - lower)
+            scratch[index(EXPECTED) + k] += weight * (upper + down * (lower - upper))

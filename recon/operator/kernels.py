@@ -4,7 +4,8 @@
 
 A detector row is processed in blocks of `BLOCK_PX` pixels. The plane coordinates of a block's pixels are computed once
 and used in both directions, so H and Hᵀ share their weights by construction. Only `FORWARD` writes anything of the size
-views × pixels.
+views × pixels: what nearer planes leave of a plane's light is computed again for each block, from their opacities and
+with the weights of H.
 
 Rows of the detector are distributed in tiles, tile `t` to worker `t mod workers`, and each worker adds into an
 accumulator of its own: sums are deterministic for a given number of workers.
@@ -15,11 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.recon.likelihood.pixel_models import form_ratio_of_block
+from faintfield.recon.likelihood.pixel_models import LEAST_SQUARES, form_ratio_of_block
 from faintfield.recon.numba_tools import advanced, compiled, index, pointer, prefetch
-from faintfield.recon.operator.blocks import copy, gather, prefetch_block, scatter, weigh
+from faintfield.recon.operator.blocks import copy, gather, hide, prefetch_block, scatter, visit_plane, weigh
 from faintfield.recon.operator.placement import BLOCK_PX, COUNTED, EXPECTED, locate_on_all, unpack_relief, weights_of
-from faintfield.recon.operator.scene_blocks import form_precision, hide, multiply_by_row_sums, scatter_each
 
 # Detector rows of a tile; 4, 16 or 32 rows take as long.
 TILE_ROWS = 8
@@ -76,6 +76,24 @@ class SceneGeometry(NamedTuple):
 def size_of(geometry: SceneGeometry) -> int:
     """Return the number of samples of all planes."""
     return int((geometry.layout[:, 1] * geometry.layout[:, 2]).sum())
+
+
+class Hiding(NamedTuple):
+    """Occlusion by nearer planes, as the kernel reads it.
+
+    Attributes
+    ----------
+    opacities : array (sample,)
+        α of all planes; of size zero where nothing hides anything.
+    opaque : int array (row × 2,)
+        First and past-the-last column of each row, of all planes, that has some opacity.
+    depths : array (plane,)
+        Only planes that are farther are hidden.
+    """
+
+    opacities: NDArray[Any]
+    opaque: NDArray[np.intp]
+    depths: NDArray[np.float64]
 
 
 class PixelModel(NamedTuple):
@@ -186,13 +204,46 @@ def sweep(
                         )  # fmt: skip
                     elif operation > NORMAL:
                         response = advanced(maps, layer + layer + index((lattice * rows + row) * padded + first))
-                        form_precision(model, count, advanced(variance_at, at), response, level, scratch)
+                        _form_precision(model, count, advanced(variance_at, at), response, level, scratch)
                     if operation == PRECISION:
-                        multiply_by_row_sums(count_of_planes, scratch, models)
+                        _multiply_by_row_sums(count_of_planes, scratch, models)
                     if operation == PRECISION_OF_EACH:
-                        scatter_each(added_at, layout, count_of_planes, scratch, blocks, models)
+                        _scatter_each(added_at, layout, count_of_planes, scratch, blocks, models)
                     elif operation != VALUE:
                         scatter(added_at, layout, count_of_planes, scratch, blocks)
                 if operation == REACH:
                     geometry.reach[view, row, 0], geometry.reach[view, row, 1] = met_from, met_to
     return value
+
+
+@compiled
+def _form_precision(model, count, known, response, level, scratch):
+    """Set `EXPECTED`, the light of some pixels, to their inverse variance."""
+    number = type(scratch[0])
+    one, level = number(1), number(level)
+    for k in range(count):
+        at = index(EXPECTED) + k
+        light = level * response[k] if model == LEAST_SQUARES else max(scratch[at], level)
+        scratch[at] = one / (light + known[k])
+
+
+@compiled
+def _multiply_by_row_sums(planes, scratch, sums):
+    """Multiply `EXPECTED` by the sum of a pixel's weights on all planes, H 1; `sums` is scratch."""
+    for k in range(index(BLOCK_PX)):
+        sums[k] = type(scratch[0])(0)
+    for plane in range(index(planes)):
+        for k in range(index(BLOCK_PX)):
+            sums[k] += scratch[weights_of(plane) + k]
+    for k in range(index(BLOCK_PX)):
+        scratch[index(EXPECTED) + k] *= sums[k]
+
+
+@compiled
+def _scatter_each(samples, layout, planes, scratch, blocks, precision):
+    """Add `EXPECTED` times a pixel's weight on a plane to that plane; `precision` is scratch."""
+    copy(scratch, index(EXPECTED), precision, index(0), index(BLOCK_PX))
+    for plane in range(index(planes)):
+        for k in range(index(BLOCK_PX)):
+            scratch[index(EXPECTED) + k] = scratch[weights_of(plane) + k] * precision[k]
+        visit_plane(True, samples, layout, plane, scratch, blocks)

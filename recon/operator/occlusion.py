@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import Image, blurred
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.scene_blocks import Hiding
+from faintfield.recon.operator.kernels import Hiding
 
 # Spacings of the blurs before the light is judged, of about two samples (noise is not opaque), and after.
 _BLUR_BEFORE, _BLUR_AFTER = (1, 2, 2), (1,)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.operator import kernels
+from faintfield.recon.operator.kernels import Hiding
 from faintfield.recon.operator.placement import make_workspace
-from faintfield.recon.operator.scene_blocks import Hiding
 from faintfield.recon.threads import run_in_threads
 
 

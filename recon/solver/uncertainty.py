@@ -276,7 +276,7 @@ def _coupling(operator: SceneOperator, index: int) -> Iterator[Image]:
         yield z * operator.planes_of(operator.adjoint_of_forward(samples))[index]
 
 
-def _three_sample_blur(image: Image, alternation: NDArray[np.floating]) -> Image:
+def _three_sample_blur(image: Image, alternation: Image) -> Image:
     """Return an image blurred by (t, 1, t)/(1 + 2t) along both axes; leaves `alternation` of alternating samples."""
     for axis, left in enumerate(alternation.tolist()):
         t = (1 - left) / (2 + 2 * left)

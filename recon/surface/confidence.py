@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
+from faintfield.recon.likelihood.images import Image
 from faintfield.recon.surface.edges import near_side, values_at
 
 # Relative error of a depth that still counts as right.
@@ -34,12 +35,7 @@ _MAX_CONFIDENCE = 0.95
 _POORLY_EXPLAINED, _MAX_IF_POORLY = 0.35, 0.85
 
 
-def confidence(
-    index: NDArray[np.floating],
-    costs: NDArray[np.floating],
-    inverse_depths: NDArray[np.floating],
-    explained: NDArray[np.floating],
-) -> NDArray[np.float32]:
+def confidence(index: Image, costs: Image, inverse_depths: Image, explained: Image) -> NDArray[np.float32]:
     """Return the probability (row, column) that depths are right within `RIGHT_WITHIN`.
 
     A logistic model of `features`, whose coefficients were fitted on rendered scenes of known depth.
@@ -60,12 +56,7 @@ def confidence(
     return np.asarray(np.minimum(1 / (1 + np.exp(-logit)), most), np.float32)
 
 
-def features(
-    index: NDArray[np.floating],
-    costs: NDArray[np.floating],
-    inverse_depths: NDArray[np.floating],
-    explained: NDArray[np.floating],
-) -> NDArray[np.float64]:
+def features(index: Image, costs: Image, inverse_depths: Image, explained: Image) -> NDArray[np.float64]:
     """Return what the probability depends on (feature, row, column); the first is one everywhere.
 
     In order: one; by how much alternatives cost more (logarithm); the distance to the next edge of something nearer;

@@ -31,7 +31,7 @@ _CONTRAST, _MIN_COST = 0.2, 0.05
 _STEPS, _STEP = 200, np.float32(0.35)
 
 
-def near_side(index: NDArray[np.floating], of_near: bool = True) -> NDArray[np.bool_]:
+def near_side(index: Image, of_near: bool = True) -> NDArray[np.bool_]:
     """Return the samples (row, column) at an edge that are on its nearer side, or on its farther one."""
     found = np.zeros(index.shape, bool)
     right, down = np.diff(index, axis=1), np.diff(index, axis=0)
@@ -72,7 +72,7 @@ def moved_edges(index: NDArray[np.float32], ratios: Image, light: Image) -> NDAr
     return np.where(free, np.where(share > 0.5, near, far), index)
 
 
-def values_at(volume: Image, index: NDArray[np.floating]) -> NDArray[np.float32]:
+def values_at(volume: Image, index: Image) -> NDArray[np.float32]:
     """Return a volume (row, column, depth) at fractional indices (row, column)."""
     below = np.clip(np.floor(index).astype(np.intp), 0, volume.shape[2] - 2)
     share = np.clip(index - below, 0, 1)

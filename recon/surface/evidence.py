@@ -122,7 +122,7 @@ class DepthEvidence:
 
         return self._of_all_depths(ratio, 1)[0]
 
-    def explained(self, index: NDArray[np.floating]) -> Explained:
+    def explained(self, index: Image) -> Explained:
         """Return the light of a surface, given as fractional index of the depths (row, column)."""
         q = np.interp(index, np.arange(len(self.inverse_depths)), self.inverse_depths)
         operator = self.views.surface_operator(q)

@@ -23,7 +23,7 @@ _WINDOW, _DETAIL = 6.0, 6.0
 _CHANCE = 100.0
 
 
-def lit_samples(views: PinholeViews, inverse_depth: NDArray[np.floating]) -> NDArray[np.bool_]:
+def lit_samples(views: PinholeViews, inverse_depth: Image) -> NDArray[np.bool_]:
     """Return the samples (row, column) of a surface whose light stands out of noise: black looks alike at any depth.
 
     Counts the mean, over a small window, of what all views show of the surface. The picture's level is its root mean
@@ -44,7 +44,7 @@ def lit_samples(views: PinholeViews, inverse_depth: NDArray[np.floating]) -> NDA
     return np.asarray((light > _MIN_SIGMAS * sigma) & (light > _MIN_LIGHT * level))
 
 
-def explained_share(evidence: DepthEvidence, index: NDArray[np.floating]) -> NDArray[np.float32]:
+def explained_share(evidence: DepthEvidence, index: Image) -> NDArray[np.float32]:
     """Return how much of the views' detail a surface explains, near each sample (row, column), between 0 and 1.
 
     In a window, let E be by how much the detail of the light raises the log-likelihood, as far as the two halves of
@@ -134,10 +134,7 @@ def squared_errors(evidence: DepthEvidence, expected: Image, views: NDArray[np.i
 
 
 def predicted(
-    evidence: DepthEvidence,
-    index: NDArray[np.floating],
-    views: NDArray[np.intp],
-    neighbours: Sequence[NDArray[np.intp]],
+    evidence: DepthEvidence, index: Image, views: NDArray[np.intp], neighbours: Sequence[NDArray[np.intp]]
 ) -> Prediction:
     """Return how well a surface predicts views that the evidence leaves out, and how well its rivals do.
 

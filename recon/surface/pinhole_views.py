@@ -80,7 +80,7 @@ class PinholeViews:
             self.grid.binned(bins),
         )
 
-    def surface_operator(self, inverse_depth: NDArray[np.floating]) -> SurfaceOperator:
+    def surface_operator(self, inverse_depth: Image) -> SurfaceOperator:
         """Return H of a surface with the given 1/depth (row, column)."""
         return SurfaceOperator(
             self.ray_from_surface, self.rays(), self.grid, inverse_depth, valid=self.light_e > UNKNOWN

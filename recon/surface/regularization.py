@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from faintfield.recon.likelihood.images import Image
 from faintfield.recon.numba_tools import compiled
 from faintfield.recon.threads import map_in_threads
 
@@ -34,13 +35,13 @@ class PiecewisePlane:
     _dual: NDArray[np.float32]
 
     @classmethod
-    def start(cls, values: NDArray[np.floating]) -> "PiecewisePlane":
+    def start(cls, values: Image) -> "PiecewisePlane":
         """Return a map to start from."""
         u = np.array(values, np.float32)
         slopes, dual = np.zeros((2, *u.shape), np.float32), np.zeros((5, *u.shape), np.float32)
         return cls(u, slopes, np.stack([u, *slopes]), dual)
 
-    def approach(self, target: NDArray[np.floating], weight: float, bend: tuple[float, float], steps: int) -> None:
+    def approach(self, target: Image, weight: float, bend: tuple[float, float], steps: int) -> None:
         """Make steps towards the minimum.
 
         Parameters
