@@ -35,6 +35,9 @@ _MIN_COMPARED = 2 / 3
 # Smallest light, in standard deviations of its noise and relative to the picture's level: less may be stray light.
 _MIN_LIGHT_SIGMAS, _MIN_LIGHT = 4.0, 0.03
 
+# Statistics closer than this, relative to their size, are equal: sums of the same numbers in another order.
+_EQUAL = 1e-5
+
 
 class Agreement(NamedTuple):
     """Agreement of the views on each sample of a plane (row, column), their number, and the light.
@@ -178,10 +181,6 @@ def _lit(planes: list[Agreement], best: NDArray[np.intp]) -> NDArray[np.bool_]:
     )
     level = np.sqrt(np.mean(np.square(np.maximum(light, 0), dtype=np.float64)))
     return np.asarray((light > _MIN_LIGHT_SIGMAS * np.sqrt(variance)) & (light > _MIN_LIGHT * level))
-
-
-# Statistics closer than this, relative to their size, are equal: sums of the same numbers in another order.
-_EQUAL = 1e-5
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,9 @@ MIN_SAMPLES, _MIN_SHARE, _REACH = 12, 0.02, 1.5
 # Correlated samples of a product of two smoothed noises: 2π times the fine scale squared.
 _CORRELATED_SAMPLES = 2 * np.pi
 
+# Least coverage of each half, in views, of samples whose detail counts.
+_MIN_COVERAGE = 0.5
+
 
 class FocusMeasure(NamedTuple):
     """The power of detail at one depth, and its standard deviation due to noise, both in e⁻²."""
@@ -132,10 +135,6 @@ def _vertex(depth: Image, curve: Image, peak: int) -> float:
         return float(depth[peak])
     a, b, _ = np.polyfit(depth[peak - 1 : peak + 2] - depth[peak], curve[peak - 1 : peak + 2], 2)
     return float(depth[peak] - b / (2 * a)) if a < 0 else float(depth[peak])
-
-
-# Least coverage of each half, in views, of samples whose detail counts.
-_MIN_COVERAGE = 0.5
 
 
 class SeenByView(NamedTuple):

@@ -16,6 +16,12 @@ from faintfield.recon.threads import run_in_threads
 # Shape parameter of the Kaiser window that weights the samples of a patch.
 _KAISER_BETA = 2.0
 
+# Least variance of a coefficient, relative to that of a sample.
+_LEAST_VARIANCE = 0.01
+
+# A coefficient below so many standard deviations of its noise is taken for noise.
+_THRESHOLD = 2.7
+
 
 class Patches(NamedTuple):
     """Settings by which groups of similar patches are formed.
@@ -36,13 +42,6 @@ class Patches(NamedTuple):
     step: int = 5
     radius: int = 18
     members: int = 64
-
-
-# Least variance of a coefficient, relative to that of a sample.
-_LEAST_VARIANCE = 0.01
-
-# A coefficient below so many standard deviations of its noise is taken for noise.
-_THRESHOLD = 2.7
 
 
 def collaborative_wiener(

@@ -17,6 +17,13 @@ _WIDE_BLUR, _NARROW_BLUR = (1, 2, 4, 8, 12), (1, 1)
 # Where the variance is smaller, there is none.
 _TINY = 1e-30
 
+# Largest excess of the squares of residuals over their variance in detail, and largest of detail over smooth parts: a
+# calibration of the noise may be off by a percent everywhere. Chosen on `CHOSEN_ON` in benchmarks/uncertainty.py.
+_MAX_EXCESS, _MAX_BEYOND_SMOOTH = 0.006, 0.012
+
+# Standard errors that are added to both.
+_SIGMAS = 2.0
+
 
 class Noise(NamedTuple):
     """Covariance of the noise of a picture, `Cov(p, p + d) = variance[p] · kernel[1 + d]`, zero for distant samples.
@@ -185,14 +192,6 @@ def _products_of_neighbours(picture: Image) -> NDArray[np.float64]:
     for i, j in product(range(3), range(3)):
         sums[i, j] = np.einsum("ij,ij", inner, picture[i : rows - 2 + i, j : columns - 2 + j], dtype=np.float64)
     return (sums + sums[::-1, ::-1]) / 2
-
-
-# Largest excess of the squares of residuals over their variance in detail, and largest of detail over smooth parts: a
-# calibration of the noise may be off by a percent everywhere. Chosen on `CHOSEN_ON` in benchmarks/uncertainty.py.
-_MAX_EXCESS, _MAX_BEYOND_SMOOTH = 0.006, 0.012
-
-# Standard errors that are added to both.
-_SIGMAS = 2.0
 
 
 class Misfit(NamedTuple):

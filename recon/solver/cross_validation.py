@@ -33,6 +33,13 @@ _CANDIDATE_RATIO, _MAX_STEPS = 2**0.5, 8
 # Accuracy of candidates and limit on their passes: only the differences between them matter.
 _TOLERANCE, _MAX_PASSES = 0.02, 4
 
+# Side of a window in samples: what lies beyond its edges is unknown to it, so that it should not be small.
+SIDE = 256
+
+# The windows have this share of the plane's samples together, and at least so many: the darkest scenes, of SNR 0.05,
+# need that many to tell weights that are a quarter apart. A plane less than twice that large stands for itself.
+_SHARE, _MIN_SAMPLES = 1 / 16, 2**20
+
 
 @dataclass(frozen=True)
 class CrossValidatedWeight:
@@ -205,14 +212,6 @@ def _lowest_offset(losses: Sequence[float | None]) -> float:
     if before is None or here is None or after is None or not before + after > 2 * here:
         return 0.0
     return float(np.clip(0.5 * (before - after) / (before - 2 * here + after), -0.5, 0.5))
-
-
-# Side of a window in samples: what lies beyond its edges is unknown to it, so that it should not be small.
-SIDE = 256
-
-# The windows have this share of the plane's samples together, and at least so many: the darkest scenes, of SNR 0.05,
-# need that many to tell weights that are a quarter apart. A plane less than twice that large stands for itself.
-_SHARE, _MIN_SAMPLES = 1 / 16, 2**20
 
 
 def windows_of(problem: SceneProblem, min_views: int) -> list[SceneProblem]:

@@ -7,32 +7,21 @@ from scipy.ndimage import distance_transform_edt
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.surface.edges import near_side, values_at
 
-# Relative error of a depth that still counts as right.
-RIGHT_WITHIN = 0.02
+# Relative error of a depth that still counts as right; probability above which it is sure, below which it is unknown.
+RIGHT_WITHIN, SURE, UNKNOWN_BELOW = 0.02, 0.9, 0.03
 
-# Probability above which a depth is called sure, and below which none is stated.
-SURE, UNKNOWN_BELOW = 0.9, 0.03
+# Samples from an edge, and from the border of the picture, beyond which these do not matter.
+_FAR_FROM_EDGE, _FAR_FROM_BORDER = 12.0, 10.0
 
-# Samples from an edge beyond which it does not matter.
-_FAR_FROM_EDGE = 12.0
-
-# Samples from the border of the picture beyond which it does not matter.
-_FAR_FROM_BORDER = 10.0
-
-# Share of the detail from which a surface explains the views well enough.
-_EXPLAINED = 0.5
-
-# Alternatives to a depth lie at least this many steps away from it.
-_APART_STEPS = 3.0
+# Share of the detail from which a surface explains the views well enough; least steps to alternatives to a depth.
+_EXPLAINED, _APART_STEPS = 0.5, 3.0
 
 # Coefficients of the logistic model, in the order of `features`: fitted by `python -m benchmarks.surface_confidence`.
 COEFFICIENTS = (-3.773, 1.015, 1.953, 0.814, 1.967)
 
-# No probability is stated above this: scenes contain what no model has.
-_MAX_CONFIDENCE = 0.95
-
-# Where a surface explains less of the detail than this, nor above this: other surfaces may explain as much.
-_POORLY_EXPLAINED, _MAX_IF_POORLY = 0.35, 0.85
+# Largest probability, as scenes contain what no model has, and where a surface explains less than this share of the
+# detail: other surfaces may explain as much.
+_MAX_CONFIDENCE, _POORLY_EXPLAINED, _MAX_IF_POORLY = 0.95, 0.35, 0.85
 
 
 def confidence(index: Image, costs: Image, inverse_depths: Image, explained: Image) -> NDArray[np.float32]:
@@ -42,14 +31,12 @@ def confidence(index: Image, costs: Image, inverse_depths: Image, explained: Ima
 
     Parameters
     ----------
-    index : float array (row, column)
-        The depths, as fractional index.
+    index, inverse_depths : float array (row, column), float array (depth,)
+        The depths, as fractional index of 1/depth.
     costs : float array (row, column, depth)
         Costs by paths, see `sum_over_paths`.
-    inverse_depths : float array (depth,)
-        1/depth.
     explained : float array (row, column)
-        How much of the views' detail the surface explains, see `explained_share`.
+        Share of the views' detail that the surface explains, see `explained_share`.
     """
     logit = np.tensordot(np.asarray(COEFFICIENTS), features(index, costs, inverse_depths, explained), 1)
     most = np.where(explained < _POORLY_EXPLAINED, _MAX_IF_POORLY, _MAX_CONFIDENCE)
@@ -57,10 +44,10 @@ def confidence(index: Image, costs: Image, inverse_depths: Image, explained: Ima
 
 
 def features(index: Image, costs: Image, inverse_depths: Image, explained: Image) -> NDArray[np.float64]:
-    """Return what the probability depends on (feature, row, column); the first is one everywhere.
+    """Return the features of a depth (feature, row, column), given the parameters of `confidence`.
 
-    In order: one; by how much alternatives cost more (logarithm); the distance to the next edge of something nearer;
-    the distance to the border of the picture; how much of the detail is explained (logarithm), if it is little.
+    In order: one; the extra cost of alternatives (logarithm); the distance to the next edge of something nearer, and to
+    the border of the picture; the share of the detail that is explained (logarithm), if it is little.
     """
     q = np.interp(index, np.arange(len(inverse_depths)), inverse_depths)
     tolerance = RIGHT_WITHIN * q / (inverse_depths[1] - inverse_depths[0])
@@ -73,12 +60,5 @@ def features(index: Image, costs: Image, inverse_depths: Image, explained: Image
     edge = np.minimum(distance_transform_edt(~near), _FAR_FROM_EDGE) if near.any() else np.full(q.shape, _FAR_FROM_EDGE)
     rows, columns = (np.minimum(np.arange(size), np.arange(size)[::-1]) for size in index.shape)
     border = np.minimum(np.minimum(rows[:, np.newaxis], columns), _FAR_FROM_BORDER)
-    return np.stack(
-        [
-            np.ones_like(q),
-            np.log1p(np.maximum(margin, 0)),
-            edge / _FAR_FROM_EDGE,
-            border / _FAR_FROM_BORDER,
-            np.log(np.minimum(explained / _EXPLAINED, 1)),
-        ]
-    )
+    dearer, poorly = np.log1p(np.maximum(margin, 0)), np.log(np.minimum(explained / _EXPLAINED, 1))
+    return np.stack([np.ones_like(q), dearer, edge / _FAR_FROM_EDGE, border / _FAR_FROM_BORDER, poorly])

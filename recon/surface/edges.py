@@ -49,12 +49,10 @@ def moved_edges(index: NDArray[np.float32], ratios: Image, light: Image) -> NDAr
 
     Parameters
     ----------
-    index : float array (row, column)
-        Depths as fractional index, larger for nearer ones.
+    index, light : float array (row, column)
+        Depths as fractional index, larger for nearer ones; the picture.
     ratios : float array (row, column, depth)
         Log-likelihood ratios of the depths.
-    light : float array (row, column)
-        The picture.
     """
     near_edge, far_edge = near_side(index), near_side(index, of_near=False)
     if not near_edge.any():

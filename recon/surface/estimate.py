@@ -24,20 +24,16 @@ from faintfield.recon.surface.goodness import (
 from faintfield.recon.surface.pinhole_views import PinholeViews, gaussian
 from faintfield.recon.surface.regularization import PiecewisePlane, lowest, sum_over_paths
 
-# Rounds of depth and light without the views that judge them; the last is one more, with all views.
-_ROUNDS = 3
-
-# Fewest views of which some are left out to judge the rounds: both halves of the others must find depths.
-_MIN_JUDGED = 2 * MIN_VIEWS
-
-# The depth of a small window is that of its neighbours with this probability of being another one.
-_OUTLIERS = 0.3
+# Rounds of depth and light without the views that judge them, before one more with all views; fewest views of which
+# some are left out to judge: both halves of the others must find depths.
+_ROUNDS, _MIN_JUDGED = 3, 2 * MIN_VIEWS
 
 # Scales of windows in samples: the small one, the one that its votes are gathered over, and that of the first round.
 _WINDOW, _GATHERED, _GATHERED_AT_FIRST = 1.5, 4.0, 6.0
 
-# Share of the evidence of a window that is independent: samples of a denoised picture are not.
-_INDEPENDENT = 0.3
+# Probability that a small window has another depth than its neighbours; share of its evidence that is independent, as
+# samples of a denoised picture are not.
+_OUTLIERS, _INDEPENDENT = 0.3, 0.3
 
 # Costs of paths: one step, any step; and those of the first round.
 _STEP_COSTS, _STEP_COSTS_AT_FIRST = (0.5, 4.0), (1.0, 10.0)
@@ -49,6 +45,21 @@ _STAGES = (100.0, 50.0, 25.0, 12.0, 6.0, 3.0)
 # The highest confidence at the ends of the range, as a better depth may lie beyond, and where there is no light.
 _DOUBTFUL = 0.5
 
+# Movement of the outermost view from one depth to the next, in samples; fewest and most depths.
+_SAMPLES_PER_STEP, _MIN_DEPTHS, _MAX_DEPTHS = 1.6, 64, 128
+
+# Bins in which a range is sought, on top of those of the views; searches, each in the range that the last found.
+_BINS, _SEARCHES = 2, 2
+
+# Samples that tell the range are right with this probability; there are at least so many.
+_LIKELY, _MIN_SAMPLES = 0.5, 64
+
+# Quantiles of their depths, and what is added on either side: a share of the range, and steps.
+_QUANTILES, _MARGIN, _MARGIN_STEPS = (0.003, 0.997), 0.05, 2.0
+
+# Search again if the range shrinks to less than this share of the last one.
+_SHRUNK_ENOUGH = 0.6
+
 
 @dataclass(frozen=True)
 class SurfaceEstimate:
@@ -56,14 +67,12 @@ class SurfaceEstimate:
 
     Attributes
     ----------
-    inverse_depth : float array (row, column)
-        1/depth.
-    confidence : float array (row, column)
-        Probability that the depth is right within 2 %.
+    inverse_depth, confidence : float array (row, column)
+        1/depth, and the probability that it is right within 2 %.
     rounds : int
         Rounds of depth and light that the result needed.
     prediction : Prediction, optional
-        How well views that were left out are predicted; None if there are too few views to leave some out.
+        Of views that were left out; None if there are too few views to leave some out.
     """
 
     inverse_depth: NDArray[np.float64]
@@ -81,12 +90,10 @@ def estimate_surface(
 
     Parameters
     ----------
-    views : PinholeViews
-        The views.
+    views, nodes : PinholeViews, int array (view, 2)
+        The views, and their rows and columns in the grid of nodes.
     inverse_depths : float array (depth,)
         The 1/depth to choose from, ascending in equal steps.
-    nodes : int array (view, 2)
-        Row and column of each view in the grid of nodes.
     """
     left_out = validation_views(len(nodes)) if len(nodes) >= _MIN_JUDGED else np.zeros(0, np.intp)
     kept = np.setdiff1d(np.arange(len(nodes)), left_out)
@@ -121,12 +128,11 @@ class _Judged(NamedTuple):
 
     @classmethod
     def of(cls, evidence: DepthEvidence, known: Explained, views: NDArray[np.intp]) -> "_Judged":
-        """Return how a surface predicts views."""
         expected = known.operator.forward(known.light(), views)
         return cls(squared_errors(evidence, expected, views), seen_of(evidence, known, views))
 
     def is_better_than(self, other: "_Judged") -> bool:
-        """Return whether the errors are smaller where both surfaces are seen; without any view, they are."""
+        """Return whether the errors are no larger where both surfaces are seen."""
         both = self.seen & other.seen
         return float(np.sum(self.squares[both] - other.squares[both], dtype=np.float64)) <= 0
 
@@ -137,10 +143,7 @@ def first_depths(evidence: DepthEvidence) -> NDArray[np.float32]:
 
 
 def halves(nodes: NDArray[np.intp], views: NDArray[np.intp] | None = None) -> Halves:
-    """Return two halves of the views (all by default) that look from all over: a checkerboard of their nodes.
-
-    Views whose nodes have nearly all one colour are divided in turn instead.
-    """
+    """Return two halves of the views, all by default: by a checkerboard of nodes, unless nearly all have one colour."""
     views = np.arange(len(nodes)) if views is None else views
     odd = nodes[views].sum(axis=1) % 2 == 1
     if not len(views) <= 4 * np.count_nonzero(odd) <= 3 * len(views):
@@ -159,8 +162,8 @@ def next_depths(evidence: DepthEvidence, known: Explained) -> tuple[NDArray[np.f
 def _votes(evidence: Image, scale: float) -> NDArray[np.float32]:
     """Return costs (row, column, depth): the votes of small windows for depths, gathered.
 
-    A vote is `−ln( ε/n + (1 − ε) P )`, with P the probability of each of n depths by the window's evidence: no window,
-    however bright its detail, outvotes its neighbours.
+    A vote is `−ln( ε/n + (1 − ε) P )`, with P the probability of each of n depths by the window's evidence: no window
+    outvotes its neighbours.
     """
     votes = gaussian(evidence, _WINDOW)
     votes *= np.float32(4 * np.pi * _WINDOW**2 * _INDEPENDENT)
@@ -206,22 +209,6 @@ def _search(evidence, values, stiffness, target):  # type: ignore[no-untyped-def
             target[i, j] = np.float32(at) + offset
 
 
-# Movement of the outermost view from one depth to the next, in samples; fewest and most depths.
-_SAMPLES_PER_STEP, _MIN_DEPTHS, _MAX_DEPTHS = 1.6, 64, 128
-
-# Bins in which a range is sought, on top of those of the views; searches, each in the range that the last found.
-_BINS, _SEARCHES = 2, 2
-
-# Samples that tell the range are right with this probability; there are at least so many.
-_LIKELY, _MIN_SAMPLES = 0.5, 64
-
-# Quantiles of their depths, and what is added on either side: a share of the range, and steps.
-_QUANTILES, _MARGIN, _MARGIN_STEPS = (0.003, 0.997), 0.05, 2.0
-
-# Search again if the range shrinks to less than this share of the last one.
-_SHRUNK_ENOUGH = 0.6
-
-
 def equal_steps(views: PinholeViews, far: float, near: float) -> NDArray[np.float64]:
     """Return the 1/depth (depth,) to compare, ascending from `far` to `near`."""
     moved = (near - far) * float(views.reach.max())
@@ -230,21 +217,12 @@ def equal_steps(views: PinholeViews, far: float, near: float) -> NDArray[np.floa
 
 
 def found_range(views: PinholeViews, nodes: NDArray[np.intp], far: float, near: float) -> tuple[float, float]:
-    """Return the range of 1/depth, far and near, in which the views show anything.
-
-    Parameters
-    ----------
-    views : PinholeViews
-        The views.
-    nodes : int array (view, 2)
-        Row and column of each view in the grid of nodes.
-    far, near : float
-        1/depth at the ends of the range to search.
+    """Return the range of 1/depth between far and near in which the views show anything (`nodes` as for a surface).
 
     Raises
     ------
     NothingInFocus
-        Nowhere do the views agree on anything.
+        The views agree on nothing.
     """
     coarse = views.binned(_BINS)
     limits = (far, near)
@@ -257,8 +235,7 @@ def found_range(views: PinholeViews, nodes: NDArray[np.intp], far: float, near: 
             raise NothingInFocus(f"the views tell the depth of {likely.mean():.1%} of the picture; give a range")
         first, last = np.quantile(index[likely], _QUANTILES)
         margin = _MARGIN * (last - first) + _MARGIN_STEPS
-        before = near - far
-        step = depths[1] - depths[0]
+        before, step = near - far, depths[1] - depths[0]
         far, near = depths[0] + step * (first - margin), depths[0] + step * (last + margin)
         far, near = max(far, limits[0]), min(near, limits[1])
         if near - far > _SHRUNK_ENOUGH * before:

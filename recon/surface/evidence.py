@@ -48,12 +48,8 @@ class Halves(NamedTuple):
 class Ratios(NamedTuple):
     """Log-likelihood ratios (row, column, depth) of each depth against a surface.
 
-    Attributes
-    ----------
-    own : float array (row, column, depth)
-        Of the light that the views show at each depth.
-    both : float array (row, column, depth)
-        The mean of these and of those of the surface's own light at each depth.
+    `own` are those of the light that the views show at each depth, and `both` the mean of these and of those of the
+    surface's light at each depth.
     """
 
     own: Image
@@ -62,16 +58,9 @@ class Ratios(NamedTuple):
 
 @dataclass(frozen=True)
 class Explained:
-    """A surface, and the light on it.
+    """A surface by its H and its relief, 1/depth at each pixel (view, row, column), 0 where it sees no sample.
 
-    Attributes
-    ----------
-    operator : SurfaceOperator
-        H of the surface.
-    relief : float32 array (view, row, column)
-        1/depth of what each pixel sees, 0 where it sees no sample.
-    lights : list of float array (row, column)
-        The light, as each half of the views shows it.
+    `lights` is the light (row, column) as each half of the views shows it.
     """
 
     operator: SurfaceOperator
@@ -84,34 +73,28 @@ class Explained:
 
 
 class DepthEvidence:
-    """The evidence for each depth of a sweep.
+    """The evidence for each depth of a sweep, 1/depth ascending in equal steps.
 
-    Parameters
-    ----------
-    views : PinholeViews
-        The views.
-    inverse_depths : float array (depth,)
-        1/depth, ascending in equal steps.
-    halves : Halves
-        The views that count, in two halves: depths are found in one by the light of the other.
+    The views that count are in two halves: depths are found in one by the light of the other.
     """
 
     def __init__(self, views: PinholeViews, inverse_depths: NDArray[np.float64], halves: Halves) -> None:
         self.views, self.inverse_depths, self.halves = views, inverse_depths, halves
         self._numbers = np.concatenate(halves)
         self._half = np.repeat(np.arange(2), [len(half) for half in halves])
-        self._subset = _of_views(views, self._numbers)
-        middle = self._sums(self._stack(), float(np.median(inverse_depths)), self._nothing(), self._anywhere())
+        light_e = np.ascontiguousarray(views.light_e[self._numbers])
+        self._subset = replace(views, light_e=light_e, ray_from_surface=views.ray_from_surface[self._numbers])
+        middle = self._sums(self._stack(), float(np.median(inverse_depths)), *self._unhidden())
         mean = blurred_mean(middle[0, 1] + middle[1, 1], middle[0, 0] + middle[1, 0], _MEAN_LIGHT)
         variance = np.maximum(mean, 0) + np.float32(views.variance_e2)
         self.variance = np.maximum(variance, np.float32(max(_LEAST_VARIANCE * float(variance.mean()), 1e-6)))
 
     def at_first(self) -> Image:
-        """Return the evidence (row, column, depth) before any surface is known: where both halves show alike detail."""
-        stack, nothing, anywhere = self._stack(), self._nothing(), self._anywhere()
+        """Return the evidence (row, column, depth) before any surface is known: both halves show alike detail there."""
+        stack, unhidden = self._stack(), self._unhidden()
 
         def ratio(inverse_depth: float) -> list[Image]:
-            sums = self._sums(stack, inverse_depth, nothing, anywhere)
+            sums = self._sums(stack, inverse_depth, *unhidden)
             lights = [self._denoised(sum_e, count, _OF_DEPTH) for count, sum_e in sums]
             total = np.zeros_like(self.variance)
             for (count, sum_e), other in zip(sums, reversed(lights), strict=True):
@@ -126,19 +109,11 @@ class DepthEvidence:
         """Return the light of a surface, given as fractional index of the depths (row, column)."""
         q = np.interp(index, np.arange(len(self.inverse_depths)), self.inverse_depths)
         operator = self.views.surface_operator(q)
-        light = self.views.light_e
-        samples = np.ones(self.variance.shape, np.float32)
-        relief = operator.inverse_depth_of_pixels()
+        samples, relief = np.ones(self.variance.shape, np.float32), operator.inverse_depth_of_pixels()
         for view, seen in enumerate(relief):  # one at a time: all together are as large as the images
             seen[operator.forward(samples, [view])[0] == 0] = 0
-        return Explained(
-            operator,
-            relief,
-            [
-                self._denoised(operator.adjoint(light, half), operator.sensitivity(half), _OF_SURFACE, workers=None)
-                for half in self.halves
-            ],
-        )
+        sums = [(operator.adjoint(self.views.light_e, half), operator.sensitivity(half)) for half in self.halves]
+        return Explained(operator, relief, [self._denoised(*of_half, _OF_SURFACE, workers=None) for of_half in sums])
 
     def against(self, known: Explained) -> Ratios:
         """Return the evidence for each depth against a surface and its light."""
@@ -150,9 +125,8 @@ class DepthEvidence:
             sums = self._sums(stack, inverse_depth, relief, tolerance)
             lights = [self._denoised(sum_e, count, _OF_DEPTH) for count, sum_e, _ in sums]
             own, matched = np.zeros_like(self.variance), np.zeros_like(self.variance)
-            for (count, sum_e, of_known), light, of_surface in zip(
-                sums, reversed(lights), reversed(details), strict=True
-            ):
+            others = zip(reversed(lights), reversed(details), strict=True)
+            for (count, sum_e, of_known), (light, of_surface) in zip(sums, others, strict=True):
                 own += sum_e * light - np.float32(0.5) * count * light**2 - of_known
                 matched += count * detail(sum_e / np.maximum(count, 0.5), count, _DETAIL) * of_surface
             return [own, np.float32(0.5) * (own + matched)]
@@ -160,7 +134,7 @@ class DepthEvidence:
         return Ratios(*self._of_all_depths(ratio, 2))
 
     def _explanation(self, known: Explained) -> Image:
-        """Return the part of each pixel's log-likelihood (view, row, column) that its light by the surface explains."""
+        """Return the log-likelihood of each pixel (view, row, column) that counts, by the light of the surface."""
         explained = []
         for half, light in zip(self.halves, reversed(known.lights), strict=True):
             expected = known.operator.forward(light, half)
@@ -175,17 +149,15 @@ class DepthEvidence:
         """Return pictures (view, row, column, number) of the views that count: their light, and further numbers."""
         return np.stack([self._subset.light_e, *further], axis=-1)
 
-    def _nothing(self) -> NDArray[np.float32]:
-        return np.zeros((len(self._numbers), *self.views.light_e.shape[1:]), np.float32)
-
-    def _anywhere(self) -> NDArray[np.float32]:
-        return np.full(len(self._numbers), np.inf, np.float32)
+    def _unhidden(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return a relief and tolerances by which nothing is hidden."""
+        return np.zeros_like(self._subset.light_e), np.full(len(self._numbers), np.inf, np.float32)
 
     def _sums(self, stack: Image, inverse_depth: float, relief: Image, tolerance: Image) -> Image:
         return gather(self._subset, stack, inverse_depth, relief, tolerance, self._half)
 
     def _of_all_depths(self, ratios: Callable[[float], list[Image]], count: int) -> list[Image]:
-        """Return what a function gives for each depth (row, column, depth), per unit of the noise's variance."""
+        """Return the results of a function of each depth (row, column, depth), per unit of the noise's variance."""
         volumes = [np.empty((*self.variance.shape, len(self.inverse_depths)), np.float32) for _ in range(count)]
         workers = int(numba.config.NUMBA_NUM_THREADS)
 
@@ -206,18 +178,6 @@ class DepthEvidence:
         dual = DualField.zero([light.shape], np.dtype(np.float32))
         dual = dual if workers is None else replace(dual, workers=workers)
         return dual.prox(light, metric, weight, Penalty(), lambda _: 0.0, _STEPS).plane
-
-
-def _of_views(views: PinholeViews, numbers: NDArray[np.intp]) -> PinholeViews:
-    """Return some of the views."""
-    return PinholeViews(
-        np.ascontiguousarray(views.light_e[numbers]),
-        views.variance_e2,
-        views.ray_from_surface[numbers],
-        views.focal_px,
-        views.centre_px,
-        views.grid,
-    )
 
 
 def blurred_mean(sum_e: Image, count: Image, scale: float) -> Image:

@@ -22,19 +22,20 @@ _WINDOW, _DETAIL = 6.0, 6.0
 # Log-likelihood that chance may add to both, in a window.
 _CHANCE = 100.0
 
+# Number of planes that stand for a surface, each a share of its samples.
+_PLANES = 4
+
+# Blurs of the mean of neighbours, in pixels: the best counts.
+_BLURS = (1.0, 2.0, 4.0)
+
+# Scale in pixels of the blur that tells the light of a pixel, for its variance.
+_LEVEL_SCALE = 8.0
+
 
 def lit_samples(views: PinholeViews, inverse_depth: Image) -> NDArray[np.bool_]:
     """Return the samples (row, column) of a surface whose light stands out of noise: black looks alike at any depth.
 
-    Counts the mean, over a small window, of what all views show of the surface. The picture's level is its root mean
-    square.
-
-    Parameters
-    ----------
-    views : PinholeViews
-        The views.
-    inverse_depth : float array (row, column)
-        1/depth of the surface.
+    The light is the mean of all views over a small window, and the picture's level its root mean square.
     """
     operator = views.surface_operator(inverse_depth)
     count = np.maximum(gaussian(operator.sensitivity(), _LIGHT_WINDOW), np.float32(1e-3))
@@ -49,16 +50,9 @@ def explained_share(evidence: DepthEvidence, index: Image) -> NDArray[np.float32
 
     In a window, let E be by how much the detail of the light raises the log-likelihood, as far as the two halves of
     the views agree on it, and X by how much the errors of one half, predicted by the light of the other, exceed those
-    of the noise. Returned is `(E + c) / (E + X + c)`, with c for what chance does to both. It is small where something
-    shines, is seen through or repeats itself, because no light of one surface then fits all views. It is near 1 where
-    little is seen at all.
-
-    Parameters
-    ----------
-    evidence : DepthEvidence
-        Of the views.
-    index : float array (row, column)
-        The surface, as fractional index of the depths.
+    of the noise. Returned is `(E + c) / (E + X + c)`, with c for chance in both. It is small where something shines, is
+    seen through or repeats itself, because no light of one surface then fits all views. It is near 1 where little is
+    seen at all. `index` (row, column) is the surface, as fractional index of the depths.
     """
     known = evidence.explained(index)
     views = np.sum([known.operator.sensitivity(half) for half in evidence.halves], axis=0)
@@ -73,32 +67,19 @@ def explained_share(evidence: DepthEvidence, index: Image) -> NDArray[np.float32
     return np.asarray((e + _CHANCE) / (e + x + _CHANCE), np.float32)
 
 
-# Number of planes that stand for a surface, each a share of its samples.
-_PLANES = 4
-
-# Blurs of the mean of neighbours, in pixels: the best counts.
-_BLURS = (1.0, 2.0, 4.0)
-
-# Scale in pixels of the blur that tells the light of a pixel, for its variance.
-_LEVEL_SCALE = 8.0
-
-
 @dataclass(frozen=True)
 class Prediction:
     """Goodness of the prediction of views that were left out.
 
     Attributes
     ----------
-    views : int array (view,)
-        The views.
-    pixels : int
-        Number of their pixels that were compared: those that see the surface and the planes.
-    surface, planes : float
-        Mean squared error over variance, by the surface, and by the same depths on a few planes; NaN without pixels.
-    standard_error : float
-        Of the difference between the two, as the errors of the pixels scatter.
+    views, pixels : int array (view,), int
+        The views, and the number of their pixels that were compared: those that see the surface and the planes.
+    surface, planes, standard_error : float
+        Mean squared error over variance, by the surface, and by the same depths on a few planes, NaN without pixels;
+        standard error of their difference.
     neighbours : float, optional
-        The same by the mean of the views next to each, blurred as suits it best; None without such views.
+        The same by the mean of the views next to each, under the best blur; None without such views.
     """
 
     views: NDArray[np.intp]
@@ -115,20 +96,18 @@ def seen_of(evidence: DepthEvidence, known: Explained, views: NDArray[np.intp]) 
 
 
 def squared_errors(evidence: DepthEvidence, expected: Image, views: NDArray[np.intp]) -> NDArray[np.float32]:
-    """Return the squared errors of pixels (view, row, column) over their variance, given what is expected of them.
+    """Return the squared errors of pixels (view, row, column) over their variance, given their expected light.
 
-    The variance is that of the pixels' own light, blurred: were it that of what is expected, whoever expects too much
-    would seem to err less.
+    The variance is that of the pixels' own light, blurred: were it that of the expected light, too much of this would
+    seem to err less.
     """
     light_e = evidence.views.light_e[views]
     known = light_e > UNKNOWN
-    level_e = np.stack(
-        [
-            blurred_mean(np.where(there, picture, 0), there.astype(np.float32), _LEVEL_SCALE)
-            for picture, there in zip(light_e, known, strict=True)
-        ]
-    )
-    variance = np.maximum(level_e, 0) + np.float32(evidence.views.variance_e2)
+    levels_e = [
+        blurred_mean(np.where(there, picture, 0), there.astype(np.float32), _LEVEL_SCALE)
+        for picture, there in zip(light_e, known, strict=True)
+    ]
+    variance = np.maximum(np.stack(levels_e), 0) + np.float32(evidence.views.variance_e2)
     errors = np.where(known, light_e - expected, 0)
     return np.asarray(np.square(errors) / np.maximum(variance, np.float32(1e-6)), np.float32)
 
@@ -140,14 +119,10 @@ def predicted(
 
     Parameters
     ----------
-    evidence : DepthEvidence
-        Of the other views.
-    index : float array (row, column)
-        The surface, as fractional index of the depths.
-    views : int array (view,)
-        The views that were left out.
-    neighbours : sequence of int array
-        For each of them, the views next to it that were not left out.
+    evidence, index : DepthEvidence, float array (row, column)
+        Of the other views; the surface, as fractional index of the depths.
+    views, neighbours : int array (view,), sequence of int array
+        The views that were left out, and for each the views next to it that were not.
     """
     limits = np.quantile(index, np.arange(1, _PLANES) / _PLANES)
     middles = np.quantile(index, (np.arange(_PLANES) + 0.5) / _PLANES)
@@ -159,36 +134,25 @@ def predicted(
     )
     pixels = int(seen.sum())
     scatter = float(np.std((by_planes - by_surface)[seen], dtype=np.float64)) if pixels else float("nan")
-    return Prediction(
-        views,
-        pixels,
-        _mean(by_surface, seen),
-        _mean(by_planes, seen),
-        scatter / max(pixels, 1) ** 0.5,
-        _by_neighbours(evidence, views, neighbours, seen),
-    )
+    standard_error, by_neighbours = scatter / max(pixels, 1) ** 0.5, _by_neighbours(evidence, views, neighbours, seen)
+    return Prediction(views, pixels, _mean(by_surface, seen), _mean(by_planes, seen), standard_error, by_neighbours)
 
 
 def _by_neighbours(
     evidence: DepthEvidence, views: NDArray[np.intp], neighbours: Sequence[NDArray[np.intp]], counted: NDArray[np.bool_]
 ) -> float | None:
-    """Return the deviance of views predicted by the mean of those beside them, under the best blur."""
+    """Return the mean error of views predicted by the mean of those next to them, under the best blur."""
     if not neighbours or min(map(len, neighbours)) == 0:
         return None
     light = evidence.views.light_e
     counts = [np.asarray((light[near] > UNKNOWN).sum(axis=0), np.float32) for near in neighbours]
     sums = [np.where(light[near] > UNKNOWN, light[near], 0).sum(axis=0, dtype=np.float32) for near in neighbours]
-    return min(
-        _mean(
-            squared_errors(
-                evidence, np.stack([blurred_mean(*of_view, blur) for of_view in zip(sums, counts, strict=True)]), views
-            ),
-            counted,
-        )
-        for blur in _BLURS
-    )
+    errors = []
+    for blur in _BLURS:
+        expected = np.stack([blurred_mean(*of_view, blur) for of_view in zip(sums, counts, strict=True)])
+        errors.append(_mean(squared_errors(evidence, expected, views), counted))
+    return min(errors)
 
 
 def _mean(squares: NDArray[np.float32], counted: NDArray[np.bool_]) -> float:
-    """Return the mean of the errors of pixels that count, NaN of none."""
     return float(np.mean(squares[counted], dtype=np.float64)) if counted.any() else float("nan")

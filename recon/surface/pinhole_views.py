@@ -1,7 +1,7 @@
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
 """The views as ideal pinhole cameras see them, their sums over what each depth brings together, and a blur."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -13,11 +13,8 @@ from faintfield.recon.numba_tools import compiled, index, pointer
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.surface_operator import SurfaceOperator
 
-# Light of a pixel without a valid number.
-UNKNOWN = np.float32(-1e30)
-
-# A sum with any such light lies below this.
-_SURELY_UNKNOWN = np.float32(-1e20)
+# Light of a pixel without a valid number; a sum with any such light lies below the second.
+UNKNOWN, _SURELY_UNKNOWN = np.float32(-1e30), np.float32(-1e20)
 
 
 @dataclass(frozen=True)
@@ -35,7 +32,7 @@ class PinholeViews:
     focal_px, centre_px : (float, float)
         Of the pinhole camera, in pixels of these images, right and down.
     grid : PlaneGrid
-        The samples of the surface, at unit depth.
+        The samples of the surface at unit depth.
     """
 
     light_e: NDArray[np.float32]
@@ -46,7 +43,7 @@ class PinholeViews:
     grid: PlaneGrid
 
     def rays(self) -> NDArray[np.float32]:
-        """Return where pixels look (row, column, 2)."""
+        """Return the direction of each pixel (row, column, 2), x, y at unit depth."""
         rows, columns = np.indices(self.light_e.shape[1:], np.float32)
         (cx, cy), (fx, fy) = self.centre_px, self.focal_px
         return np.stack([(columns - np.float32(cx)) / np.float32(fx), (rows - np.float32(cy)) / np.float32(fy)], -1)
@@ -71,20 +68,19 @@ class PinholeViews:
         light = np.stack([binned(picture, bins) for picture in self.light_e]) * np.float32(bins**2)
         light[light < _SURELY_UNKNOWN] = UNKNOWN
         (fx, fy), (cx, cy) = self.focal_px, self.centre_px
-        return PinholeViews(
-            light,
-            self.variance_e2 * bins**2,
-            self.ray_from_surface,
-            (fx / bins, fy / bins),
-            ((cx + 0.5) / bins - 0.5, (cy + 0.5) / bins - 0.5),
-            self.grid.binned(bins),
+        return replace(
+            self,
+            light_e=light,
+            variance_e2=self.variance_e2 * bins**2,
+            focal_px=(fx / bins, fy / bins),
+            centre_px=((cx + 0.5) / bins - 0.5, (cy + 0.5) / bins - 0.5),
+            grid=self.grid.binned(bins),
         )
 
     def surface_operator(self, inverse_depth: Image) -> SurfaceOperator:
         """Return H of a surface with the given 1/depth (row, column)."""
-        return SurfaceOperator(
-            self.ray_from_surface, self.rays(), self.grid, inverse_depth, valid=self.light_e > UNKNOWN
-        )
+        valid = self.light_e > UNKNOWN
+        return SurfaceOperator(self.ray_from_surface, self.rays(), self.grid, inverse_depth, valid=valid)
 
 
 def gather(
@@ -101,16 +97,12 @@ def gather(
 
     Parameters
     ----------
-    views : PinholeViews
-        Where the views look.
     pictures : float32 array (view, row, column, number)
         The numbers to add up; the first is `UNKNOWN` where a pixel does not count.
     inverse_depth : float
         1/depth of all samples.
-    relief : float32 array (view, row, column)
-        1/depth of what each pixel sees.
-    tolerance : float32 array (view,)
-        By how much that may be larger than the samples' own.
+    relief, tolerance : float32 array (view, row, column), float32 array (view,)
+        1/depth of what each pixel sees, and its largest excess over that of the samples.
     half : int array (view,)
         The sum that each view belongs to, 0 or 1.
 
@@ -121,16 +113,8 @@ def gather(
     """
     sums = np.zeros((2, 1 + pictures.shape[3], *views.grid.shape), np.float32)
     x0, y0 = views.grid.origin_mm
-    _gather(
-        pictures,
-        relief,
-        tolerance,
-        half,
-        views.pixel_from_surface,
-        np.float32(inverse_depth),
-        (np.float32(x0), np.float32(y0), np.float32(views.grid.pitch_mm)),
-        sums,
-    )
+    lattice, q = (np.float32(x0), np.float32(y0), np.float32(views.grid.pitch_mm)), np.float32(inverse_depth)
+    _gather(pictures, relief, tolerance, half, views.pixel_from_surface, q, lattice, sums)
     return sums
 
 
@@ -162,35 +146,22 @@ def _gather(pictures, relief, tolerance, half, matrices, q, lattice, sums):
                 r, k = np.int32(row), np.int32(column)
                 upper = index(r) * row_step + index(k) * column_step
                 lower = upper + row_step
-                if (
-                    min(
-                        min(picture[upper], picture[upper + column_step]),
-                        min(picture[lower], picture[lower + column_step]),
-                    )
-                    == UNKNOWN
-                ):
+                least = min(picture[upper], picture[upper + column_step])
+                if min(least, min(picture[lower], picture[lower + column_step])) == UNKNOWN:
                     continue
                 down, right = row - np.float32(r), column - np.float32(k)
                 at = index(i) * width + index(j)
                 total[at] += one
                 for n in range(numbers):
-                    high = picture[upper + index(n)] + right * (
-                        picture[upper + column_step + index(n)] - picture[upper + index(n)]
-                    )
-                    low = picture[lower + index(n)] + right * (
-                        picture[lower + column_step + index(n)] - picture[lower + index(n)]
-                    )
+                    above, below = upper + index(n), lower + index(n)
+                    high = picture[above] + right * (picture[above + column_step] - picture[above])
+                    low = picture[below] + right * (picture[below + column_step] - picture[below])
                     total[at + index(n + 1) * size] += high + down * (low - high)
 
 
 def gaussian(image: Image, scale: float) -> NDArray[np.float32]:
-    """Return an image (row, column), or a volume (row, column, depth), blurred over rows and columns.
+    """Return an image (row, column), or a volume (row, column, up to 512 depths), blurred over rows and columns.
 
-    Parameters
-    ----------
-    image : float array
-        At most 512 depths.
-    scale : float
-        Standard deviation of the blur in samples. Edges are mirrored.
+    `scale` is the standard deviation of the blur in samples. Edges are mirrored.
     """
     return np.asarray(cv2.GaussianBlur(np.ascontiguousarray(image, np.float32), (0, 0), scale), np.float32)

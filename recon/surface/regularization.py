@@ -13,6 +13,8 @@ from faintfield.recon.threads import map_in_threads
 # Step of both primal and dual: the squared norm of the operator is at most 12.
 _STEP = np.float32(12**-0.5)
 
+_DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
+
 
 @dataclass
 class PiecewisePlane:
@@ -21,12 +23,7 @@ class PiecewisePlane:
     Minimised is `Σ ½ c (u − v)² + α₁ |∇u − w| + α₀ |ℰw|` over u and the slopes w, with ℰ the symmetrised derivative
     (Bredies, Kunisch and Pock 2010), by the primal-dual method (Chambolle and Pock 2011).
 
-    Attributes
-    ----------
-    values : float32 array (row, column)
-        u.
-    slopes : float32 array (2, row, column)
-        w, right and down.
+    `values` (row, column) are u, and `slopes` (2, row, column) w, right and down.
     """
 
     values: NDArray[np.float32]
@@ -42,17 +39,7 @@ class PiecewisePlane:
         return cls(u, slopes, np.stack([u, *slopes]), dual)
 
     def approach(self, target: Image, weight: float, bend: tuple[float, float], steps: int) -> None:
-        """Make steps towards the minimum.
-
-        Parameters
-        ----------
-        target : float array (row, column)
-            v.
-        weight : float
-            c.
-        bend : (float, float)
-            α₁ and α₀.
-        """
+        """Make steps towards the minimum, given v (row, column), c, and α₁ and α₀."""
         v = np.ascontiguousarray(target, np.float32)
         numbers = np.float32(weight), np.float32(bend[0]), np.float32(bend[1])
         for _ in range(steps):
@@ -115,21 +102,12 @@ def _descend(values, slopes, ahead, dual, target, weight):
             slopes[1, i, j] += _STEP * down
 
 
-_DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
-
-
 def sum_over_paths(costs: NDArray[np.float32], one_step: float, any_step: float) -> NDArray[np.float32]:
     """Return the costs (row, column, depth) of each depth, with those of the best depths on eight paths to a sample.
 
     Along a path, `L(p, z) = c(p, z) + min(L(q, z), L(q, z ± 1) + P₁, min L(q) + P₂) − min L(q)`, with q the sample
-    before p (Hirschmüller 2008). The constant keeps numbers small.
-
-    Parameters
-    ----------
-    costs : float array (row, column, depth)
-        Negative log-likelihood of each depth.
-    one_step, any_step : float
-        P₁ and P₂: costs of a change of depth between neighbours by one, and by any number.
+    before p (Hirschmüller 2008). The costs c are negative log-likelihoods; `one_step` P₁ and `any_step` P₂ those of a
+    change of depth between neighbours by one, and by any number.
     """
     penalties = np.float32(one_step), np.float32(any_step)
 
