@@ -28,12 +28,9 @@ class Patches(NamedTuple):
 
     Attributes
     ----------
-    size : int
-        Samples of a patch along each side, a multiple of four.
-    step : int
-        Samples from one reference patch to the next.
-    radius : int
-        How far from its reference a patch may lie, along rows and columns.
+    size, step, radius : int
+        Samples of a patch along each side, a multiple of four; from one reference patch to the next; and from a
+        reference to the farthest patch of its group, along rows and columns.
     members : int
         Largest number of patches in a group.
     """
@@ -62,13 +59,11 @@ def collaborative_wiener(
 
     Parameters
     ----------
-    picture, pilot : float array (row, column)
-        y, and a picture of the same scene without noise, as blurred as y.
-    noise : Noise
-        Covariance of the noise of y. Patches with a sample of infinite variance join no group: samples that are in no
-        other patch keep the pilot's value.
+    picture, pilot, noise : float array (row, column), float array (row, column), Noise
+        y, a picture of the same scene without noise, as blurred as y, and the covariance of y. Patches with a sample of
+        infinite variance join no group: samples that are in no other patch keep the pilot's value.
     patches : Patches, optional
-        How groups are formed.
+        Settings of the groups.
     guide : float array (row, column), optional
         A picture of the same scene in which alike patches are found; the pilot by default.
     workers : int, optional
@@ -111,7 +106,6 @@ def _filtered(
     *,
     also_thresholded: bool,
 ) -> list[NDArray[np.float32]]:
-    """Return the picture (row, column) as each filter leaves it."""
     guide = pilot if guide is None else guide
     picture, pilot, guide, variance = (
         np.ascontiguousarray(array, np.float32) for array in (picture, pilot, guide, noise.variance)
@@ -142,7 +136,6 @@ def _filtered(
 
 
 def _check(picture: Image, pilot: Image, guide: Image, variance: Image, patches: Patches) -> None:
-    """Refuse shapes that differ or are too small for a patch, and sizes that are not multiples of four (ValueError)."""
     shapes = [array.shape for array in (picture, pilot, guide, variance)]
     if len(set(shapes)) > 1:
         raise ValueError(f"picture, pilot, guide and variance have shapes {shapes}; give all the same")
@@ -153,7 +146,7 @@ def _check(picture: Image, pilot: Image, guide: Image, variance: Image, patches:
 
 
 def _corners(length: int, patches: Patches) -> NDArray[np.intp]:
-    """Return the first samples of the reference patches along one axis, the last of which ends at the edge."""
+    """Return the first samples of the reference patches along one axis; the last patch ends at the edge."""
     last = length - patches.size
     return np.unique(np.append(np.arange(0, last, patches.step), last))
 
@@ -184,11 +177,10 @@ _SMALL = Patches(size=4, step=3, radius=8, members=32)
 def patch_candidates(evidence: Evidence) -> dict[str, Image]:
     """Return pictures (row, column) of a plane by name, all as blurred as the evidence, in electrons.
 
-    "tv" is the pilot, the plane that the penalty gave; "wiener" the collaborative Wiener filter with this pilot;
-    "twice" the filter again, its pilot the mean of the first result and of the groups that keep what stands out of the
-    noise, which shows what the penalty lost; "fine" the same with small patches, whose pilot is "twice" and the small
-    groups that keep. A plane smaller than a patch has its pilot only. Patches are alike if they are so in the sum of
-    the pilot and of what other colours show.
+    "tv" is the pilot, the plane of the penalty; "wiener" the collaborative Wiener filter with this pilot; "twice" the
+    filter again, its pilot the mean of the first result and of the thresholded picture, which shows what the penalty
+    lost; "fine" the same with small patches, from "twice" and their thresholded picture. A plane smaller than a patch
+    has its pilot only. Alike patches are found in the sum of the pilot and of the light in other colours.
     """
     picture, pilot, noise, _, other_colours = evidence
 
@@ -208,18 +200,9 @@ def patch_candidates(evidence: Evidence) -> dict[str, Image]:
 
 
 def refined(operator: SceneOperator, images: ElementalImages, plane: Image) -> Image:
-    """Return a picture with the detail that its penalty removed: `( f + w − u )₊`.
+    """Return a picture with the detail that its penalty removed: `( f + w − u )₊`, with f ≥ 0 (row, column).
 
-    u is the back-projection of H f, as blurred as that of the data, y; and w is y filtered with u as its pilot.
-
-    Parameters
-    ----------
-    operator : SceneOperator
-        H of one plane or surface.
-    images : ElementalImages
-        The data.
-    plane : float array (row, column)
-        f ≥ 0, in electrons.
+    u is the back-projection of H f, of one plane or surface, and w that of the data, y, filtered with u as its pilot.
     """
     (evidence,) = evidence_of_planes(operator, images, plane)
     w = collaborative_wiener(evidence.picture, evidence.pilot, evidence.noise)

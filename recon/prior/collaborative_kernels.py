@@ -20,16 +20,9 @@ _LEAST_LEFT = 1e-3
 
 
 class Transform(NamedTuple):
-    """The transform of a patch, and what depends on it.
+    """Orthonormal cosines (k, i) and (i, k), variances (k, l) of the coefficients of noise, and weights of the samples.
 
-    Attributes
-    ----------
-    cosines, transposed : float32 array (k, i), array (i, k)
-        Orthonormal cosines.
-    variances : float32 array (k, l)
-        Variance of each coefficient of a patch of noise of variance one.
-    window : float32 array (row, column)
-        Weights of the samples of a patch.
+    The noise is a patch of variance one; the window (row, column) are the weights of the samples of a patch.
     """
 
     cosines: NDArray[np.float32]
@@ -75,7 +68,7 @@ def filter_rows(picture, pilot, guide, variance, rows, columns, search, transfor
 
 @compiled
 def _outwards(step):
-    """Return 0, 1, −1, 2, −2 … for 0, 1, 2, 3, 4 …: nearer patches are alike more often, and found first."""
+    """Return 0, 1, −1, 2, −2 … for 0, 1, 2, 3, 4 …: nearer patches are more often alike, and found first."""
     return (step + 1) // 2 if step % 2 else -(step // 2)
 
 
@@ -148,7 +141,7 @@ def _filter_group(picture, pilot, variance, places, threshold, transform, patche
     _read(pilot, places, size, u)
     for group in (y, u):
         _cosine_transform(group, scratch, transform.cosines, count)
-        _haar(group, size * size, count)
+        _haar(group, size * size, count, False)
     if above.shape[0] > 1:
         kept, length = patches[3], size * size * count
         kept[:length] = y[:length]
@@ -197,7 +190,7 @@ def _keep_large(y, level, threshold, transform, count):
 def _add_inverse(group, scratch, places, transform, level, left, above, below):
     """Transform a group back, and add its patches with the weight that their variance gives them."""
     size, count = transform.window.shape[0], places.shape[0]
-    _inverse_haar(group, size * size, count)
+    _haar(group, size * size, count, True)
     _cosine_transform(group, scratch, transform.transposed, count)
     weight = np.float32(1) / (left / np.float32(count * size * size) + np.float32(_LEAST_LEFT) * level)
     _add(group, places, size, transform.window, weight, above, below)
@@ -272,28 +265,14 @@ def _multiply(matrix, source, target, length, read_from, write_to):
 
 
 @compiled
-def _haar(group, coefficients, count):
-    """Transform each coefficient's numbers along the members: the sums of halves are halved again."""
+def _haar(group, coefficients, count, back):
+    """Transform each coefficient along the members, or back: butterflies of halves, which invert themselves."""
     root = np.float32(np.sqrt(0.5))
     for k in range(index(coefficients)):
-        first, half = k * index(count), index(count) // index(2)
-        while half > index(0):
+        first, half = k * index(count), index(1) if back else index(count) // index(2)
+        while index(0) < half < index(count):
             for m in range(half):
                 a, b = group[first + m], group[first + half + m]
                 group[first + m] = root * (a + b)
                 group[first + half + m] = root * (a - b)
-            half //= index(2)
-
-
-@compiled
-def _inverse_haar(group, coefficients, count):
-    """Invert `_haar`, whose butterflies are their own inverses."""
-    root = np.float32(np.sqrt(0.5))
-    for k in range(index(coefficients)):
-        first, half = k * index(count), index(1)
-        while half < index(count):
-            for m in range(half):
-                a, b = group[first + m], group[first + half + m]
-                group[first + m] = root * (a + b)
-                group[first + half + m] = root * (a - b)
-            half *= index(2)
+            half = half * index(2) if back else half // index(2)

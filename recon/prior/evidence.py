@@ -45,16 +45,15 @@ class Evidence(NamedTuple):
 
     Attributes
     ----------
-    picture : float array (row, column)
-        y, in electrons: the back-projection of what the views show beside the light of other planes.
-    pilot : float array (row, column)
-        u, the plane as blurred as y, `H_zᵀ H_z f_z / H_zᵀ H_z 1`.
+    picture, pilot : float array (row, column)
+        y, the back-projection less the light of other planes, and u, the plane as blurred as y,
+        `H_zᵀ H_z f_z / H_zᵀ H_z 1`, in electrons.
     noise : Noise
         Covariance of y.
     coverage : float array (row, column)
-        `H_zᵀ H_z 1`; zero where no view sees the plane, and y and u are zero there.
+        `H_zᵀ H_z 1`; y and u are zero where it is.
     other_colours : float array (row, column), optional
-        What the plane shows in other colours, as blurred as y.
+        Light of the plane in other colours, as blurred as y.
     """
 
     picture: Image
@@ -74,16 +73,7 @@ def evidence_of_planes(
 ) -> list[Evidence]:
     """Return the evidence of each plane of a scene, `y_z = u_z + H_zᵀ(g − b − H f) / H_zᵀ H_z 1`.
 
-    Parameters
-    ----------
-    operator, images
-        H and the data.
-    samples : float array (samples)
-        f ≥ 0, in electrons.
-    views : sequence of int, optional
-        The views that count; all by default.
-    other_colours : float array (samples), optional
-        The planes in other colours.
+    `samples` is f ≥ 0 in electrons, `other_colours` (samples) the planes in other colours; all `views` count by default.
     """
     seen = operator.adjoint_of_forward(samples, views)
     residual = operator.adjoint(images.electrons, views) - seen
@@ -91,21 +81,17 @@ def evidence_of_planes(
         residual -= operator.adjoint_of_map(images.background_e, views)
     variance = seen + operator.adjoint_of_map(images.background_e + images.read_variance_e2, views)
     drawn = _drawn_noise(operator, images, samples, views, (0, 0))
-    found = []
     parts = (operator.planes_of(array) for array in (residual, variance, drawn))
     own = _alone(operator, samples, seen, views)
     coverages = _alone(operator, np.ones_like(samples), operator.coverage(views), views)
-    for of_pilot, coverage, of_residual, of_variance, of_draw in zip(own, coverages, *parts, strict=True):
-        pilot, change = (_divided(array, coverage) for array in (of_pilot, of_residual))
-        noise = _noise(coverage, of_variance, [of_draw])
-        found.append(Evidence(pilot + change, pilot, noise, coverage))
+    shown: list[Image | None] = [None] * len(coverages)
     if other_colours is not None:
-        shown = map(
-            _divided,
-            _alone(operator, other_colours, operator.adjoint_of_forward(other_colours, views), views),
-            coverages,
-        )
-        found = [one._replace(other_colours=light) for one, light in zip(found, shown, strict=True)]
+        projected = operator.adjoint_of_forward(other_colours, views)
+        shown = list(map(_divided, _alone(operator, other_colours, projected, views), coverages))
+    found = []
+    for of_pilot, coverage, light, of_residual, of_variance, of_draw in zip(own, coverages, shown, *parts, strict=True):
+        pilot, change = (_divided(array, coverage) for array in (of_pilot, of_residual))
+        found.append(Evidence(pilot + change, pilot, _noise(coverage, of_variance, [of_draw]), coverage, light))
     return found
 
 
@@ -122,7 +108,6 @@ def _alone(operator: SceneOperator, samples: Image, projected: Image, views: Vie
 
 
 def _divided(sums: Image, coverage: Image) -> Image:
-    """Return sums by coverage, zero where no view sees."""
     return np.divide(sums, coverage, out=np.zeros_like(sums), where=coverage > 0)
 
 
@@ -133,16 +118,7 @@ def noise_of_back_projection(
 
     A pixel of variance v adds h² v to the variance of a sum Hᵀ g, and the operator can only add h v. The ratio of the
     two sums changes slowly over the plane, so it is measured, like the kernel, on back-projected draws of the noise,
-    one view at a time.
-
-    Parameters
-    ----------
-    operator, images, plane
-        H of one plane or surface, the data, and f.
-    seed : int
-        Seed of the random generators, one per draw and view.
-    draws : int
-        Number of draws.
+    one view at a time. Each draw and view has a random generator of its own.
     """
     variance = operator.adjoint_of_map(images.background_e + images.read_variance_e2)
     variance += operator.adjoint_of_forward(np.maximum(plane, 0))
@@ -167,21 +143,15 @@ def _noise(coverage: Image, variance: Image, draws: list[Image]) -> Noise:
 def _drawn_noise(
     operator: SceneOperator, images: ElementalImages, samples: Image, views: ViewSelection, seed: tuple[int, int]
 ) -> Image:
-    """Return Hᵀ n (samples) of one draw of the noise n of the data, view by view."""
+    """Return Hᵀ n (samples) of one draw of the noise n of the data: its deviation with random signs, fast to draw."""
     light, total = np.maximum(samples, 0), np.zeros_like(samples)
     for view in (operator.all_views if views is None else np.asarray(views)).tolist():
         known = operator.map_of_views(images.background_e + images.read_variance_e2, np.array([view]))
         deviation = np.sqrt(operator.forward(light, [view]) + known)[0]
-        total += operator.adjoint_of_view(_with_random_signs(deviation, [*seed, view]), view)
+        random_bytes = np.random.default_rng([*seed, view]).bytes(-(-deviation.size // 8))
+        negative = np.unpackbits(np.frombuffer(random_bytes, np.uint8), count=deviation.size).reshape(deviation.shape)
+        total += operator.adjoint_of_view(np.where(negative, -deviation, deviation), view)
     return total
-
-
-def _with_random_signs(image: Image, seed: Sequence[int]) -> Image:
-    """Return an image (row, column) whose values change sign at random: noise of this deviation, fast to draw."""
-    generator = np.random.default_rng(seed)
-    bits = np.frombuffer(generator.bytes(-(-image.size // 8)), np.uint8)
-    negative = np.unpackbits(bits, count=image.size).reshape(image.shape)
-    return np.where(negative, -image, image)
 
 
 def _products_of_neighbours(picture: Image) -> NDArray[np.float64]:
@@ -195,14 +165,9 @@ def _products_of_neighbours(picture: Image) -> NDArray[np.float64]:
 
 
 class Misfit(NamedTuple):
-    """Squares of a plane's residuals over their variance.
+    """Means of a plane's squared residuals over their variance, and the standard error of their difference.
 
-    Attributes
-    ----------
-    detail, smooth : float
-        Their mean where the plane has detail, and where it has light but none; one for the right model.
-    se : float
-        Standard error of their difference by chance.
+    `detail` is that where the plane has detail, and `smooth` where it has light but none: one for the right model.
     """
 
     detail: float
@@ -211,7 +176,7 @@ class Misfit(NamedTuple):
 
     @property
     def contradicts(self) -> bool:
-        """Return whether the residuals in detail are larger than noise makes them, and larger than elsewhere."""
+        """True if the residuals in detail are larger than noise makes them, and larger than elsewhere."""
         chance = _SIGMAS * self.se
         return self.detail - 1 > _MAX_EXCESS + chance and self.detail - self.smooth > _MAX_BEYOND_SMOOTH + chance
 
@@ -219,16 +184,9 @@ class Misfit(NamedTuple):
 def misfits(
     operator: SceneOperator, images: ElementalImages, samples: Image, regions: Sequence[dict[str, Image]]
 ) -> list[Misfit]:
-    """Return how the views contradict each plane, in one pass over the data.
+    """Return the misfit of each plane of f ≥ 0 (samples, in electrons), in one pass over the data.
 
-    Parameters
-    ----------
-    operator, images
-        H and the data.
-    samples : float array (samples)
-        f ≥ 0, in electrons.
-    regions : sequence of dict of str to float array (row, column)
-        Shares of the samples of each plane in "light, detail" and "light, smooth".
+    `regions` are shares (row, column) of the samples of each plane in "light, detail" and "light, smooth".
     """
     squares, variances, spreads = (np.zeros_like(samples) for _ in range(3))
     for view in operator.seeing_views.tolist():
@@ -246,7 +204,7 @@ def misfits(
 
 
 def _misfit(squares: Image, variances: Image, spreads: Image, regions: dict[str, Image]) -> Misfit:
-    """Return the misfit of one plane from back-projected squares, variances, and variances of squares of its views."""
+    """Return the misfit of one plane from back-projected squares, variances, and variances of squares."""
 
     def ratio(share: Image) -> tuple[float, float]:
         total, expected, spread = (
