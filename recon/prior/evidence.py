@@ -73,7 +73,7 @@ def evidence_of_planes(
 ) -> list[Evidence]:
     """Return the evidence of each plane of a scene, `y_z = u_z + H_zᵀ(g − b − H f) / H_zᵀ H_z 1`.
 
-    `samples` is f ≥ 0 in electrons, `other_colours` (samples) the planes in other colours; all `views` count by default.
+    `samples` is f ≥ 0 in electrons, and `other_colours` (samples) the planes in other colours. All `views` by default.
     """
     seen = operator.adjoint_of_forward(samples, views)
     residual = operator.adjoint(images.electrons, views) - seen
