@@ -9,6 +9,7 @@ from msgspec import Struct
 
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.clock import Clock
+from faintfield.rig.devices import Rig
 from faintfield.rig.errors import CaptureStopped
 from faintfield.rig.plan import PlannedFrame, StepKind
 from faintfield.rig.session.session import Session
@@ -207,21 +208,22 @@ MAX_UNATTENDED_TRIES = 3
 
 
 class Dialogue:
-    """The capture's side of the conversation with the operator, which the journal keeps.
+    """The capture's side of the conversation with the operator, which the journal of the session keeps.
 
-    `warnings` are the latest ones, shown with the status.
+    `pace` estimates the remaining time; `warnings` are the latest ones, shown with the status.
     """
 
-    def __init__(self, session: Session, operator: OperatorInterface, pace: Pace) -> None:
-        self._session = session
-        self._pace = pace
+    def __init__(self, session: Session, rig: Rig, operator: OperatorInterface) -> None:
+        self.session = session
+        self.rig = rig
+        self.pace = Pace(rig.stage, rig.clock, session.plan.settle_s, session.plan.readout_s)
         self.operator = operator
         self.warnings: tuple[str, ...] = ()
 
     def ask(self, prompt: Prompt) -> Answer:
         """Ask the operator, and record question and answer."""
         answer = self.operator.ask(prompt)
-        self._session.journal.event("prompt", key=prompt.key, title=prompt.title, lines=prompt.lines, answer=answer)
+        self.session.journal.event("prompt", key=prompt.key, title=prompt.title, lines=prompt.lines, answer=answer)
         return answer
 
     def ask_or_stop(self, prompt: Prompt) -> Answer:
@@ -233,18 +235,18 @@ class Dialogue:
 
     def warn(self, text: str) -> None:
         """Record a warning, and show it from now on."""
-        self._session.journal.event("warning", message=text)
+        self.session.journal.event("warning", message=text)
         self.warnings = (text,)
 
     def stop(self) -> NoReturn:
         """Raise `CaptureStopped` on behalf of the operator."""
-        self._session.journal.event("stopped")
-        done, total = len(self._session.valid()), len(self._session.frames)
+        self.session.journal.event("stopped")
+        done, total = len(self.session.valid()), len(self.session.frames)
         raise CaptureStopped(f"stopped with {done} of {total} frames taken; run the same command to go on")
 
     def show_status(self, frame: PlannedFrame, doing: str) -> None:
         """Show the state of the capture, which is `doing` something for `frame`."""
-        session = self._session
+        session = self.session
         missing, steps = session.missing(), session.plan.steps
         to_check = {frame.step for frame in missing if steps[frame.step].at == "grid"}
         status = Status(
@@ -254,7 +256,7 @@ class Dialogue:
             title=_step_title(frame, len(steps)),
             done=len(session.valid()),
             total=len(session.frames),
-            to_go_s=self._pace.remaining_s(missing, len(to_check) if session.frozen.rig.drift.check else 0),
+            to_go_s=self.pace.remaining_s(missing, len(to_check) if session.frozen.rig.drift.check else 0),
             node=frame.stop.node,
             grid=self._shares_done(frame.step),
             warnings=self.warnings,
@@ -263,9 +265,9 @@ class Dialogue:
 
     def _shares_done(self, step: int) -> tuple[tuple[float, ...], ...]:
         """Return the share of a step's frames that is done, per row and column; −1 where the step has none."""
-        grid, valid = self._session.frozen.rig.grid, self._session.valid()
+        grid, valid = self.session.frozen.rig.grid, self.session.valid()
         done: defaultdict[tuple[int, int], list[bool]] = defaultdict(list)
-        for frame in self._session.frames:
+        for frame in self.session.frames:
             if frame.step == step:
                 done[frame.stop.node].append(frame.number in valid)
         nodes = [[done.get((row, column)) for column in range(grid.columns)] for row in range(grid.rows)]

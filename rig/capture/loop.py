@@ -3,15 +3,7 @@
 import msgspec
 
 from faintfield.rig.cameras.protocol import Decode
-from faintfield.rig.capture.guide import (
-    MAX_UNATTENDED_TRIES,
-    Answer,
-    Dialogue,
-    OperatorInterface,
-    Pace,
-    Prompt,
-    step_prompt,
-)
+from faintfield.rig.capture.guide import MAX_UNATTENDED_TRIES, Answer, Dialogue, OperatorInterface, Prompt, step_prompt
 from faintfield.rig.capture.survey import check_plan
 from faintfield.rig.capture.take import DriftChecks, FrameTaker
 from faintfield.rig.devices import Rig
@@ -32,11 +24,9 @@ class Capture:
     def __init__(self, session: Session, rig: Rig, operator: OperatorInterface, decode: Decode) -> None:
         self._session = session
         self._rig = rig
-        self._operator = operator
-        self._pace = Pace(rig.stage, rig.clock, session.plan.settle_s, session.plan.readout_s)
-        self._dialogue = Dialogue(session, operator, self._pace)
-        self._drift = DriftChecks(session, rig, self._dialogue, self._pace)
-        self._taker = FrameTaker(session, rig, self._dialogue, self._drift, self._pace, decode)
+        self._dialogue = Dialogue(session, rig, operator)
+        self._drift = DriftChecks(self._dialogue)
+        self._taker = FrameTaker(self._dialogue, self._drift, decode)
         self._failures = self._untimed_checks = 0
         self._homings_in_journal = 0
         self._unrecovered: Exception | None = None
@@ -88,7 +78,7 @@ class Capture:
         session, first = self._session, missing[0]
         frames = [frame for frame in missing if frame.step == first.step]
         self._dialogue.show_status(first, "waiting for your answer")
-        duration_s = self._pace.remaining_s(frames, 0)
+        duration_s = self._dialogue.pace.remaining_s(frames, 0)
         prompt = step_prompt(first, len(session.plan.steps), len(frames), duration_s)
         answer = self._dialogue.ask_or_stop(prompt)
         if answer == "skip":
@@ -142,7 +132,7 @@ class Capture:
                 return
 
     def _handle_request(self, frame: PlannedFrame) -> None:
-        request = self._operator.take_request()
+        request = self._dialogue.operator.take_request()
         if request is None:
             return
         self._session.journal.event("wish", frame=frame.number, wish=request)
@@ -165,7 +155,7 @@ class Capture:
             failure = self._unrecovered
         device = "camera" if isinstance(failure, CameraError) else "stage"
         self._failures += 1
-        self._pace.here = None
+        self._dialogue.pace.here = None
         self._record_failure(f"{device}_failed", frame, failure)
         self._dialogue.warn(f"{frame.name}: {failure}")
         unattended: Answer = "again" if self._failures < MAX_UNATTENDED_TRIES else "stop"

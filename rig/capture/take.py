@@ -10,21 +10,12 @@ import msgspec
 
 from faintfield.rig.cameras.protocol import Decode, Exposure, Pixels
 from faintfield.rig.cameras.settings import CoolingSettings
-from faintfield.rig.capture.checks import (
-    LIT_KINDS,
-    Findings,
-    Settling,
-    board_warnings,
-    check_frame,
-    measure_settling,
-)
-from faintfield.rig.capture.guide import MAX_UNATTENDED_TRIES, Answer, Dialogue, Pace, Prompt
+from faintfield.rig.capture.checks import LIT_KINDS, Findings, Settling, board_warnings, check_frame, measure_settling
+from faintfield.rig.capture.guide import MAX_UNATTENDED_TRIES, Answer, Dialogue, Prompt
 from faintfield.rig.capture.survey import read_temperature
-from faintfield.rig.devices import Rig
 from faintfield.rig.errors import CameraError, CameraTimeout, DriftUnknown, PositionDrifted
 from faintfield.rig.plan import PlannedFrame
 from faintfield.rig.session.journal import CommittedFrame, FrameRecord
-from faintfield.rig.session.session import Session
 from faintfield.rig.stages.drift import DriftWatch
 
 
@@ -34,15 +25,13 @@ class DriftChecks:
     `nodes` counts those that the stage moved to since the last check.
     """
 
-    def __init__(self, session: Session, rig: Rig, dialogue: Dialogue, pace: Pace) -> None:
-        settings = session.frozen.rig.drift
-        self._session = session
-        self._rig = rig
+    def __init__(self, dialogue: Dialogue) -> None:
         self._dialogue = dialogue
-        self._pace = pace
+        self._session, self._rig, self._pace = dialogue.session, dialogue.rig, dialogue.pace
+        settings = self._session.frozen.rig.drift
         self.nodes = 0
         self._failures = 0
-        self.watch = DriftWatch(rig.stage, limit_mm=settings.limit_mm) if settings.check else None
+        self.watch = DriftWatch(self._rig.stage, limit_mm=settings.limit_mm) if settings.check else None
 
     def begin(self) -> None:
         """Home, and learn how long homing and a check take if drift is checked."""
@@ -101,16 +90,10 @@ class FrameTaker:
     file. `last` is the frame taken last.
     """
 
-    def __init__(
-        self, session: Session, rig: Rig, dialogue: Dialogue, drift: DriftChecks, pace: Pace, decode: Decode
-    ) -> None:
-        self._session = session
-        self._settings = session.rig
-        self._rig = rig
-        self._dialogue = dialogue
-        self._drift = drift
-        self._pace = pace
-        self._decode = decode
+    def __init__(self, dialogue: Dialogue, drift: DriftChecks, decode: Decode) -> None:
+        self._dialogue, self._drift, self._decode = dialogue, drift, decode
+        self._session, self._rig, self._pace = dialogue.session, dialogue.rig, dialogue.pace
+        self._settings = self._session.rig
         self._cooled_step: int | None = None
         self._settle_s: float | None = None
         self._layouts: dict[str, str | None] = {}
@@ -122,7 +105,7 @@ class FrameTaker:
 
         Raises `StageError`, `NotHomed`, `CameraError` or `SessionUnwritable`, after which the frame is still missing.
         """
-        settings = self._session.rig.camera
+        settings = self._settings.camera
         if settings.settle_temperature_c is not None and frame.step != self._cooled_step:
             self._wait_for_temperature(frame, settings, settings.settle_temperature_c)
         self._cooled_step = frame.step
@@ -198,8 +181,8 @@ class FrameTaker:
             session.reject(frame, written, str(failure))
             raise
         findings = self._check(frame, pixels)
-        checked = (findings.values, findings.warnings)
-        record = FrameRecord(position.point, frame.exposure_s, dict(exposure.metadata), *checked)
+        metadata = dict(exposure.metadata)
+        record = FrameRecord(position.point, frame.exposure_s, metadata, findings.values, findings.warnings)
         self._drift.add(session.commit(frame, written, record))
         self.last = frame
         if findings.warnings:
@@ -238,9 +221,8 @@ class FrameTaker:
 
     def _check(self, frame: PlannedFrame, pixels: Pixels | None) -> Findings:
         if pixels is None:
-            return Findings(
-                {}, ("the file cannot be decoded here, so nothing was checked; look at it with the camera's program",)
-            )
+            warning = "the file cannot be decoded here, so nothing was checked; look at it with the camera's program"
+            return Findings({}, (warning,))
         earlier_sharpness = [
             committed.record.checks["sharpness"]
             for committed in self._session.valid().values()

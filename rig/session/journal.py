@@ -164,14 +164,13 @@ class Journal:
 
     def event(self, kind: str, *, frame: int | None = None, **detail: object) -> None:
         """Record an event."""
-        with self._transaction():
-            self._add("event", (None, _now(), kind, frame, _to_json(detail)))
+        self.add_events(kind, [detail], frame)
 
-    def add_events(self, kind: str, details: Sequence[Struct]) -> None:
+    def add_events(self, kind: str, details: Sequence[object], frame: int | None = None) -> None:
         """Record events of a kind, all or none."""
         if details:
             with self._transaction():
-                self._add("event", *((None, _now(), kind, None, _to_json(detail)) for detail in details))
+                self._add("event", *((None, _now(), kind, frame, _to_json(detail)) for detail in details))
 
     def intend(self, frame: int) -> int:
         """Record that `frame` will be taken now, and return the number of the exposure."""
@@ -207,14 +206,12 @@ class Journal:
 
     def uncommitted(self) -> list[tuple[int, int]]:
         """Return the number and the frame of every exposure that was not committed."""
-        with self._translate_errors():
-            return self._read(_UncommittedRow, _UNCOMMITTED)
+        return self._read(_UncommittedRow, _UNCOMMITTED)
 
     def next_intent(self) -> int:
         """Return the number that the next exposure will have."""
-        with self._translate_errors():
-            ((last,),) = self._read(tuple[_Index], "SELECT coalesce(max(id), 0) FROM intent")
-            return int(last) + 1
+        ((last,),) = self._read(tuple[_Index], "SELECT coalesce(max(id), 0) FROM intent")
+        return int(last) + 1
 
     def events(self, kind: str | None = None) -> list[JournalEvent]:
         """Return the events in order, all or those of one kind."""
@@ -236,7 +233,8 @@ class Journal:
                 yield msgspec.convert(row, _TrafficRow)
 
     def _read(self, layout: Any, query: str, *arguments: object) -> list[Any]:
-        rows = [msgspec.convert(row, layout) for row in self._db.execute(query, arguments).fetchmany(_MAX_ROWS + 1)]
+        with self._translate_errors():
+            rows = [msgspec.convert(row, layout) for row in self._db.execute(query, arguments).fetchmany(_MAX_ROWS + 1)]
         if len(rows) > _MAX_ROWS:
             raise SessionCorrupt(f"{self.path}: holds more than {_MAX_ROWS} rows of a kind; restore it from a copy")
         return rows

@@ -12,14 +12,7 @@ from msgspec import Struct
 
 from faintfield.rig.errors import PlanRefused, SessionCorrupt
 from faintfield.rig.files import make_folder, sha256
-from faintfield.rig.session.disk import (
-    PART,
-    list_names,
-    lock_session,
-    set_aside,
-    translate_errors,
-    write_new,
-)
+from faintfield.rig.session.disk import PART, list_names, lock_session, set_aside, translate_errors, write_new
 from faintfield.rig.session.journal import Begun, CommittedFrame, Journal
 from faintfield.rig.session.session import (
     ASIDE,

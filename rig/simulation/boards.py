@@ -35,15 +35,11 @@ class SimulatedBoard:
     square_mm: float
     rt_ref_board: NDArray[np.float64]
 
-    def points_ref_mm(self) -> NDArray[np.float64]:
-        """Return the corners (corner, 3) in the reference frame, row by row."""
+    def seen(self, optics: SimulatedOptics, rt_cam_ref: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the images (corner, 2) of the corners, row by row, in pixels; NaN outside the detector."""
         row, column = np.divmod(np.arange(self.corner_rows * self.corner_columns), self.corner_columns)
         flat = np.column_stack([column, row, np.zeros(len(row))]) * self.square_mm
-        return _transform(self.rt_ref_board, flat)
-
-    def seen(self, optics: SimulatedOptics, rt_cam_ref: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the images (corner, 2) of the corners in pixels; NaN outside the detector."""
-        points = _transform(rt_cam_ref, self.points_ref_mm())
+        points = _transform(rt_cam_ref, _transform(self.rt_ref_board, flat))
         x, y = distort(points[:, 0] / points[:, 2], points[:, 1] / points[:, 2], optics.distortion)
         pixels = np.column_stack([x * optics.fx_px + optics.cx_px, y * optics.fy_px + optics.cy_px])
         inside = (pixels >= 0).all(axis=1) & (pixels <= np.array(optics.size_px) - 1).all(axis=1) & (points[:, 2] > 0)
@@ -56,10 +52,8 @@ def six_boards(corner_rows: int, corner_columns: int, square_mm: float) -> list[
     boards = []
     for about_x, about_y, *place_mm in _SIX_POSES:
         rotation = _rotation(np.radians([0, about_y, 0])) @ _rotation(np.radians([about_x, 0, 0]))
-        r = cv2.Rodrigues(rotation)[0].ravel()
-        boards.append(
-            SimulatedBoard(corner_rows, corner_columns, square_mm, np.append(r, place_mm - rotation @ centre_mm))
-        )
+        pose = np.append(cv2.Rodrigues(rotation)[0].ravel(), place_mm - rotation @ centre_mm)
+        boards.append(SimulatedBoard(corner_rows, corner_columns, square_mm, pose))
     return boards
 
 
