@@ -92,9 +92,8 @@ def decode_tiff(file: BufferedReader, path: Path, accept: Accept, number: int | 
             _require_honest_strips(page, file)
             return np.asarray(page.asarray(maxworkers=1))  # several frames are decoded at a time
     file.seek(0)
-    if number is None:
-        return decode_with_opencv(read_all(file, page.nbytes + OVERHEAD_BYTES))
-    return _page_with_opencv(read_all(file, MAX_FRAME_BYTES), number)
+    max_bytes = MAX_FRAME_BYTES if number is not None else page.nbytes + OVERHEAD_BYTES
+    return _decode_with_opencv(read_all(file, max_bytes), number)
 
 
 def count_pages(file: BufferedReader) -> int:
@@ -128,7 +127,7 @@ def decode_photo(file: BufferedReader, _: Path, accept: Accept) -> NDArray[Any]:
     content = read_all(file, size_bytes + OVERHEAD_BYTES)
     if _END_MARKS[mark] not in content[-1024:] or (mark is _PNG and not _sound_png(content)):
         raise ValueError("not an image, or truncated")
-    return decode_with_opencv(content)
+    return _decode_with_opencv(content)
 
 
 def _require_one_page(tiff: tifffile.TiffFile, path: Path) -> None:
@@ -177,26 +176,21 @@ def _jpeg_size(file: BufferedReader) -> tuple[int, int, int]:
     raise ValueError("its picture does not begin")
 
 
-def decode_with_opencv(content: bytes) -> NDArray[Any]:
-    """Return the picture of a file's content, in the order red, green, blue."""
-    pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+def _decode_with_opencv(content: bytes, number: int | None = None) -> NDArray[Any]:
+    """Return the picture of a file's content, or one of a stack, its colours in the order red, green, blue."""
+    pixels: Any = None
+    if number is None:
+        pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    else:
+        pages: Any = cv2.imdecodemulti(
+            np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED, None, (number, number + 1)
+        )[1]
+        pixels = pages[0] if len(pages) == 1 else None
     if pixels is None:
         raise ValueError("not an image, or truncated")
-    return _in_rgb(np.asarray(pixels))
-
-
-def _page_with_opencv(content: bytes, number: int) -> NDArray[Any]:
-    buffer = np.frombuffer(content, np.uint8)
-    done, pages = cv2.imdecodemulti(buffer, cv2.IMREAD_UNCHANGED, None, (number, number + 1))
-    if not done or len(pages) != 1:
-        raise ValueError(f"picture {number} of the stack cannot be decoded")
-    return _in_rgb(np.asarray(pages[0]))
-
-
-def _in_rgb(pixels: NDArray[Any]) -> NDArray[Any]:
     if pixels.ndim == 3 and pixels.shape[2] >= 3:
-        pixels = np.asarray(cv2.cvtColor(pixels[:, :, :3], cv2.COLOR_BGR2RGB))
-    return pixels
+        pixels = cv2.cvtColor(pixels[:, :, :3], cv2.COLOR_BGR2RGB)
+    return np.asarray(pixels)
 
 
 def _sound_png(content: bytes) -> bool:
@@ -260,7 +254,7 @@ def decode_bmp(file: BufferedReader, _: Path, accept: Accept) -> NDArray[Any]:
     content = read_all(file, 4 * width * height + OVERHEAD_BYTES)
     if len(content) < start + (width * bits + 31) // 32 * 4 * height:
         raise ValueError("truncated")
-    return decode_with_opencv(content)
+    return _decode_with_opencv(content)
 
 
 def decode_exr(file: BufferedReader, path: Path, accept: Accept) -> NDArray[Any]:
@@ -274,7 +268,7 @@ def decode_exr(file: BufferedReader, path: Path, accept: Accept) -> NDArray[Any]
         )
     os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")  # OpenCV asks for it when it first decodes one
     file.seek(0)
-    return decode_with_opencv(read_all(file, 16 * width * height + OVERHEAD_BYTES))
+    return _decode_with_opencv(read_all(file, 16 * width * height + OVERHEAD_BYTES))
 
 
 def _exr_size(head: bytes) -> tuple[int, int]:

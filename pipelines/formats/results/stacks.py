@@ -99,7 +99,9 @@ def _slices(folder: Path, planes: Sequence[PlaneRecord]) -> Iterator[NDArray[np.
 
 def _imagej_metadata(planes: Sequence[PlaneRecord], scale: Scale, colours: int, units: StatedUnits) -> dict[str, Any]:
     """Return the calibration of a stack in the words of ImageJ; origins are in samples there."""
-    labels = [f"{units.depths_text([record.depth_mm])}{_pitch_text(record, units)}" for record in planes]
+    labels = [units.depths_text([record.depth_mm]) for record in planes]
+    if units.depth == "mm":
+        labels = [f"{label}, {record.pitch_mm:.4g} mm/px" for label, record in zip(labels, planes, strict=True)]
     metadata: dict[str, Any] = {
         "axes": "ZCYX",
         "unit": scale.unit or "relative",
@@ -113,7 +115,3 @@ def _imagej_metadata(planes: Sequence[PlaneRecord], scale: Scale, colours: int, 
     if colours > 1:
         metadata["mode"] = "composite"
     return metadata
-
-
-def _pitch_text(record: PlaneRecord, units: StatedUnits) -> str:
-    return f", {record.pitch_mm:.4g} mm/px" if units.depth == "mm" else ""

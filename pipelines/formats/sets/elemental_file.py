@@ -1,7 +1,8 @@
 """`elemental.toml`, the format in which anyone states images and poses: its tables, read, checked and written."""
 
+from collections import Counter
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -173,16 +174,11 @@ def _check_views(path: Path, settings: ElementalSetFile) -> None:
             f"{path}: view[{settings.reference_view}] is the reference but its pose is {reference.tolist()}; "
             "poses are relative to the reference view, whose own is zero"
         )
-    _refuse_repeated(path, "image", [name for view in settings.view for name in (view.image, *view.repeats)])
+    images = [("image", name) for view in settings.view for name in (view.image, *view.repeats)]
+    nodes = [("node", view.node) for view in settings.view if view.node is not None]
+    (key, name), count = Counter([*images, *nodes]).most_common(1)[0]
+    if count > 1:
+        raise BadValue(f"{path}: {key} = {name} is named by more than one view; give each view its own")
     counts = {1 + len(view.repeats) for view in settings.view}
     if len(counts) > 1:
         raise BadValue(f"{path}: views have {min(counts)} to {max(counts)} frames; give all of them as many repeats")
-    _refuse_repeated(path, "node", [view.node for view in settings.view if view.node is not None])
-
-
-def _refuse_repeated(path: Path, key: str, names: list[Any]) -> None:
-    seen = set()
-    for name in names:
-        if name in seen:
-            raise BadValue(f"{path}: {key} = {name} is named by more than one view; give each view its own")
-        seen.add(name)
