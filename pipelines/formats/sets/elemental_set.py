@@ -1,7 +1,7 @@
 """The elemental set: checked images and poses, whatever files they come from, and values in its units."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, is_dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -317,7 +317,7 @@ def in_units[Record](elemental_set: ElementalSet, record: Record) -> Record:
 
     def convert(name: str, value: Any, depth_mm: Any) -> Any:
         """Return a value in the units of the set, by the name of its field; lengths across a plane need its depth."""
-        if isinstance(value, Struct) or is_dataclass(value):
+        if isinstance(value, Struct) or value is record:  # which may be a dataclass
             depth_mm = getattr(value, "depth_mm", None)
             parts = structs.asdict(value) if isinstance(value, Struct) else vars(value)
             kind: Any = type(value)
