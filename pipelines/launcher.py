@@ -108,7 +108,6 @@ def _register(parent: App, name: str, target: str, example: str, place: int, gro
 
 
 def _register_verb(examples: Sequence[str], words: str) -> None:
-    """Register `import` or `export` with its commands."""
     verb = examples[0].split()[0]
     epilogue = f"Example: faintfield {examples[0]}"
     app.command(App(name=verb, help=words, group=_FILES, help_epilogue=epilogue, help_format="plaintext"))
@@ -182,7 +181,6 @@ def _launch(
 
 
 def _json(result: object) -> bytes:
-    """Return a result as one line of JSON."""
     import msgspec
 
     from faintfield.pipelines.formats.units import json_of

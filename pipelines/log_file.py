@@ -56,7 +56,6 @@ def logged(path: Path | None, arguments: Sequence[str], one_line: tuple[type[Bas
 
 
 def _opened(path: Path) -> logging.Handler:
-    """Return a handler that appends to the file, with times in UTC."""
     try:
         handler = _LogFile(path, encoding="utf-8")
     except OSError as failure:

@@ -278,5 +278,4 @@ def _origin(directory: Path, path: Path, inputs: Set[str]) -> dict[str, Any]:
 
 
 def _link(directory: Path, path: Path) -> str:
-    """Return a file's address relative to the page's folder."""
     return path.resolve().relative_to(directory.resolve(), walk_up=True).as_posix()

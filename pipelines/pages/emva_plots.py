@@ -272,7 +272,6 @@ def _dark_signal(measured: EmvaMeasurement) -> _Plot:
 
 
 def _spectrograms(measured: EmvaMeasurement, image: MeanImage, unit: str, factor: float) -> _Plot:
-    """Draw the horizontal and the vertical spectrogram, as amplitudes."""
     spectra = [spectrogram(image.values, measured.used, axis) for axis in (1, 0)]
 
     def draw(axes: Axes) -> None:

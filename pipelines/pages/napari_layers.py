@@ -85,7 +85,6 @@ def _plane_layer(folder: Path, plane: PlaneRecord, name: str, units: StatedUnits
 
 
 def _stack_layer(folder: Path, planes: Sequence[PlaneRecord], name: str, step_mm: float, units: StatedUnits) -> _Layer:
-    """Return planes at equal steps of depth as one layer."""
     pixels = np.stack([_pixels(folder, plane) for plane in planes])
     scale = stack_scale(planes, units)
     across = _UNITS.get(scale.unit, scale.unit)

@@ -72,7 +72,6 @@ def draw_page(calibration: NoiseCalibration, title: str) -> bytes:
 
 
 def _plots(calibration: NoiseCalibration) -> tuple[_Plot, ...]:
-    """Return every plot of the page, in order, those left out included."""
     maps = calibration.maps
     offset = calibration.estimates["offset_dn"].value or 0.0
     cut_off = " (moments as they are, cut off)" if calibration.likelihood.startswith("censored") else ""
@@ -183,7 +182,6 @@ def _why_empty(values: NDArray[np.floating] | None, unusable: NDArray[np.bool_])
 
 
 def _histograms(axes: Axes, calibration: NoiseCalibration) -> None:
-    """Draw the histograms of the shortest and the longest darks, measured and fitted."""
     for histogram, colour in zip(calibration.histograms, (_SECOND, _INK), strict=False):
         counted = histogram.count > 0
         label = f"{histogram.exposure_s:g} s, {histogram.count.sum():,} values"

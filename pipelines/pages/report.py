@@ -146,7 +146,6 @@ def _describe_search(search: BestFocusRecord, units: StatedUnits) -> str:
 
 
 def _title(directory: Path, results: dict[Path, ReconstructionRecord], surfaces: dict[Path, SurfaceFileRecord]) -> str:
-    """Return the title of the page: the objects of the reconstruction, and their depths."""
     records = [plane for result in results.values() for plane in result.planes]
     depths = sorted({record.depth_mm for record in at_depths(records)})
     units = units_of(next(iter(results.values()), None))
@@ -188,7 +187,6 @@ def _light(the_set: SetSection) -> list[Fact]:
 
 
 def _poses(geometry: GeometrySection | None, against_truth: GeometryErrors | None, units: StatedUnits) -> Fact:
-    """Return the uncertainty of the camera's positions."""
     if geometry is None:
         scale = "" if units.depth == "mm" else "; their scale is not known"
         return Fact("Poses", "as stated", f"by the set; not measured{scale}")
@@ -204,7 +202,6 @@ def _poses(geometry: GeometrySection | None, against_truth: GeometryErrors | Non
 
 
 def _noise(noise: NoiseSection | None, the_set: SetSection | None) -> list[Fact]:
-    """Return the sensor's noise, as measured or else as the set states it."""
     if noise is None:
         if the_set is None or the_set.noise_free:
             return []

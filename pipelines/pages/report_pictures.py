@@ -164,7 +164,6 @@ def _side_by_side(planes: list[Plane], columns: list[str], white: float) -> list
 
 
 def _sigmas(planes: list[Plane], titles: dict[str, str]) -> Sigmas | None:
-    """Return the standard deviations, None if they were not asked for."""
     maps = [
         (f"{titles[plane.column]}, {plane.label}", sigma)
         for plane in sorted(planes, key=lambda plane: plane.depth_mm)

@@ -122,7 +122,6 @@ def _figures(folder: Path, surface: SurfaceRecord, units: StatedUnits) -> list[F
 
 
 def _embedded(path: Path) -> str | None:
-    """Return a picture as data URI, None if it is missing."""
     return data_uri(read_content(path, MAX_PREVIEW_BYTES), path.suffix) if path.is_file() else None
 
 
@@ -147,7 +146,6 @@ def _quantity(surface: SurfaceRecord) -> str:
 
 
 def _tolerance(surface: SurfaceRecord) -> str:
-    """Return the largest error of a depth that counts as right."""
     return "2 % of its difference from that of infinity" if surface.unit == "px" else "2 %"
 
 
@@ -157,8 +155,9 @@ def _predictions(held_out: HeldOutRecord) -> list[Prediction]:
         ("the same depths on a few planes", held_out.planes),
         ("the mean of each view’s neighbours, blurred", held_out.neighbours),
     ]
-    lowest = min(deviance for _, deviance in ways if deviance is not None)
-    return [Prediction(by, deviance, deviance == lowest) for by, deviance in ways if deviance is not None]
+    known = [(by, deviance) for by, deviance in ways if deviance is not None]
+    lowest = min(deviance for _, deviance in known)
+    return [Prediction(by, deviance, deviance == lowest) for by, deviance in known]
 
 
 def _verdict(held_out: HeldOutRecord, predictions: Sequence[Prediction]) -> str:

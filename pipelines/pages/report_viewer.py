@@ -118,17 +118,17 @@ def _first(
     wanted = places[min(shown.slider_depth, len(places) - 1)]
     lead = min(of_best, key=lambda plane: abs(plane.depth_mm - wanted[0]))
 
-    def index_of(column: str) -> int | None:
-        """Return the index of the picture of a column at the place of the best one."""
-        keys = [(picture["kind"], picture["title"], picture["place"]) for picture in pictures]
-        key = ("light", titles[column], places.index(lead.place))
-        return keys.index(key) if key in keys else None
+    keys = [(picture["kind"], picture["title"], picture["place"]) for picture in pictures]
 
-    second = index_of(best) or 0
+    def index_of(column: str) -> int:
+        """Return the index of the picture of a column at the place of the best one."""
+        return keys.index(("light", titles[column], places.index(lead.place)))
+
+    second = index_of(best)
     if lead.method in JOINT_METHODS:
         alone = [plane for plane in planes if plane.method not in JOINT_METHODS and plane.place == lead.place]
-        if alone and (first := index_of(best_column(alone))) is not None:
-            return first, second
+        if alone:
+            return index_of(best_column(alone)), second
     return 0 if second else min(1, len(pictures) - 1), second
 
 

@@ -61,7 +61,6 @@ def draw_figure3(
 
 
 def _draw_planes(figure: Figure, axes: Sequence[Axes], planes: Sequence[DrawnPlane], letters: str, what: str) -> None:
-    """Draw planes on one grey scale, with axes in millimetres."""
     white = max(float(np.quantile(pixels, 0.998)) for pixels, _ in planes)
     for panel, (pixels, plane), letter in zip(axes, planes, letters, strict=True):
         rows, columns = pixels.shape[:2]
@@ -102,7 +101,6 @@ def draw_figure4(points: Sequence[CurvePoint]) -> bytes:
 
 
 def _draw_curve(axes: Axes, points: Sequence[CurvePoint], key: tuple[str, str], index: int, label: str) -> None:
-    """Draw the means of an object and a method with twice their standard errors."""
     index %= len(_COLOURS)
     look: dict[str, Any] = {"color": _COLOURS[index], "marker": _MARKS[index], "linestyle": _DASHES[index]}
     curve = sorted(

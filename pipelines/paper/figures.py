@@ -219,7 +219,6 @@ def _figure3(out: Path, _: FigureOptions) -> Figure3:
 
 
 def _figure4(out: Path, options: FigureOptions) -> Figure4:
-    """Measure the errors of all methods, and whether they fall with the SNR."""
     errors = measure_errors(options.size_px, options.seeds)
     points = mean_curves(errors)
     monotone = {method.name: is_monotone(points, method.name) for method in METHODS}

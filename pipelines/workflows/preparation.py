@@ -56,7 +56,6 @@ def write_boards(
 
 
 def _boards(count: int, across: int, down: int, square_mm: float, dictionary: str) -> list[Board]:
-    """Return boards of one size that share no marker."""
     marker_mm, markers = round(_MARKER_SHARE * square_mm, 1), across * down // 2
     try:
         return [
@@ -105,7 +104,6 @@ def predict_capture(rig: Path, options: PlanOptions) -> PredictionRecord:
 
 
 def _in_px(sides_mm: list[float], depths_mm: Sequence[float], f_px: Estimate) -> list[float]:
-    """Return sides in pixels at the first depth."""
     if not sides_mm:
         return []
     if not depths_mm or f_px.value is None:

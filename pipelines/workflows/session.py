@@ -279,5 +279,4 @@ def _step_of_surface(session: Path, opened: Opened, selection: SurfaceRequest) -
 
 
 def _frames(session: Path, *kinds: str) -> list[str]:
-    """Return the names of the plan and of the frames of some kinds that count."""
     return [PLAN, *(str(path.relative_to(session)) for it, _, path in taken_frames(session) if it.kind in kinds)]

@@ -91,7 +91,6 @@ def serve_simulated_stage(protocol: str, speed: float) -> None:
 
 @contextmanager
 def _connected(connection: StageConnection) -> Iterator[Gantry]:
-    """Connect to a stage, print its warnings, and close the port at the end."""
     try:
         settings = _settings(connection)
     except ValueError as failure:

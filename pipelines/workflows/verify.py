@@ -72,7 +72,6 @@ def verify_folder(path: Path, inputs: Path | None) -> Verified:
 
 
 def _report_session(folder: Path, verdict: Verdict) -> None:
-    """Inform the user of what was found of a session."""
     _list("problem", verdict.problems)
     state = "complete"
     if not verdict.sealed:
@@ -91,7 +90,6 @@ def _report_session(folder: Path, verdict: Verdict) -> None:
 
 
 def _report_results(path: Path, verdict: ResultVerdict) -> None:
-    """Inform the user of what was found of results."""
     _list("not checked", verdict.unchecked)
     _list("problem", verdict.problems)
     if not verdict.problems:
@@ -102,12 +100,10 @@ def _report_results(path: Path, verdict: ResultVerdict) -> None:
 
 
 def _count(things: Sized, noun: str) -> str:
-    """Return how many there are of something."""
     return f"{len(things)} {noun}{'' if len(things) == 1 else 's'}"
 
 
 def _list(label: str, lines: tuple[str, ...]) -> None:
-    """Print the first of several findings."""
     for line in lines[:_MAX_SHOWN]:
         inform(f"{label}: {line}")
     if len(lines) > _MAX_SHOWN:
