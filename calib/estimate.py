@@ -8,6 +8,9 @@ _NO_SPREAD = "the values are not much likelier with a spread, so that none was f
 # Standard errors by which a variance is negative beyond chance: once in a thousand sound measurements, or less.
 _HIDDEN_SIGMA = 3.2
 
+# Half width of a 95 % interval of a normal law, in standard deviations: `scipy.stats.norm.ppf(0.975)`.
+NORMAL_QUANTILE = 1.959963984540054
+
 # Largest exponent of an interval's end over its value; nothing beyond is of use.
 _MAX_EXPONENT = 50.0
 
@@ -31,7 +34,7 @@ class Estimate(Struct, frozen=True, omit_defaults=True):
     why: str | None = None
 
 
-def interval(value: float, se: float, quantile: float, *, positive: bool = False) -> Estimate:
+def interval(value: float, se: float, quantile: float = NORMAL_QUANTILE, *, positive: bool = False) -> Estimate:
     """Return an estimate with its interval, which is symmetric on a logarithmic scale for positive quantities."""
     if positive:
         factor = float(np.exp(min(quantile * se / value, _MAX_EXPONENT)))
@@ -39,7 +42,7 @@ def interval(value: float, se: float, quantile: float, *, positive: bool = False
     return Estimate(value, se, (value - quantile * se, value + quantile * se))
 
 
-def root(variance: float, se: float, quantile: float, scale: float = 1.0) -> Estimate:
+def root(variance: float, se: float, scale: float = 1.0) -> Estimate:
     """Return the root of a variance, times a scale; no value if the variance is significantly negative.
 
     Where it is negative by chance, the interval is from 0 to the root of one standard error at least.
@@ -53,6 +56,6 @@ def root(variance: float, se: float, quantile: float, scale: float = 1.0) -> Est
             f"(limit {_HIDDEN_SIGMA:g}), so that a spread would be hidden; the noise of the frames is not independent, "
             "as when pickup changes its phase from frame to frame, which means of 10 frames or more show less",
         )
-    low = float(np.sqrt(max(variance - quantile * se, 0.0))) * scale
-    high = float(np.sqrt(max(variance + quantile * se, se))) * scale
-    return Estimate(float(np.sqrt(max(variance, 0.0))) * scale, (high - low) / (2 * quantile), (low, high))
+    low = float(np.sqrt(max(variance - NORMAL_QUANTILE * se, 0.0))) * scale
+    high = float(np.sqrt(max(variance + NORMAL_QUANTILE * se, se))) * scale
+    return Estimate(float(np.sqrt(max(variance, 0.0))) * scale, (high - low) / (2 * NORMAL_QUANTILE), (low, high))

@@ -4,11 +4,11 @@
 """
 
 from faintfield.calib.estimate import Estimate
-from faintfield.calib.noise.calibrate import calibrate
+from faintfield.calib.noise.calibrate import NoiseCalibration, calibrate
 from faintfield.calib.noise.maps.measure import NoiseMaps
 from faintfield.calib.noise.misfit import TransferPoint
-from faintfield.calib.noise.result import NoiseCalibration
-from faintfield.calib.noise.series.statistics import Conditions, Series, SeriesSums, measure_series
+from faintfield.calib.noise.series import Conditions, Series
+from faintfield.calib.noise.sums import SeriesSums, measure_series
 
 __all__ = [
     "Conditions",

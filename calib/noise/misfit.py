@@ -6,14 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from faintfield.calib.noise.fit.scatter import flat_variances_of_nodes, light_signal, noise_freedom
-from faintfield.calib.noise.fit.series_fit import NoiseLikelihood, SeriesFit
-from faintfield.calib.noise.likelihood.gaussian import level_variances_dn2
-from faintfield.calib.noise.likelihood.maximum import NoiseFit
+from faintfield.calib.noise.flats import Saturation
+from faintfield.calib.noise.likelihood.gaussian import NoiseFit, level_variances_dn2
 from faintfield.calib.noise.likelihood.moments import Moments
 from faintfield.calib.noise.likelihood.response import UNKNOWN_BEND_SE, charge_dn, charge_slope
-from faintfield.calib.noise.series.flats import Saturation
-from faintfield.calib.noise.series.statistics import Series
+from faintfield.calib.noise.scatter import flat_variances_of_nodes, light_signal, noise_freedom
+from faintfield.calib.noise.series import Series
+from faintfield.calib.noise.series_fit import NoiseLikelihood, SeriesFit
 from faintfield.calib.noise.strips import Array
 
 # The series contradict the model if a departure has at most this probability, or exceeds this many standard errors, and

@@ -11,8 +11,8 @@ from faintfield.calib.estimate import Estimate
 from faintfield.calib.noise import NoiseCalibration, Series
 from faintfield.calib.noise.emva.nonuniformity import Nonuniformity, TemporalNoise, nonuniformity, temporal_noise
 from faintfield.calib.noise.emva.quantities import derived_quantities, gather_inputs
-from faintfield.calib.noise.fit.temperature import dark_current_doubling
 from faintfield.calib.noise.strips import map_of, mean_over
+from faintfield.calib.noise.temperature import dark_current_doubling
 from faintfield.pipelines.formats.results.noise import EmvaImageRecord, EmvaRecord
 
 # The bright image is the series of the most frames within so much of half of saturation, or else the nearest to it.

@@ -9,27 +9,35 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import stats
 
-from faintfield.calib.estimate import Estimate, interval, root
-from faintfield.calib.noise.emva.light_estimates import light_estimates, quantum_efficiency, why_noise_denies
+from faintfield.calib.estimate import NORMAL_QUANTILE, Estimate, interval, root
 from faintfield.calib.noise.emva.nonuniformity import nonuniformity, temporal_noise
-from faintfield.calib.noise.fit.series_fit import NoiseLikelihood, SeriesFit
-from faintfield.calib.noise.likelihood.gaussian import dark_variances_dn2, main_quantities
-from faintfield.calib.noise.likelihood.maximum import NoiseFit
+from faintfield.calib.noise.flats import Saturation
+from faintfield.calib.noise.likelihood.gaussian import (
+    NoiseFit,
+    flat_variances_dn2,
+    level_variances_dn2,
+    main_quantities,
+)
 from faintfield.calib.noise.likelihood.moments import Moments
-from faintfield.calib.noise.likelihood.response import charge_dn
+from faintfield.calib.noise.likelihood.response import FittedLevels, charge_dn
 from faintfield.calib.noise.maps.photo_response import Response
-from faintfield.calib.noise.series.flats import Saturation
+from faintfield.calib.noise.misfit import series_goodness
+from faintfield.calib.noise.series_fit import NoiseLikelihood, SeriesFit
 from faintfield.calib.noise.strips import Array, map_of
 
 # Largest relative standard error of the gain, without which no quantity in electrons has a value.
 MAX_RELATIVE_SE = 0.1
 
 # Read noise in DN below which the Gaussian cannot tell the noise from the rounding, unless the phases of the
-# pixels average out.
-_MIN_ROUNDED_READ_DN = 0.35
+# pixels average out; and the largest error that rounding may make of the noise of a series of darks with so little.
+_MIN_ROUNDED_READ_DN, _MAX_ROUNDING_ERROR = 0.35, 0.05
 
-# Largest error that rounding may make of the noise of a series of darks with so little read noise.
-_MAX_ROUNDING_ERROR = 0.05
+# Largest scatter of the noise of series about the model, and largest departure of one, as fractions of the variance.
+_MAX_NOISE_ERROR, _MAX_DEPARTURE, _MIN_SIGMAS = 0.05, 0.1, 6.0
+
+# Draws of the response from its covariance for the error of the linearity error, and largest share of draws that no
+# response can have.
+_DRAWS, _MAX_IMPOSSIBLE = 200, 0.05
 
 _FLATS_REMEDY = "record at least 2 flats at half of saturation, or darks long enough for tens of dark electrons"
 _ONE_EXPOSURE = "all darks have one exposure; record darks of at least 2 exposures, better 4 up to 60 s"
@@ -39,6 +47,14 @@ _ONE_REPEATED = (
 )
 _NO_PHOTONS = "no flat states its photons per pixel (`photons` in noise.toml, or `photons_per_s` in rig.toml)"
 _NO_FLATS = "there are no flats; record at least 2, evenly lit, at half of saturation"
+_POOR_RESPONSE = (
+    "the levels of the flats leave the response open, so that it might even fall; record more frames of each level, "
+    "and the levels in one go"
+)
+_NO_LIGHT = (
+    "the light of the flats is not known: state the photons of at least 3 light levels over a factor of 2, or record 3 "
+    "exposures under one light"
+)
 
 
 def estimate_all(
@@ -58,25 +74,37 @@ def estimate_all(
         The dark levels lie on a straight line over exposure time; the noise of all series follows eq. (1).
     """
     fit, moments = fitted.fit, fitted.moments
-    quantile, levels_quantile = float(stats.norm.ppf(0.975)), _levels_quantile(fit, moments)
+    levels_quantile = _levels_quantile(fit, moments)
     why_rounded = _why_rounded(fitted)
     holds = levels_hold and noise_holds
     why_no_gain = (
-        why_rounded or why_noise_denies(fitted) or _why_no_gain(fit, moments, from_darks=not fitted.flats, holds=holds)
+        why_rounded or _why_noise_denies(fitted) or _why_no_gain(fit, moments, from_darks=not fitted.flats, holds=holds)
     )
     whys = {"offset_dn": None, "gain_dn_per_e": why_no_gain, "read_noise_e": why_no_gain}
     whys["dark_current_e_per_s"] = _why_no_current(fit, moments, why_no_gain, levels_quantile, levels_hold=levels_hold)
-    estimates, covariance = _in_electrons(fit, whys, quantile if fitted.flats else levels_quantile, levels_quantile)
+    gain_quantile = NORMAL_QUANTILE if fitted.flats else levels_quantile
+    estimates, covariance = _in_electrons(fit, whys, gain_quantile, levels_quantile)
     gain = estimates["gain_dn_per_e"]
-    estimates |= _in_dn(fit, quantile, levels_quantile) | _spreads(fitted, gain, quantile)
+    estimates |= _in_dn(fit, levels_quantile) | _spreads(fitted, gain)
     if why_rounded is not None:
         estimates |= dict.fromkeys(("read_noise_dn", "dsnu_dn"), Estimate(None, why=why_rounded))
     # The fixed patterns of rows and columns: EMVA 1288's DSNU.row and DSNU.col.
     dark, used = max(fitted.darks, key=lambda dark: dark.frames), fitted.used
     spreads = nonuniformity(map_of(dark.mean_of, used.shape, np.float64), used, temporal_noise(dark, used))
-    estimates |= {"dsnu_row_dn": spreads.row, "dsnu_column_dn": spreads.column}
-    estimates |= _shared_noise(fitted, quantile) | _from_flats(fitted, gain, response, quantile)
-    return estimates | light_estimates(fitted, saturation, gain, estimates["quantum_efficiency"]), covariance
+    estimates |= {"dsnu_row_dn": spreads.row, "dsnu_column_dn": spreads.column} | _shared_noise(fitted)
+    estimates |= _from_flats(fitted, gain, response)
+    excess = fitted.moments.excess
+    estimates |= {
+        "linearity_error": _linearity(fitted, saturation),
+        "saturation_e": _capacity(fitted, saturation, gain, estimates["quantum_efficiency"]),
+        "noise_error": Estimate(float(np.sqrt(excess.variance2))),
+        "drift_dn": Estimate(float(np.sqrt(excess.drift_dn2))),
+        "light_error": Estimate(float(np.sqrt(excess.light2)))
+        if _knows_light(fitted)
+        else Estimate(None, why=_NO_LIGHT),
+        "lamp_flicker": _lamp_flicker(fit, moments),
+    }
+    return estimates, covariance
 
 
 def _in_electrons(
@@ -104,7 +132,40 @@ def _levels_quantile(fit: NoiseFit, moments: Moments) -> float:
     freedom = float((moments.darks.frames - 1).sum())
     if freedom >= 1 and fit.values.get("jitter_dn2", 0.0) > 0.5 * pixel_part:
         return float(stats.t.ppf(0.975, freedom))
-    return float(stats.norm.ppf(0.975))
+    return NORMAL_QUANTILE
+
+
+def _why_rounded(fitted: SeriesFit) -> str | None:
+    read_dn, rounding2 = float(np.exp(0.5 * fitted.fit.values["log_read_dn2"])), fitted.moments.darks.rounding2
+    shown = read_dn >= _MIN_ROUNDED_READ_DN or float(rounding2.max()) <= _MAX_ROUNDING_ERROR**2
+    if shown or fitted.likelihood is not NoiseLikelihood.GAUSSIAN:
+        return None
+    return (
+        f"the read noise is about {read_dn:.2g} DN (limit {_MIN_ROUNDED_READ_DN:g} DN), so little that rounding to "
+        "whole DN hides it, and the level of the darks moves too much for the likelihood of whole values; record at a "
+        "higher gain or with more bits, the camera settled"
+    )
+
+
+def _why_noise_denies(fitted: SeriesFit) -> str | None:
+    """Return why the noise of the series denies the model; only flats can, since pickup may move noise of darks."""
+    if not fitted.flats:
+        return None
+    for item in series_goodness(fitted)[len(fitted.darks) :]:
+        excess, se = item.noise_excess or 0.0, item.noise_se or np.inf
+        if abs(excess) > max(_MAX_DEPARTURE, _MIN_SIGMAS * se):
+            return (
+                f"the noise of the {item.series.conditions} is {excess:+.1%} off the model's in variance "
+                f"({abs(excess) / se:.0f} standard errors); record it again or leave it out"
+            )
+    scatter = float(np.sqrt(fitted.moments.excess.variance2))
+    if scatter > _MAX_NOISE_ERROR:
+        return (
+            f"the noise of the series scatters by {scatter:.1%} in variance about the model (limit "
+            f"{_MAX_NOISE_ERROR:.0%}): the noise of the camera changed, or the response is not that of one sensor; "
+            "record all series in one go"
+        )
+    return None
 
 
 def _why_no_gain(fit: NoiseFit, moments: Moments, *, from_darks: bool, holds: bool) -> str | None:
@@ -122,18 +183,6 @@ def _why_no_gain(fit: NoiseFit, moments: Moments, *, from_darks: bool, holds: bo
     return None
 
 
-def _why_rounded(fitted: SeriesFit) -> str | None:
-    read_dn, rounding2 = float(np.exp(0.5 * fitted.fit.values["log_read_dn2"])), fitted.moments.darks.rounding2
-    shown = read_dn >= _MIN_ROUNDED_READ_DN or float(rounding2.max()) <= _MAX_ROUNDING_ERROR**2
-    if shown or fitted.likelihood is not NoiseLikelihood.GAUSSIAN:
-        return None
-    return (
-        f"the read noise is about {read_dn:.2g} DN (limit {_MIN_ROUNDED_READ_DN:g} DN), so little that rounding to "
-        "whole DN hides it, and the level of the darks moves too much for the likelihood of whole values; record at a "
-        "higher gain or with more bits, the camera settled"
-    )
-
-
 def _why_no_growth(moments: Moments) -> str:
     return _ONE_EXPOSURE if np.unique(moments.darks.exposure_s).size < 2 else _ONE_REPEATED
 
@@ -149,7 +198,7 @@ def _why_no_current(
         return "the dark levels are no straight line over exposure time; let the camera settle and record them again"
     signal, half_width = fit.values["dark_signal_dn_per_s"], quantile * fit.standard_error("dark_signal_dn_per_s")
     # Standard error of a normal distribution with the same interval: with few frames the formal one is too small.
-    se = half_width / float(stats.norm.ppf(0.975))
+    se = half_width / NORMAL_QUANTILE
     gain = float(np.exp(fit.values["log_gain"]))
     noise_e2 = float(np.exp(fit.values["log_read_dn2"])) / gain**2
     longest = float(moments.darks.exposure_s.max())
@@ -167,9 +216,9 @@ def _why_no_current(
     return None
 
 
-def _in_dn(fit: NoiseFit, quantile: float, levels_quantile: float) -> dict[str, Estimate]:
+def _in_dn(fit: NoiseFit, levels_quantile: float) -> dict[str, Estimate]:
     read_dn = float(np.exp(0.5 * fit.values["log_read_dn2"]))
-    half, se = max(quantile, fit.quantile_of("log_read_dn2")), 0.5 * read_dn * fit.standard_error("log_read_dn2")
+    half, se = max(NORMAL_QUANTILE, fit.quantile_of("log_read_dn2")), 0.5 * read_dn * fit.standard_error("log_read_dn2")
     signal = Estimate(None, why=_ONE_EXPOSURE)
     if "dark_signal_dn_per_s" in fit.values:
         signal = _parameter(fit, "dark_signal_dn_per_s", levels_quantile)
@@ -180,61 +229,152 @@ def _parameter(fit: NoiseFit, name: str, quantile: float) -> Estimate:
     return interval(fit.values[name], fit.standard_error(name), max(quantile, fit.quantile_of(name)))
 
 
-def _spreads(fitted: SeriesFit, gain: Estimate, quantile: float) -> dict[str, Estimate]:
+def _spreads(fitted: SeriesFit, gain: Estimate) -> dict[str, Estimate]:
     fit = fitted.fit
     dsnu2, se = fit.values["dsnu_dn2"], fit.standard_error("dsnu_dn2")
-    spreads = {"dsnu_dn": root(dsnu2, se, quantile)}
+    spreads = {"dsnu_dn": root(dsnu2, se)}
     if gain.value is None:
         return spreads | dict.fromkeys(("dsnu_e", "dcnu_e_per_s"), Estimate(None, why=gain.why))
-    spreads["dsnu_e"] = root(dsnu2, se, quantile, 1 / gain.value)
+    spreads["dsnu_e"] = root(dsnu2, se, 1 / gain.value)
     spreads["dcnu_e_per_s"] = Estimate(None, why=_why_no_growth(fitted.moments))
     if (dcnu2 := fit.values.get("dcnu_dn2_per_s2")) is not None:
-        spreads["dcnu_e_per_s"] = root(dcnu2, fit.standard_error("dcnu_dn2_per_s2"), quantile, 1 / gain.value)
+        spreads["dcnu_e_per_s"] = root(dcnu2, fit.standard_error("dcnu_dn2_per_s2"), 1 / gain.value)
     return spreads
 
 
-def _shared_noise(fitted: SeriesFit, quantile: float) -> dict[str, Estimate]:
-    fit, darks, pixels = fitted.fit, fitted.darks, fitted.moments.pixels
+def _shared_noise(fitted: SeriesFit) -> dict[str, Estimate]:
+    fit, darks = fitted.fit, fitted.darks
     if "jitter_dn2" not in fit.values:
         unknown = Estimate(None, why="the likelihood of single values has no part for it; it needs Gaussian darks")
         return dict.fromkeys(("frame_jitter_dn", "row_noise_dn", "column_noise_dn"), unknown)
     rows, columns = darks[0].pattern_dn.shape
-    noise = np.array(dark_variances_dn2(fit.values, np.array([dark.conditions.dark_time_s for dark in darks])))
-    freedom = np.array([dark.frames - 1.0 for dark in darks])
+    noise, freedom = np.array(fitted.dark_noise_dn2), fitted.moments.darks.frames - 1
 
     def shared(variances: Sequence[float], along: int, across: int) -> Estimate:
         excess = float(np.average(np.array(variances) - noise / along, weights=freedom))
         se = float(np.average(variances, weights=freedom) * np.sqrt(2 / (freedom.sum() * across)))
-        return root(excess, se, quantile)
+        return root(excess, se)
 
     # A jitter fitted as zero has no standard error: use the scatter of the levels that is expected without jitter.
-    chance = float(np.average(noise, weights=freedom) / pixels * np.sqrt(2 / freedom.sum()))
-    jitter_se = fit.standard_error("jitter_dn2") or chance
+    chance = float(np.average(noise, weights=freedom) / fitted.moments.pixels * np.sqrt(2 / freedom.sum()))
     return {
-        "frame_jitter_dn": root(fit.values["jitter_dn2"], jitter_se, quantile),
+        "frame_jitter_dn": root(fit.values["jitter_dn2"], fit.standard_error("jitter_dn2") or chance),
         "row_noise_dn": shared([dark.row_noise_dn2 for dark in darks], columns, rows),
         "column_noise_dn": shared([dark.column_noise_dn2 for dark in darks], rows, columns),
     }
 
 
-def _from_flats(fitted: SeriesFit, gain: Estimate, response: Response | None, quantile: float) -> dict[str, Estimate]:
-    prnu = Estimate(None, why=_NO_FLATS) if response is None else response.prnu_estimate(quantile)
+def _from_flats(fitted: SeriesFit, gain: Estimate, response: Response | None) -> dict[str, Estimate]:
     nonlinearity = Estimate(None, why="flats of at least 3 light levels are needed")
     if fitted.bend is not None:
-        nonlinearity = _parameter(fitted.bend, "nonlinearity_per_dn", quantile)
-    efficiency = Estimate(None, why=_NO_PHOTONS)
-    if gain.value is not None:
-        values, light = fitted.fit.values, fitted.moments.flats.light
-        pairs = []
-        for index, flat in enumerate(fitted.flats):
-            charge = charge_dn(values, fitted.moments.flats.mean_dn[index] - values["offset_dn"])
-            dark_dn = values.get("dark_signal_dn_per_s", 0.0) * flat.conditions.dark_time_s
-            if flat.conditions.photons and index not in {odd for odd, _ in light.odd}:
-                pairs.append((flat.conditions.photons, float((charge - dark_dn) / np.exp(values["log_gain"]))))
-        if pairs:
-            photons, charges_e = np.array(pairs).T
-            slope = quantum_efficiency(photons, charges_e, fitted.fit.standard_error("log_gain"))
-            efficiency = interval(*slope, quantile, positive=True)
-    elif fitted.flats:
-        efficiency = Estimate(None, why=gain.why)
+        nonlinearity = _parameter(fitted.bend, "nonlinearity_per_dn", NORMAL_QUANTILE)
+    efficiency = Estimate(None, why=gain.why if fitted.flats and gain.value is None else _NO_PHOTONS)
+    photons = [flat.conditions.photons for flat in fitted.flats]
+    odd = {index for index, _ in fitted.moments.flats.light.odd}
+    usable = [index for index, number in enumerate(photons) if number and index not in odd]
+    if gain.value is not None and usable:
+        values, means = fitted.fit.values, fitted.moments.flats.mean_dn
+        dark_dn = values.get("dark_signal_dn_per_s", 0.0) * fitted.moments.flats.exposure_s
+        charges_e = (charge_dn(values, means - values["offset_dn"]) - dark_dn) / np.exp(values["log_gain"])
+        pairs = np.stack([np.array(photons, float), charges_e], axis=1)[usable]
+        slope = quantum_efficiency(pairs[:, 0], pairs[:, 1], fitted.fit.standard_error("log_gain"))
+        efficiency = interval(*slope, positive=True)
+    prnu = Estimate(None, why=_NO_FLATS) if response is None else response.prnu_estimate()
     return {"prnu": prnu, "nonlinearity_per_dn": nonlinearity, "quantum_efficiency": efficiency}
+
+
+def quantum_efficiency(photons: Array, charge_e: Array, gain_relative_se: float) -> tuple[float, float]:
+    """Return electrons per photon with the standard error, from the charges of flats (series,) and their photons.
+
+    EMVA 1288's η = R/K is the slope of charge over photons through the origin. Its error is that of the gain and of the
+    light's steadiness.
+    """
+    slope = float(charge_e @ photons / (photons @ photons))
+    scatter = float(np.sum((charge_e - slope * photons) ** 2)) / max(photons.size - 1, 1) / float(photons @ photons)
+    return slope, float(np.hypot(slope * gain_relative_se, np.sqrt(scatter)))
+
+
+def _lamp_flicker(fit: NoiseFit, moments: Moments) -> Estimate:
+    """Return the relative scatter of the light from frame to frame.
+
+    It is what the levels of the frames of a series scatter beyond pixel noise and jitter of the black level. Neither
+    enters the pixel noise, since levels are taken out of every frame.
+    """
+    flats = moments.flats
+    noise = np.array(flat_variances_dn2(fit.values, flats.mean_dn), float) / moments.pixels
+    still = fit.values.get("jitter_dn2", 0.0) + noise
+    freedom, signal2 = flats.frames - 1, (flats.mean_dn - fit.values["offset_dn"]) ** 2
+    total = float(freedom @ signal2)
+    if not total > 0:
+        return Estimate(None, why="there are no flats")
+    variance = float(np.sum(flats.level_scatter_dn2 - freedom * still)) / total
+    spread = np.sqrt(2 * float(freedom @ (still + max(variance, 0.0) * signal2) ** 2))
+    return root(variance, float(spread) / total)
+
+
+def _knows_light(fitted: SeriesFit) -> bool:
+    return bool(fitted.bend is not None and fitted.moments.flats.light.groups.size)
+
+
+def _linearity(fitted: SeriesFit, saturation: Saturation) -> Estimate:
+    """Return EMVA 1288's linearity error of the fitted response, over the levels that were used."""
+    fit = fitted.bend
+    if fit is None or not _knows_light(fitted):
+        return Estimate(None, why=_NO_LIGHT if fitted.flats else "there are no flats")
+    offset = fit.values["offset_dn"]
+    dark = fit.values.get("dark_signal_dn_per_s", 0.0) * fitted.moments.flats.exposure_s
+    signal = fitted.moments.flats.mean_dn - offset - dark
+    full = float(signal.max()) if saturation.level_dn is None else saturation.level_dn - offset
+    variance = np.array(level_variances_dn2(fit.values, fitted.moments), float)
+    levels = FittedLevels(fitted.moments.flats.light, signal, variance, full)
+    value = levels.linearity(fit.values)
+    if value is None and levels.linearity({}) is not None:
+        return Estimate(None, why=_POOR_RESPONSE)
+    if value is None:
+        return Estimate(None, why="fewer than 3 levels are within 5 to 95 % of saturation; record more light levels")
+    names, covariance = list(fit.bend.values), fit.bend.covariance
+    bends = np.array([*fit.bend.values.values()])
+
+    def error_of(draw: Array) -> float | None:
+        return levels.linearity(dict(zip(names, draw.tolist(), strict=True)))
+
+    draws = np.random.default_rng(1288).multivariate_normal(bends, covariance, _DRAWS, method="svd")
+    errors = np.array([error for error in map(error_of, draws) if error is not None])
+    if errors.size < (1 - _MAX_IMPOSSIBLE) * _DRAWS:
+        return Estimate(None, why=_POOR_RESPONSE)
+    se = float(np.sqrt(np.mean((errors - value) ** 2)))
+    gradient = dict.fromkeys(fit.values, 0.0)
+    for name, direction, step in zip(names, np.eye(len(names)), 0.1 * np.sqrt(np.diag(covariance)), strict=True):
+        low, high = (error_of(bends + sign * step * direction) or 0.0 for sign in (-1, 1))
+        gradient[name] = (high - low) / max(2 * step, 1e-300)
+    half = fit.quantile(np.array([*gradient.values()])) * se
+    straight = stats.chi2.sf(float(bends @ np.linalg.pinv(covariance) @ bends), len(names)) > 0.05
+    return Estimate(value, se, (0.0 if straight else max(value - half, 0.0), value + half))
+
+
+def _capacity(fitted: SeriesFit, saturation: Saturation, gain: Estimate, efficiency: Estimate) -> Estimate:
+    """Return the saturation capacity μ_e.sat in electrons.
+
+    A full well takes its charge from the light of the series where it begins, as EMVA 1288 does; the response is not
+    known as far as that.
+    """
+    if saturation.level_dn is None or saturation.interval_dn is None:
+        return Estimate(None, why="no series of flats reaches saturation; record light levels up to it")
+    if gain.value is None or gain.se is None:
+        return Estimate(None, why=gain.why)
+    if saturation.limit == "ADC":
+        values, ends = fitted.fit.values, (saturation.level_dn, *saturation.interval_dn)
+        charges = [float(charge_dn(values, level - values["offset_dn"])) / gain.value for level in ends]
+        relative = 1.96 * gain.se / gain.value
+    else:
+        unused = (flat for flat, _ in saturation.left_out)
+        flats = sorted((*saturation.kept, *unused), key=lambda flat: flat.levels_dn.mean())
+        means = [float(flat.levels_dn.mean()) for flat in flats]
+        at = int(np.argmin(np.abs(np.array(means) - saturation.level_dn)))
+        photons = [flats[k].conditions.photons for k in (at, max(at - 1, 0), min(at + 1, len(flats) - 1))]
+        if efficiency.value is None or efficiency.se is None or not all(photons):
+            return Estimate(None, why="the charge of a full well follows from its photons, which are not stated")
+        charges = [efficiency.value * float(number or 0.0) for number in photons]
+        relative = 1.96 * efficiency.se / efficiency.value
+    low, high = charges[1] * (1 - relative), charges[2] * (1 + relative)
+    return Estimate(charges[0], (high - low) / 3.92, (low, high))

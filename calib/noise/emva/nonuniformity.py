@@ -11,10 +11,9 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from faintfield.calib.estimate import Estimate, root
-from faintfield.calib.noise.series.statistics import Series
+from faintfield.calib.noise.series import Series
 from faintfield.calib.noise.strips import Array, Mask, map_of, mean_over, over_strips, total_of
 
 # Width of the box whose mean is subtracted from bright images before their histogram is taken.
@@ -25,8 +24,6 @@ _MAX_STEPS = 256
 
 # Lines whose spectra are taken at a time, and pixels that are counted at a time.
 _LINES, _CHUNK_PX = 128, 1 << 16
-
-_QUANTILE = float(stats.norm.ppf(0.975))
 
 
 @dataclass(frozen=True)
@@ -90,10 +87,10 @@ def nonuniformity(image: NDArray[Any], used: Mask, noise: TemporalNoise, scale: 
     column, column_se = _of_means(columns, of_column + pixel / across[1], errors[2])
     total_se = float(np.sqrt(pixel_se**2 + row_se**2 + column_se**2))
     return Nonuniformity(
-        total=root(pixel + row + column, total_se, _QUANTILE, scale),
-        row=root(row, row_se, _QUANTILE, scale),
-        column=root(column, column_se, _QUANTILE, scale),
-        pixel=root(pixel, pixel_se, _QUANTILE, scale),
+        total=root(pixel + row + column, total_se, scale),
+        row=root(row, row_se, scale),
+        column=root(column, column_se, scale),
+        pixel=root(pixel, pixel_se, scale),
     )
 
 

@@ -14,13 +14,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
-from faintfield.calib.estimate import Estimate, interval
+from faintfield.calib.estimate import NORMAL_QUANTILE, Estimate, interval
 from faintfield.calib.noise.likelihood.rounding import ROUNDING_DN2
 from faintfield.calib.noise.strips import Array
-
-_QUANTILE = float(stats.norm.ppf(0.975))
 
 # Derivatives are differences over this share of a standard error.
 _STEP = 1e-3
@@ -75,7 +72,7 @@ class Inputs:
         at = [order.index(name) for name in needs]
         covariance = self.covariance[np.ix_(at, at)]
         value, se = propagate(formula, np.array([self.values[name] for name in needs]), covariance)
-        return interval(value, se, _QUANTILE, positive=True)
+        return interval(value, se, positive=True)
 
 
 def propagate(formula: Callable[..., float], values: Array, covariance: Array) -> tuple[float, float]:
@@ -116,7 +113,7 @@ def gather_inputs(
     derived = ("quantum_efficiency", "saturation_e") if "gain_dn_per_e" in names else ()
     names += [name for name in derived if estimates[name].value is not None]
     values = {name: estimates[name].value or 0.0 for name in names}
-    errors = np.array([np.ptp(estimates[name].ci95 or (0.0, 0.0)) / (2 * _QUANTILE) for name in names])
+    errors = np.array([np.ptp(estimates[name].ci95 or (0.0, 0.0)) / (2 * NORMAL_QUANTILE) for name in names])
     known = [name for name in names if name in covariance[0]]
     at = [list(covariance[0]).index(name) for name in known]
     part = np.asarray(covariance[1])[np.ix_(at, at)]

@@ -12,11 +12,15 @@ only; `calib.noise.likelihood.moments` gives the distribution of each.
 """
 
 from collections.abc import Mapping
+from dataclasses import astuple, dataclass, field, fields, replace
 from typing import Any
 
 import casadi as ca
 import numpy as np
+from scipy import stats
 
+from faintfield.calib.errors import PoorFit
+from faintfield.calib.estimate import NORMAL_QUANTILE
 from faintfield.calib.noise.likelihood.moments import NO_EXCESS, Excess, FlatMoments, Moments
 from faintfield.calib.noise.likelihood.response import (
     BENDS,
@@ -27,6 +31,22 @@ from faintfield.calib.noise.likelihood.response import (
 )
 from faintfield.calib.noise.likelihood.rounding import ROUNDING_DN2
 from faintfield.calib.noise.strips import Array
+
+# IPOPT prints nothing only with all of these. It also tries points with a negative variance, and backs off by itself.
+_QUIET: dict[str, Any] = {"ipopt.print_level": 0, "print_time": False, "ipopt.sb": "yes", "show_eval_warnings": False}
+
+# Gradient of −ln L per unit of a parameter at which the search ends. A gradient of one is one standard error where that
+# is one unit, and −ln L of 10⁵ is rounded such that its gradient may not come below 10⁻⁷.
+_TOLERANCE = 1e-6
+
+# Limits of parameters. Without dark signal nothing determines the gain, and the search would not end.
+_LIMITS = {"jitter_dn2": (0.0, np.inf), "log_gain": (np.log(1e-4), np.log(1e4))}
+
+_SPREADS = ("dsnu_dn2", "dcnu_dn2_per_s2")
+
+# Largest jitter that counts as zero, over the one that the levels can show: IPOPT stops a little above its bound, where
+# the likelihood may be curved the wrong way.
+_NO_JITTER = 1e-4
 
 
 def main_quantities(values: Mapping[str, float]) -> dict[str, tuple[float, dict[str, float]]]:
@@ -173,3 +193,167 @@ def _quadratic(weight: list[Any], a: Array, b: Array, scatter: Array) -> Any:
     """Return aᵀ W S W b with W = diag(weight)."""
     left, right = (ca.vertcat(*[w * side[j] for j, w in enumerate(weight)]) for side in (a, b))
     return ca.mtimes([left.T, ca.DM(scatter), right])
+
+
+@dataclass(frozen=True)
+class Bend:
+    """Coefficients κ₁, κ₂ … of the response by their names, and their covariance."""
+
+    values: dict[str, float]
+    covariance: Array
+
+
+@dataclass(frozen=True)
+class NoiseFit:
+    """Maximum-likelihood parameters of a sensor and their covariance.
+
+    Attributes
+    ----------
+    values : dict
+        `offset_dn` μ, `log_read_dn2` ln r, `dsnu_dn2` s², `jitter_dn2` τ², and, if the series determine them,
+        `dark_signal_dn_per_s` d, `dcnu_dn2_per_s2` q², `log_gain` ln g, and κ₁, κ₂ … by the names in `response.BENDS`.
+    covariance : array (parameter, parameter)
+        Covariance in the order of `values`; zero for a jitter that is zero.
+    log_likelihood : float
+        Log-likelihood at the maximum, up to a constant.
+    sources : tuple of (array, int)
+        Derivative of the covariance by the logarithm of each scatter between series that was measured from them, with
+        its degrees of freedom.
+    plain_covariance : array (parameter, parameter)
+        Covariance without any scatter beyond that of the model.
+    """
+
+    values: dict[str, float]
+    covariance: Array
+    log_likelihood: float
+    sources: tuple[tuple[Array, int], ...] = ()
+    plain_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
+
+    @property
+    def bend(self) -> Bend:
+        """Bend of the response."""
+        at = [index for index, name in enumerate(self.values) if name in BENDS]
+        values = {name: value for name, value in self.values.items() if name in BENDS}
+        return Bend(values, self.covariance[np.ix_(at, at)])
+
+    def quantile(self, gradient: Array) -> float:
+        """Return the half width of a 95 % interval, in standard errors, of a linear combination of the parameters.
+
+        The scatter between series is known from few of them only. Student's t has Satterthwaite's degrees of freedom
+        (Biometrics Bulletin 2, 110, 1946), from the variance of the variance.
+        """
+        variance = float(gradient @ self.covariance @ gradient)
+        shares = ((float(np.clip(gradient @ c @ gradient, 0, variance)), freedom) for c, freedom in self.sources)
+        spread = sum(share**2 / freedom for share, freedom in shares)
+        if not spread > 1e-6 * variance**2:
+            return NORMAL_QUANTILE
+        return float(stats.t.ppf(0.975, variance**2 / spread))
+
+    def quantile_of(self, name: str) -> float:
+        """Return `quantile` of one parameter."""
+        return self.quantile(np.array([float(parameter == name) for parameter in self.values]))
+
+    def standard_error(self, name: str) -> float:
+        """Return the standard error of one parameter, infinite for one that was not fitted."""
+        if name not in self.values:
+            return float("inf")
+        index = list(self.values).index(name)
+        return float(np.sqrt(self.covariance[index, index]))
+
+
+class GaussianProblem:
+    """The likelihood of given moments, to be maximized for several sizes of the scatter between series.
+
+    Parameters
+    ----------
+    moments : Moments
+        Sufficient statistics; some series must have two frames or more. The scatter in it is not used.
+    bends : int
+        Number of coefficients κ₁, κ₂ … of the response to fit, eq. (5), which only flats can show.
+    """
+
+    def __init__(self, moments: Moments, bends: int = 0) -> None:
+        self._start, self._scale = _start(moments, bends)
+        self._units = np.array([*self._scale.values()])
+        x, p = ca.SX.sym("x", len(self._start)), ca.SX.sym("p", len(fields(Excess)))
+        values = {name: x[i] * scale for i, (name, scale) in enumerate(self._scale.items())}
+        symbols: Any = ca.vertsplit(p)
+        moments = replace(moments, excess=Excess(*symbols))
+        objective = negative_log_likelihood(values, moments)
+        options = _QUIET | {"ipopt.acceptable_iter": 0, "ipopt.tol": _TOLERANCE}
+        self._solver = ca.nlpsol("fit", "ipopt", {"x": x, "p": p, "f": objective}, options)
+        self._hessian = ca.Function("hessian", [x, p], [ca.hessian(objective, x)[0]])
+
+    def fit(self, excess: Excess, near: Mapping[str, float] | None = None) -> NoiseFit:
+        """Return the maximum; the covariance is the inverse of the exact Hessian.
+
+        Parameters
+        ----------
+        excess : Excess
+            Scatter between series.
+        near : mapping, optional
+            Parameters to start from.
+
+        Raises
+        ------
+        PoorFit
+            IPOPT did not converge.
+        """
+        solver, units, start = self._solver, self._units, self._start | dict(near or {})
+        # The spreads over pixels may be negative, as unbiased differences of variances can be. A bound at zero would
+        # push what contradicts it (pickup whose phase turns from frame to frame, for example) into the read noise.
+        limits = np.array([_LIMITS.get(name, (-np.inf, np.inf)) for name in start]) / units[:, None]
+        # The first step from the spreads that the frames suggest may overshoot to a variance of zero; smaller spreads
+        # avoid that.
+        for share in (1.0, 0.1, 0.01):
+            first = [value * (share if name in _SPREADS else 1.0) for name, value in start.items()]
+            minimum = solver(x0=(first / units).tolist(), p=list(astuple(excess)), lbx=limits[:, 0], ubx=limits[:, 1])
+            if solver.stats()["success"]:
+                values = dict(zip(start, (np.array(minimum["x"]).ravel() * units).tolist(), strict=True))
+                return NoiseFit(values, self.covariance(values, excess), -float(minimum["f"]))
+        raise PoorFit(
+            f"the noise likelihood has no maximum: IPOPT stopped with {solver.stats()['return_status']} after "
+            f"{solver.stats()['iter_count']} iterations; check that the darks were taken with the lens covered"
+        )
+
+    def covariance(self, values: Mapping[str, float], excess: Excess) -> Array:
+        """Return the inverse of the Hessian of −ln L at given parameters, in their order; huge if undetermined."""
+        at = np.array([*values.values()]) / self._units
+        free = np.array([name != "jitter_dn2" or at[i] > _NO_JITTER for i, name in enumerate(values)])
+        hessian = np.array(self._hessian(at, list(astuple(excess))))
+        eigenvalues, vectors = np.linalg.eigh(hessian[np.ix_(free, free)])
+        inverse = np.where(eigenvalues > 1e-9, 1.0 / np.maximum(eigenvalues, 1e-9), 1e12)
+        covariance = np.zeros_like(hessian)
+        covariance[np.ix_(free, free)] = (vectors * inverse) @ vectors.T
+        return covariance * np.outer(self._units, self._units)
+
+
+def _start(moments: Moments, bends: int) -> tuple[dict[str, float], dict[str, float]]:
+    """Return initial values from simple moments, and the scale, of each parameter that the series determine."""
+    darks, flats = moments.darks, moments.flats
+    measured = darks.frames > 1
+    variance = darks.within_dn2[measured] / ((darks.frames[measured] - 1) * moments.freedom)
+    read = max(float(variance.min()) - ROUNDING_DN2, 1e-3)
+    exposures, repeated = np.unique(darks.exposure_s), np.unique(darks.exposure_s[measured])
+    line = np.polyfit(darks.exposure_s, darks.mean_dn, 1) if exposures.size > 1 else (0.0, darks.mean_dn.mean())
+    # No smaller than any jitter that the levels can show; from far below the search would take long.
+    jitter = float(darks.level_scatter_dn2.sum() / max((darks.frames - 1).sum(), 1)) + read / moments.pixels
+    start = {"offset_dn": float(line[1]), "log_read_dn2": float(np.log(read)), "dsnu_dn2": read, "jitter_dn2": jitter}
+    scale = {"offset_dn": 1.0, "log_read_dn2": 1.0, "dsnu_dn2": read, "jitter_dn2": jitter}
+    if exposures.size > 1:
+        longest = float(exposures[-1])
+        start["dark_signal_dn_per_s"], scale["dark_signal_dn_per_s"] = float(line[0]), 1 / longest
+    if repeated.size > 1:
+        start["dcnu_dn2_per_s2"], scale["dcnu_dn2_per_s2"] = 0.01 * read / longest**2, read / longest**2
+    if flats.frames.size or repeated.size > 1:
+        # Excess variance over signal, of the brightest flat or the longest dark.
+        k = int(flats.mean_dn.argmax()) if flats.frames.size else int((darks.exposure_s * measured).argmax())
+        series = flats if flats.frames.size else darks
+        excess = series.within_dn2[k] / max((series.frames[k] - 1) * moments.freedom, 1) - read
+        signal = flats.mean_dn[k] - darks.mean_dn.min() if flats.frames.size else float(line[0]) * darks.exposure_s[k]
+        gain = float(np.clip(excess / signal if signal > 0 else 1.0, 1e-2, 1e2))
+        start["log_gain"], scale["log_gain"] = float(np.log(gain)), 1.0
+    for power, name in enumerate(BENDS[:bends], 1):
+        brightest = float(flats.mean_dn.max()) - float(line[1])
+        start[name], scale[name] = 0.0, 0.01 / brightest**power
+    return start, scale

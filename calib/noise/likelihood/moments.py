@@ -1,3 +1,4 @@
+# mypy: disable-error-code="no-untyped-def, no-untyped-call"
 """Reduce series to the sufficient statistics of the Gaussian likelihood.
 
 Under Gaussian noise the likelihood depends on nothing else. With R rows, C columns and P pixels in use, removing
@@ -6,6 +7,8 @@ levels and profiles takes R + C − 1 of the P degrees of freedom. Of the rest,
 - the sum of squares within pixels, W_j, is v_j χ² with (n_j − 1)(P − R − C + 1) degrees of freedom,
 - the J × J scatter of the pixel means of the dark series is Wishart with P − R − C + 1,
 - the mean of each dark series and the scatter of its frames' levels determine the dark signal and the frame jitter.
+
+Sums over blocks, rows and columns of pixels, from one pass, show how far the noise of a series scatters.
 """
 
 from collections.abc import Sequence
@@ -13,11 +16,56 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from faintfield.calib.noise.likelihood.groups import BLOCKS, SeriesNoise, group_noise
 from faintfield.calib.noise.likelihood.response import Light, known_light
 from faintfield.calib.noise.likelihood.rounding import dark_roundings, flat_rounding
-from faintfield.calib.noise.series.statistics import Series
-from faintfield.calib.noise.strips import Array, Mask, mean_over, total_of
+from faintfield.calib.noise.series import Series
+from faintfield.calib.noise.strips import Array, Mask, compiled, mean_over, over_strips, total_of
+
+# Blocks of pixels along each side of a frame.
+BLOCKS = 8
+
+# Means between which the noise that is expected of the pixels of a flat is interpolated, and parts of a frame that are
+# summed apart, whatever the number of cores, so that sums do not depend on it.
+_NODES, _PARTS = 64, 4
+
+
+@dataclass(frozen=True)
+class SeriesNoise:
+    """Sums of the noise of a series over groups of pixels in use.
+
+    Attributes
+    ----------
+    frames : int
+        Number of frames.
+    share : float
+        Degrees of freedom that rows and columns leave, over the number of pixels.
+    nodes_dn : array (node,)
+        Means for which the expected noise is to be stated; one of a dark, whose pixels share it.
+    blocks, rows, columns : array (group, 2 + node)
+        For each group its number of pixels, its sum of squares, and the weight of each node in the expected noise.
+    """
+
+    frames: int
+    share: float
+    nodes_dn: Array
+    blocks: Array
+    rows: Array
+    columns: Array
+
+    def scatter(self, groups: Array, variances_dn2: Array | float) -> tuple[Array, Array]:
+        """Return the noise of groups over the expected one, and the degrees of freedom of each, both (group,).
+
+        Parameters
+        ----------
+        groups : array (group, 2 + node)
+            One of the three sums; groups with fewer than two pixels are left out.
+        variances_dn2 : array (node,) or float
+            Expected noise of pixels with the means `nodes_dn`.
+        """
+        count, measured, weights = groups[:, 0], groups[:, 1], groups[:, 2:]
+        expected = weights @ np.broadcast_to(variances_dn2, weights.shape[1:])
+        enough, freedom = count > 1, (self.frames - 1) * self.share
+        return measured[enough] / (expected[enough] * freedom), count[enough] * freedom
 
 
 @dataclass(frozen=True)
@@ -52,17 +100,13 @@ class DarkMoments:
 
 @dataclass(frozen=True)
 class FlatMoments:
-    """Statistics of the flat series, possibly none.
+    """Statistics of the flat series, possibly none; those not named here are as for the darks.
 
     Attributes
     ----------
-    frames, mean_dn, within_dn2 : array (series,)
-        As for the darks.
     evenness : array (series,)
         ⟨s⟩²/⟨s²⟩ of the signal s over the pixels: the factor on the degrees of freedom where brighter pixels are
         noisier than others.
-    rounding2, exposure_s, level_scatter_dn2 : array (series,)
-        As for the darks.
     light : Light
         Light of the flats, as far as it is known.
     range_dn, bend_se : float
@@ -83,7 +127,7 @@ class FlatMoments:
 
 @dataclass(frozen=True)
 class Excess:
-    """Scatter that the model of the pixels does not explain; see `calib.noise.fit.scatter`.
+    """Scatter that the model of the pixels does not explain; see `calib.noise.scatter`.
 
     Attributes
     ----------
@@ -91,10 +135,8 @@ class Excess:
         Squared deviations of variances over blocks of pixels, over those of normal noise.
     variance2 : float
         Relative variance of a series' noise about the model.
-    drift_dn2 : float
-        Variance of the level of a series of darks about the straight line.
-    light2 : float
-        Relative variance of the level of a series of flats about the response.
+    drift_dn2, light2 : float
+        Variance of the level of a series of darks about the straight line; relative one of flats about the response.
     """
 
     darks: float = 1.0
@@ -136,53 +178,111 @@ def gather_moments(darks: Sequence[Series], flats: Sequence[Series], used: Mask)
     used : array (row, column), bool
         Pixels that are neither defective nor suspect.
     """
-    rows, columns = used.shape
     pixels = float(used.sum())
-    freedom = max(pixels - rows - columns + 1.0, 1.0)
-    mean_dn = [mean_over(item.mean_of, used) for item in (*darks, *flats)]
-    floor_dn = min(mean_dn[: len(darks)])
-    noise = tuple(group_noise(item, used, floor_dn, (BLOCKS, BLOCKS)) for item in (*darks, *flats))
+    freedom = max(pixels - sum(used.shape) + 1.0, 1.0)
+    both, first_flat = (*darks, *flats), len(darks)
+    mean_dn = np.array([mean_over(item.mean_of, used) for item in both])
+    frames = np.array([item.frames for item in both], np.float64)
+    exposure_s = np.array([item.conditions.dark_time_s for item in both])
+    level_scatter_dn2 = np.array([item.levels_dn.var() * item.frames for item in both])
+    floor_dn = min(mean_dn[:first_flat])
+    noise = tuple(group_noise(item, used, floor_dn, (BLOCKS, BLOCKS)) for item in both)
+    within_dn2 = np.array([float(item.rows[:, 1].sum()) for item in noise])
     roundings = dark_roundings(darks, used)
+    excess_dn2 = np.array([rounding.excess_dn2 for rounding in roundings])
 
     def work(strip: slice) -> Array:
         at = used[strip]
         patterns = np.array([dark.pattern_dn[strip][at] for dark in darks], np.float64)
         return patterns @ patterns.T
 
-    pairs = zip(noise, roundings, strict=False)  # the darks come first
-    within_dn2 = [item.within_dn2 - rounding.excess_dn2 * (item.frames - 1) * freedom for item, rounding in pairs]
     return Moments(
         pixels=pixels,
         freedom=freedom,
         darks=DarkMoments(
-            exposure_s=np.array([series.conditions.dark_time_s for series in darks]),
-            frames=np.array([series.frames for series in darks], np.float64),
-            mean_dn=np.array(mean_dn[: len(darks)]),
-            within_dn2=np.array(within_dn2),
-            level_scatter_dn2=np.array([series.levels_dn.var() * series.frames for series in darks]),
+            exposure_s=exposure_s[:first_flat],
+            frames=frames[:first_flat],
+            mean_dn=mean_dn[:first_flat],
+            within_dn2=within_dn2[:first_flat] - excess_dn2 * (frames[:first_flat] - 1) * freedom,
+            level_scatter_dn2=level_scatter_dn2[:first_flat],
             scatter_dn2=total_of(work, used.shape),
             rounding2=np.array([rounding.error**2 for rounding in roundings]),
         ),
         flats=FlatMoments(
-            frames=np.array([series.frames for series in flats], np.float64),
-            mean_dn=np.array(mean_dn[len(darks) :]),
-            within_dn2=np.array([group.within_dn2 for group in noise[len(darks) :]]),
-            evenness=np.array([_evenness(series, darks[0], used) for series in flats]),
-            exposure_s=np.array([series.conditions.dark_time_s for series in flats]),
+            frames=frames[first_flat:],
+            mean_dn=mean_dn[first_flat:],
+            within_dn2=within_dn2[first_flat:],
+            evenness=np.array([_evenness(flat, darks[0], used) for flat in flats]),
+            exposure_s=exposure_s[first_flat:],
             light=known_light(flats),
-            level_scatter_dn2=np.array([series.levels_dn.var() * series.frames for series in flats]),
-            rounding2=np.array([flat_rounding(series, used).error ** 2 for series in flats]),
+            level_scatter_dn2=level_scatter_dn2[first_flat:],
+            rounding2=np.array([flat_rounding(flat, used).error ** 2 for flat in flats]),
         ),
         noise=noise,
     )
 
 
 def _evenness(flat: Series, dark: Series, used: Mask) -> float:
-    """Return ⟨s⟩²/⟨s²⟩ of the signal s of a flat over a dark."""
-
     def work(rows: slice) -> Array:
         signal = (flat.mean_of(rows) - dark.mean_of(rows))[used[rows]]
         return np.array([signal.sum(), signal @ signal])
 
     mean, square = total_of(work, used.shape) / float(used.sum())
     return float(mean**2 / max(square, 1e-12))
+
+
+def group_noise(series: Series, used: Mask, floor_dn: float, blocks: tuple[int, int]) -> SeriesNoise:
+    """Return the sums of a series; a flat's pixels count as no darker than `floor_dn`."""
+    nodes = np.zeros(1)
+    if series.conditions.kind == "flat":
+        ends = over_strips(lambda rows: (mean := series.mean_of(rows)).min() + 1j * mean.max(), used.shape)
+        low, high = max(np.real(ends).min(), floor_dn), max(np.imag(ends).max(), floor_dn)
+        nodes = np.linspace(low, high + 1e-6, _NODES)
+    row_of, column_of = (np.arange(size) * count // size for size, count in zip(used.shape, blocks, strict=True))
+    by_row = np.zeros((len(used), 2 + nodes.size))
+
+    def work(rows: slice) -> tuple[Array, Array]:
+        by_block, by_column = (np.zeros((size, 2 + nodes.size)) for size in (blocks[0] * blocks[1], used.shape[1]))
+        of_rows, block_of_row = series.row_dn[rows] + series.levels_dn.mean(), row_of[rows] * blocks[1]
+        maps = series.within_dn2[rows], used[rows], series.pattern_dn[rows]
+        places = of_rows, series.column_dn, nodes, block_of_row, column_of
+        _sum_groups(*maps, *places, by_block, by_row[rows], by_column)
+        return by_block, by_column
+
+    by_block, by_column = (sum(parts) for parts in zip(*over_strips(work, used.shape, _PARTS), strict=True))
+    pixels = float(used.sum())
+    share = max(pixels - sum(used.shape) + 1, 1.0) / pixels
+    return SeriesNoise(series.frames, share, nodes, by_block, by_row, by_column)
+
+
+@compiled
+def _sum_groups(within, used, pattern, of_rows, of_columns, nodes, block_of_row, column_of, blocks, rows, columns):
+    last = nodes.size - 1
+    per_dn = last / (nodes[last] - nodes[0]) if last else 0.0
+    for row in range(within.shape[0]):
+        count, total = 0.0, 0.0
+        for column in range(within.shape[1]):
+            if not used[row, column]:
+                continue
+            block, squares = block_of_row[row] + column_of[column], float(within[row, column])
+            count += 1.0
+            total += squares
+            blocks[block, 0] += 1.0
+            blocks[block, 1] += squares
+            columns[column, 0] += 1.0
+            columns[column, 1] += squares
+            if last == 0:
+                continue
+            place = (pattern[row, column] + of_rows[row] + of_columns[column] - nodes[0]) * per_dn
+            place = min(max(place, 0.0), float(last))
+            node = min(int(place), last - 1)
+            share = place - node
+            blocks[block, 2 + node] += 1.0 - share
+            blocks[block, 3 + node] += share
+            rows[row, 2 + node] += 1.0 - share
+            rows[row, 3 + node] += share
+            columns[column, 2 + node] += 1.0 - share
+            columns[column, 3 + node] += share
+        rows[row, 0], rows[row, 1] = count, total
+    if last == 0:
+        blocks[:, 2], rows[:, 2], columns[:, 2] = blocks[:, 0], rows[:, 0], columns[:, 0]

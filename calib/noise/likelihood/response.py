@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from faintfield.calib.noise.series.statistics import Series
+from faintfield.calib.noise.series import Series
 from faintfield.calib.noise.strips import Array
 
 # κ₁, κ₂, … by their names in a fit.

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from faintfield.calib.noise.series.statistics import Series
+from faintfield.calib.noise.series import Series
 from faintfield.calib.noise.strips import Array, Mask, total_of
 
 # Variance in DN² that rounding to whole DN adds on average over the phases.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from faintfield.calib.noise.maps.read_noise import PixelReadNoise
-from faintfield.calib.noise.series.statistics import Series, robust_sigma
+from faintfield.calib.noise.series import Series, robust_sigma
 from faintfield.calib.noise.strips import Array, Map, Mask, map_of
 
 # Robust standard deviations above the median dark signal from which a pixel is hot.

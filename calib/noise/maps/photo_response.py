@@ -68,11 +68,11 @@ class Response:
     dead: Mask
     why_no_prnu: str = ""
 
-    def prnu_estimate(self, quantile: float) -> Estimate:
+    def prnu_estimate(self) -> Estimate:
         """Return PRNU with its interval, or the reason why it has none."""
         if self.why_no_prnu:
             return Estimate(None, why=self.why_no_prnu)
-        return interval(self.prnu, self.prnu_se, quantile)
+        return interval(self.prnu, self.prnu_se)
 
 
 def measure_response(signal_dn: Map, noise_dn2: float, usable: Mask) -> Response:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from faintfield.calib.noise.maps.seams import find_seams, mean_effect
-from faintfield.calib.noise.series.statistics import Series, any_suspect, robust_sigma
+from faintfield.calib.noise.series import Series, any_suspect, robust_sigma
 from faintfield.calib.noise.strips import (
     Array,
     Map,

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from faintfield.calib.noise import Conditions
-from faintfield.calib.noise.fit.temperature import dark_factor
+from faintfield.calib.noise.temperature import dark_factor
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.frames import RAW_SUFFIXES, exif_exposure_s
 from faintfield.pipelines.formats.reading import is_file

@@ -24,7 +24,7 @@ from faintfield.calib.noise.emva.quantities import (
     snr,
     threshold_e,
 )
-from faintfield.calib.noise.fit.temperature import dark_current_doubling
+from faintfield.calib.noise.temperature import dark_current_doubling
 
 GAIN, READ_E, CURRENT, EFFICIENCY, FULL_E = 0.5, 8.0, 0.2, 0.6, 10_000.0
 

@@ -8,9 +8,9 @@ import pytest
 from numpy.typing import NDArray
 
 from faintfield.calib.noise import Conditions, NoiseCalibration, Series, calibrate, measure_series
-from faintfield.calib.noise.emva.light_estimates import quantum_efficiency
+from faintfield.calib.noise.emva.estimates import quantum_efficiency
 from faintfield.calib.noise.maps.defects import outlying_pixels
-from faintfield.calib.noise.maps.levels import LinePattern, line_pattern, pixel_levels
+from faintfield.calib.noise.maps.measure import LinePattern, line_pattern, pixel_levels
 from faintfield.calib.noise.maps.photo_response import Response, _kept_share, _running_mean, measure_response
 from faintfield.calib.noise.maps.read_noise import PixelReadNoise, kept_of, measure_read_noise
 from faintfield.calib.noise.maps.seams import find_seams, share_of_seam
@@ -290,7 +290,7 @@ def test_edges_of_light_make_no_dead_pixels(times: float) -> None:
         response = responding(spread(2) * np.where(bright, times, 1.0))
         assert not response.dead.any()
         assert "times as bright in one part" in response.why_no_prnu
-        assert response.prnu_estimate(1.96).value is None
+        assert response.prnu_estimate().value is None
 
 
 def test_dead_pixels_beside_an_edge_are_found() -> None:
@@ -306,7 +306,7 @@ def test_colour_filters_hint_at_a_mosaic() -> None:
     response = responding(spread(5) * filters)
     assert not response.dead.any()
     assert "mosaic =" in response.why_no_prnu
-    assert response.prnu_estimate(1.96).why == response.why_no_prnu
+    assert response.prnu_estimate().why == response.why_no_prnu
     assert not responding(spread(5) * np.where(filters > 0.5, 1.05, 1.0)).why_no_prnu
 
 

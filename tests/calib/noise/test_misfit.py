@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from faintfield.calib.estimate import Estimate
 from faintfield.calib.noise import Conditions, Series, calibrate, measure_series
-from faintfield.calib.noise.fit.scatter import trend_dn2, without_odd
-from faintfield.calib.noise.fit.temperature import Warmth, settle_temperature, with_doubling_error
-from faintfield.calib.noise.likelihood.maximum import NoiseFit
+from faintfield.calib.noise.likelihood.gaussian import NoiseFit
 from faintfield.calib.noise.likelihood.moments import gather_moments
 from faintfield.calib.noise.likelihood.response import Light
+from faintfield.calib.noise.scatter import trend_dn2, without_odd
+from faintfield.calib.noise.temperature import Warmth, settle_temperature, with_doubling_error
 from tests.calib.noise.darkroom import Chip, dark_series, expose, flat_series, specimen, with_flats
 
 CHIP = {"gain_dn_per_e": 0.5, "read_noise_e": 8.0, "dsnu_e": 3.0, "shape": (40, 40)}

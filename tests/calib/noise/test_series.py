@@ -10,8 +10,8 @@ from scipy import stats
 
 from faintfield.calib.errors import BadFrame, LightLeak, SaturatedFlat
 from faintfield.calib.noise import Conditions, Series, calibrate, measure_series
-from faintfield.calib.noise.series.flats import check_flat_levels, find_saturation
-from faintfield.calib.noise.series.statistics import MAX_CHANCE, outlier
+from faintfield.calib.noise.flats import check_flat_levels, find_saturation
+from faintfield.calib.noise.series import MAX_CHANCE, outlier
 from tests.calib.noise.darkroom import Chip, dark_series, darks, expose, flat_series, specimen
 
 DARK, FLAT = Conditions("dark", 1.0), Conditions("flat", 1.0)

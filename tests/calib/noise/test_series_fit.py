@@ -7,10 +7,10 @@ from scipy import stats
 from faintfield.calib.estimate import interval, root
 from faintfield.calib.noise import Conditions, calibrate, measure_series
 from faintfield.calib.noise.emva.estimates import _in_electrons, _levels_quantile, _why_no_current, _why_no_gain
-from faintfield.calib.noise.fit.series_fit import NoiseLikelihood, _shared_noise_dn2, choose_likelihood
+from faintfield.calib.noise.likelihood.gaussian import NoiseFit
 from faintfield.calib.noise.likelihood.marginal import Counts
-from faintfield.calib.noise.likelihood.maximum import NoiseFit
 from faintfield.calib.noise.likelihood.moments import DarkMoments, FlatMoments, Moments
+from faintfield.calib.noise.series_fit import NoiseLikelihood, _shared_noise_dn2, choose_likelihood
 from tests.calib.noise.darkroom import dark_series, darks, flat_series, specimen
 
 NAMES = ("offset_dn", "log_read_dn2", "dsnu_dn2", "jitter_dn2", "dark_signal_dn_per_s", "log_gain")
@@ -41,7 +41,7 @@ def test_positive_quantities_have_logarithmic_intervals() -> None:
 
 
 def test_interval_of_a_root_has_root_ends() -> None:
-    estimate = root(4.0, 1.0, 1.96, 0.5)
+    estimate = root(4.0, 1.0, 0.5)
     low, high = 0.5 * np.sqrt(4 - 1.96), 0.5 * np.sqrt(4 + 1.96)
     assert estimate.value == 1.0
     assert estimate.ci95 == pytest.approx((low, high))
@@ -49,14 +49,14 @@ def test_interval_of_a_root_has_root_ends() -> None:
 
 
 def test_variance_far_below_zero_is_hidden() -> None:
-    chance = root(-0.9, 1.0, 1.96)
+    chance = root(-0.9, 1.0)
     assert chance.value == 0.0
     assert chance.ci95 == pytest.approx((0.0, np.sqrt(1.06)))
-    assert root(-3.0, 1.0, 1.96).ci95 == (0.0, 1.0), "never shorter than one standard error"
-    hidden = root(-4.0, 1.0, 1.96)
+    assert root(-3.0, 1.0).ci95 == (0.0, 1.0), "never shorter than one standard error"
+    hidden = root(-4.0, 1.0)
     assert hidden.value is None
     assert "by 4 standard errors" in str(hidden.why)
-    assert root(0.5, 0.0, 1.96).value is None
+    assert root(0.5, 0.0).value is None
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,7 @@ def peak_bytes(frames: int) -> int:
 
 def test_memory_does_not_grow_with_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of each frame only a sample of its pixels and the means of its rows and columns are kept."""
-    monkeypatch.setattr("faintfield.calib.noise.series.statistics.SAMPLE_PX", 100)
+    monkeypatch.setattr("faintfield.calib.noise.series.SAMPLE_PX", 100)
     peak_bytes(2)  # what is compiled and imported at first is not counted
     few, many = peak_bytes(4), peak_bytes(24)
     of_frame = 2 * int(np.prod(SHAPE))

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from faintfield.calib.noise import calibrate
-from faintfield.calib.noise.fit.series_fit import NoiseLikelihood
 from faintfield.calib.noise.likelihood.exact import _flat_part, _Maximum
+from faintfield.calib.noise.likelihood.gaussian import Bend
 from faintfield.calib.noise.likelihood.marginal import (
     DARK_LOG_WEIGHTS,
     DARK_NODES,
@@ -18,8 +18,8 @@ from faintfield.calib.noise.likelihood.marginal import (
     MarginalLikelihood,
     mass_function,
 )
-from faintfield.calib.noise.likelihood.maximum import Bend
 from faintfield.calib.noise.likelihood.moments import DarkMoments, FlatMoments, Moments
+from faintfield.calib.noise.series_fit import NoiseLikelihood
 from tests.calib.noise.darkroom import EXPOSURES_S, TRUTH, dark_series, expose, specimen
 from tests.calib.noise.likelihood.slopes import slopes
 

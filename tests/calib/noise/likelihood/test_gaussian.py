@@ -8,8 +8,12 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from faintfield.calib.noise import Series, calibrate
-from faintfield.calib.noise.likelihood.gaussian import main_quantities, negative_log_likelihood
-from faintfield.calib.noise.likelihood.maximum import GaussianProblem, NoiseFit
+from faintfield.calib.noise.likelihood.gaussian import (
+    GaussianProblem,
+    NoiseFit,
+    main_quantities,
+    negative_log_likelihood,
+)
 from faintfield.calib.noise.likelihood.moments import (
     NO_EXCESS,
     DarkMoments,

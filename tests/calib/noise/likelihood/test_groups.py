@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from faintfield.calib.noise import Conditions, measure_series
-from faintfield.calib.noise.likelihood.groups import group_noise
+from faintfield.calib.noise.likelihood.moments import group_noise
 
 
 @pytest.mark.parametrize("kind", ["dark", "flat"])

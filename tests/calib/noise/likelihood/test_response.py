@@ -16,7 +16,8 @@ from faintfield.calib.noise.likelihood.response import (
     scatter_of_levels,
     signal_of_charge,
 )
-from faintfield.calib.noise.series.statistics import Conditions, Series, measure_series
+from faintfield.calib.noise.series import Conditions, Series
+from faintfield.calib.noise.sums import measure_series
 
 BENT = {"nonlinearity_per_dn": 2e-5, "nonlinearity_per_dn2": -3e-9}
 

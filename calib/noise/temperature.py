@@ -8,9 +8,9 @@ from scipy import stats
 from scipy.optimize import minimize_scalar
 
 from faintfield.calib.estimate import Estimate, interval
-from faintfield.calib.noise.likelihood.maximum import NoiseFit
+from faintfield.calib.noise.likelihood.gaussian import NoiseFit
 from faintfield.calib.noise.likelihood.moments import Moments
-from faintfield.calib.noise.series.statistics import Conditions, Series
+from faintfield.calib.noise.series import Conditions, Series
 from faintfield.calib.noise.strips import Array
 
 # Smallest range of temperatures that shows the growth, and limits of the kelvins over which dark current may double.

@@ -12,10 +12,14 @@ from dataclasses import astuple, replace
 import numpy as np
 from scipy import stats
 
-from faintfield.calib.noise.likelihood.gaussian import dark_variances_dn2, flat_variances_dn2, level_variances_dn2
-from faintfield.calib.noise.likelihood.groups import SeriesNoise
-from faintfield.calib.noise.likelihood.maximum import GaussianProblem, NoiseFit
-from faintfield.calib.noise.likelihood.moments import NO_EXCESS, Excess, Moments
+from faintfield.calib.noise.likelihood.gaussian import (
+    GaussianProblem,
+    NoiseFit,
+    dark_variances_dn2,
+    flat_variances_dn2,
+    level_variances_dn2,
+)
+from faintfield.calib.noise.likelihood.moments import NO_EXCESS, Excess, Moments, SeriesNoise
 from faintfield.calib.noise.likelihood.response import (
     Light,
     charge_dn,
@@ -26,7 +30,7 @@ from faintfield.calib.noise.likelihood.response import (
     scatter_of_line,
 )
 from faintfield.calib.noise.likelihood.rounding import ROUNDING_DN2
-from faintfield.calib.noise.series.statistics import Series
+from faintfield.calib.noise.series import Series
 from faintfield.calib.noise.strips import Array
 
 # The levels of all dark series have a trend in common below this probability.

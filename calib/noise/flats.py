@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from faintfield.calib.errors import BadFrame, SaturatedFlat
-from faintfield.calib.noise.series.statistics import Series
+from faintfield.calib.noise.series import Series
 from faintfield.calib.noise.strips import Array
 
 # Share of the values at a known end of the range beyond which the noise of a series is clipped: the variance of a

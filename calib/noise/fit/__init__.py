@@ -1,1 +1,0 @@
-"""The fit of the series, with the scatter between them."""

@@ -1,1 +1,0 @@
-"""Frames reduced to the sufficient statistics of their series."""
