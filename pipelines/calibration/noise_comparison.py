@@ -8,9 +8,9 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
+from scipy import stats
 
-from faintfield.calib.estimate import Estimate
-from faintfield.calib.noise.change import chance, compare_maps, difference_in_sigma
+from faintfield.calib.estimate import NORMAL_QUANTILE, Estimate
 from faintfield.pipelines.errors import BadValue, WrongSize
 from faintfield.pipelines.formats.frames import at_phase, mosaic_period
 from faintfield.pipelines.formats.results.noise import (
@@ -26,12 +26,16 @@ from faintfield.pipelines.formats.results.noise import (
 # Probability that any quantity at all is called changed though nothing has.
 CHANCE = 0.05
 
+# Smallest growth of the difference of two maps over what their errors make that counts: the errors are known no better.
+_MIN_GROWTH = 0.1
+
 # Of the fit and of the report by EMVA 1288, those that do not follow from others.
 _OF_FIT = ("saturation_e", "linearity_error")
 _OF_EMVA = ("prnu_row", "prnu_column")
 
 _KINDS = ("hot", "noisy", "dead")
 
+type Array = NDArray[np.float64]
 type Verdict = Literal["changed", "unchanged", "not comparable"]
 
 
@@ -99,27 +103,36 @@ def compare_noise(first: Path, second: Path) -> NoiseComparison:
     paths = tuple(path / NOISE_FILE if path.is_dir() else path for path in (first, second))
     records = read_noise(paths[0]), read_noise(paths[1])
     _check_alike(paths[0], records[0], paths[1], records[1])
-    quantities = list(_quantities(*records))
+    quantities = [(change, _chance_of(change)) for change in _quantities(*records)]
     maps = list(_maps(paths[0], records[0], paths[1], records[1]))
-    count = sum(quantity.sigma is not None for quantity in quantities) + sum(
-        quantity[1] is not None for quantity in maps
-    )
+    count = sum(probability is not None for _, probability in (*quantities, *maps))
     level = CHANCE / max(count, 1)
-    judged = [_judged(quantity, level) for quantity in quantities]
-    judged_maps = [_judged_map(change, probability, level) for change, probability in maps]
+    judged = [_judged(*pair, level) for pair in quantities]
+    judged_maps = [_judged(*pair, level) for pair in maps]
     changed = [(row.plane, row.name) for row in judged if row.verdict == "changed"]
     changed += [(row.plane, f"{row.name} map") for row in judged_maps if row.verdict == "changed"]
     return NoiseComparison(
-        str(paths[0]),
-        str(paths[1]),
-        count,
-        _limit_sigma(level),
-        judged,
-        [_pixel_change(kind, *records) for kind in _KINDS],
-        judged_maps,
-        [f"{plane}: {name}" if plane else name for plane, name in changed],
-        list(_notes(*records)),
+        first=str(paths[0]),
+        second=str(paths[1]),
+        comparisons=count,
+        limit_sigma=float(stats.norm.isf(level / 2)),
+        quantities=judged,
+        pixels=[_pixel_change(kind, *records) for kind in _KINDS],
+        maps=judged_maps,
+        changed=[f"{plane}: {name}" if plane else name for plane, name in changed],
+        notes=list(_notes(*records)),
     )
+
+
+def _judged[AnyChange: (Change, MapChange)](change: AnyChange, probability: float | None, level: float) -> AnyChange:
+    """Return a change with its verdict at a level of probability."""
+    if probability is None or probability >= level:
+        return change
+    return msgspec.structs.replace(change, verdict="changed")
+
+
+def _chance_of(change: Change) -> float | None:
+    return None if change.sigma is None else chance(change.sigma)
 
 
 def _check_alike(first_path: Path, first: NoiseRecord, second_path: Path, second: NoiseRecord) -> None:
@@ -177,48 +190,44 @@ def _measured(quantities: Quantities) -> dict[str, Estimate]:
 
 def _change(name: str, plane: str, first: Estimate, second: Estimate) -> Change:
     """Return one quantity of both."""
-    whys = [
-        f"{which}: {quantity.why or 'no reason stated'}"
-        for which, quantity in (("A", first), ("B", second))
-        if quantity.value is None
-    ]
     if first.value is None or second.value is None:
-        if first.value is None and second.value is None and first.why == second.why:
-            whys = [f"A and B: {first.why or 'no reason stated'}"]
-        return Change(name, first.value, second.value, None, None, "not comparable", plane, "; ".join(whys))
-    difference = second.value - first.value
+        whys = {which: it.why or "no reason stated" for which, it in (("A", first), ("B", second)) if it.value is None}
+        if len(whys) == 2 and first.why == second.why:
+            whys = {"A and B": whys["A"]}
+        why = "; ".join(f"{which}: {reason}" for which, reason in whys.items())
+        return Change(name, first.value, second.value, None, None, "not comparable", plane, why)
+    difference, sigma, reason = second.value - first.value, None, None
     if first.ci95 is None or second.ci95 is None:
-        return Change(
-            name, first.value, second.value, difference, None, "not comparable", plane, "no interval is stated"
-        )
-    sigma = difference_in_sigma(first.value, first.ci95, second.value, second.ci95)
-    if not np.isfinite(sigma):
-        if not difference:
-            return Change(name, first.value, second.value, 0.0, 0.0, "unchanged", plane)
-        return Change(name, first.value, second.value, difference, None, "not comparable", plane, "both errors are 0")
-    return Change(name, first.value, second.value, difference, sigma, "unchanged", plane)
+        reason = "no interval is stated"
+    else:
+        sigma = difference_in_sigma(first.value, first.ci95, second.value, second.ci95)
+        if not np.isfinite(sigma):
+            sigma, reason = (None, "both errors are 0") if difference else (0.0, None)
+    verdict: Verdict = "not comparable" if sigma is None else "unchanged"
+    return Change(name, first.value, second.value, difference, sigma, verdict, plane, reason)
 
 
-def _judged(change: Change, level: float) -> Change:
-    """Return a change with its verdict at a level of probability."""
-    if change.sigma is None or chance(change.sigma) >= level:
-        return change
-    return msgspec.structs.replace(change, verdict="changed")
+def difference_in_sigma(
+    first: float, first_ci95: tuple[float, float], second: float, second_ci95: tuple[float, float]
+) -> float:
+    """Return second − first over its standard error; NaN where neither has one.
+
+    Each error is that of the side of the interval that faces the other value: intervals near a limit are lopsided.
+    """
+    (low, high) = (first_ci95, second_ci95) if second >= first else (second_ci95, first_ci95)
+    below, above = min(first, second), max(first, second)
+    error = float(np.hypot(low[1] - below, above - high[0])) / NORMAL_QUANTILE
+    return (second - first) / error if error > 0 else float("nan")
 
 
-def _limit_sigma(level: float) -> float:
-    """Return the standard errors beyond which a difference counts."""
-    from scipy import stats
-
-    return float(stats.norm.isf(level / 2))
+def chance(sigma: float) -> float:
+    """Return the probability that two measurements of one value differ by so many standard errors or more."""
+    return float(2 * stats.norm.sf(abs(sigma)))
 
 
 def _pixel_change(kind: str, first: NoiseRecord, second: NoiseRecord) -> PixelChange:
-    """Return how the unusable pixels of a kind differ."""
-    first_pixels, second_pixels = (set(map(tuple, getattr(record, f"{kind}_pixels"))) for record in (first, second))
-    return PixelChange(
-        kind, len(first_pixels - second_pixels), len(second_pixels - first_pixels), len(first_pixels & second_pixels)
-    )
+    before, after = (set(map(tuple, getattr(record, f"{kind}_pixels"))) for record in (first, second))
+    return PixelChange(kind, len(before - after), len(after - before), len(before & after))
 
 
 def _maps(
@@ -242,27 +251,36 @@ def _maps(
     usable = ~(maps[0]["mask"].astype(bool) | maps[1]["mask"].astype(bool))
     for plane, phase in [(_name(plane), plane.phase) for plane in first.planes or []] or [("", (0, 0))]:
         used = at_phase(usable, phase, period)
-        values = [_of(maps_of[key], phase, period, used) for maps_of in maps for key in names[:2]]
         if used.sum() < 2:
             yield MapChange(name, 0, None, None, "not comparable", plane, "no pixel is usable in both"), None
             continue
-        found = compare_maps(*values)
-        probability = found.chance if found.grown else 1.0
-        yield MapChange(name, found.pixels, found.rms, found.expected, "unchanged", plane), probability
+        values = (np.asarray(at_phase(of[key], phase, period)[used], np.float64) for of in maps for key in names[:2])
+        rms, expected, probability = compare_maps(*values)
+        yield MapChange(name, int(used.sum()), rms, expected, "unchanged", plane), probability
 
 
-def _of(
-    values: NDArray[np.generic], phase: tuple[int, int], period: tuple[int, int], used: NDArray[np.bool_]
-) -> NDArray[np.float64]:
-    """Return the values of the usable pixels of a phase."""
-    return np.asarray(at_phase(values, phase, period)[used], np.float64)
+def compare_maps(first: Array, first_variance: Array, second: Array, second_variance: Array) -> tuple[float, ...]:
+    """Compare two maps of posterior means, arrays (pixel,), each with the variance of its errors.
 
+    A map with a spread s² over the pixels, whose errors have the variance V, is w times a measurement, w = 1 − V/s²,
+    with noise of variance w V. The difference of two maps of the same pixels thus has the variance
+    w₁ V₁ + w₂ V₂ + (w₁ − w₂)² s².
 
-def _judged_map(change: MapChange, probability: float | None, level: float) -> MapChange:
-    """Return the comparison of maps with its verdict at a level of probability."""
-    if probability is None or probability >= level:
-        return change
-    return msgspec.structs.replace(change, verdict="changed")
+    Returns
+    -------
+    rms, expected, chance : float
+        Rms of the difference, its mean taken out; what the errors of both maps make of it; and the probability of so
+        large an rms without a change: 1 if it exceeds its expectation by no more than the errors are known.
+    """
+    difference = second - first
+    errors = np.array([first_variance.mean(), second_variance.mean()])
+    spreads = np.array([first.var(), second.var()]) + errors
+    weights = 1 - errors / np.maximum(spreads, 1e-300)
+    expected2 = float(weights @ errors + (weights[0] - weights[1]) ** 2 * spreads.mean())
+    rms2, freedom = float(difference.var(ddof=1)), difference.size - 1
+    ratio = freedom * rms2 / expected2 if expected2 > 0 else (np.inf if rms2 > 0 else 0.0)
+    rms, expected = float(np.sqrt(rms2)), float(np.sqrt(expected2))
+    return rms, expected, float(stats.chi2.sf(ratio, freedom)) if rms > (1 + _MIN_GROWTH) * expected else 1.0
 
 
 def _notes(first: NoiseRecord, second: NoiseRecord) -> Iterator[str]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from faintfield.calib.estimate import interval, root
+from faintfield.calib.estimate import NORMAL_QUANTILE, interval, root
 from faintfield.calib.noise import Conditions, calibrate, measure_series
 from faintfield.calib.noise.emva.estimates import _in_electrons, _levels_quantile, _why_no_current, _why_no_gain
 from faintfield.calib.noise.likelihood.gaussian import NoiseFit
@@ -42,16 +42,16 @@ def test_positive_quantities_have_logarithmic_intervals() -> None:
 
 def test_interval_of_a_root_has_root_ends() -> None:
     estimate = root(4.0, 1.0, 0.5)
-    low, high = 0.5 * np.sqrt(4 - 1.96), 0.5 * np.sqrt(4 + 1.96)
+    low, high = 0.5 * np.sqrt(4 - NORMAL_QUANTILE), 0.5 * np.sqrt(4 + NORMAL_QUANTILE)
     assert estimate.value == 1.0
     assert estimate.ci95 == pytest.approx((low, high))
-    assert estimate.se == pytest.approx((high - low) / 3.92)
+    assert estimate.se == pytest.approx((high - low) / (2 * NORMAL_QUANTILE))
 
 
 def test_variance_far_below_zero_is_hidden() -> None:
     chance = root(-0.9, 1.0)
     assert chance.value == 0.0
-    assert chance.ci95 == pytest.approx((0.0, np.sqrt(1.06)))
+    assert chance.ci95 == pytest.approx((0.0, np.sqrt(NORMAL_QUANTILE - 0.9)))
     assert root(-3.0, 1.0).ci95 == (0.0, 1.0), "never shorter than one standard error"
     hidden = root(-4.0, 1.0)
     assert hidden.value is None
