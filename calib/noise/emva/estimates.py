@@ -85,7 +85,11 @@ def estimate_all(
     gain_quantile = NORMAL_QUANTILE if fitted.flats else levels_quantile
     estimates, covariance = _in_electrons(fit, whys, gain_quantile, levels_quantile)
     gain = estimates["gain_dn_per_e"]
-    estimates |= _in_dn(fit, levels_quantile) | _spreads(fitted, gain)
+    read_dn = float(np.exp(0.5 * fit.values["log_read_dn2"]))
+    half, se = max(NORMAL_QUANTILE, fit.quantile_of("log_read_dn2")), 0.5 * read_dn * fit.standard_error("log_read_dn2")
+    estimates["read_noise_dn"] = interval(read_dn, se, half, positive=True)
+    estimates["dark_signal_dn_per_s"] = _parameter(fit, "dark_signal_dn_per_s", levels_quantile)
+    estimates |= _spreads(fitted, gain)
     if why_rounded is not None:
         estimates |= dict.fromkeys(("read_noise_dn", "dsnu_dn"), Estimate(None, why=why_rounded))
     # The fixed patterns of rows and columns: EMVA 1288's DSNU.row and DSNU.col.
@@ -93,15 +97,15 @@ def estimate_all(
     spreads = nonuniformity(map_of(dark.mean_of, used.shape, np.float64), used, temporal_noise(dark, used))
     estimates |= {"dsnu_row_dn": spreads.row, "dsnu_column_dn": spreads.column} | _shared_noise(fitted)
     estimates |= _from_flats(fitted, gain, response)
-    excess = fitted.moments.excess
+    excess, knows_light = moments.excess, fitted.bend is not None and bool(moments.flats.light.groups.size)
     estimates |= {
-        "linearity_error": _linearity(fitted, saturation),
+        "linearity_error": _linearity(fitted.bend, moments, saturation)
+        if fitted.bend is not None and knows_light
+        else Estimate(None, why=_NO_LIGHT if fitted.flats else "there are no flats"),
         "saturation_e": _capacity(fitted, saturation, gain, estimates["quantum_efficiency"]),
         "noise_error": Estimate(float(np.sqrt(excess.variance2))),
         "drift_dn": Estimate(float(np.sqrt(excess.drift_dn2))),
-        "light_error": Estimate(float(np.sqrt(excess.light2)))
-        if _knows_light(fitted)
-        else Estimate(None, why=_NO_LIGHT),
+        "light_error": Estimate(float(np.sqrt(excess.light2))) if knows_light else Estimate(None, why=_NO_LIGHT),
         "lamp_flicker": _lamp_flicker(fit, moments),
     }
     return estimates, covariance
@@ -216,16 +220,9 @@ def _why_no_current(
     return None
 
 
-def _in_dn(fit: NoiseFit, levels_quantile: float) -> dict[str, Estimate]:
-    read_dn = float(np.exp(0.5 * fit.values["log_read_dn2"]))
-    half, se = max(NORMAL_QUANTILE, fit.quantile_of("log_read_dn2")), 0.5 * read_dn * fit.standard_error("log_read_dn2")
-    signal = Estimate(None, why=_ONE_EXPOSURE)
-    if "dark_signal_dn_per_s" in fit.values:
-        signal = _parameter(fit, "dark_signal_dn_per_s", levels_quantile)
-    return {"read_noise_dn": interval(read_dn, se, half, positive=True), "dark_signal_dn_per_s": signal}
-
-
 def _parameter(fit: NoiseFit, name: str, quantile: float) -> Estimate:
+    if name not in fit.values:
+        return Estimate(None, why=_ONE_EXPOSURE)
     return interval(fit.values[name], fit.standard_error(name), max(quantile, fit.quantile_of(name)))
 
 
@@ -312,21 +309,14 @@ def _lamp_flicker(fit: NoiseFit, moments: Moments) -> Estimate:
     return root(variance, float(spread) / total)
 
 
-def _knows_light(fitted: SeriesFit) -> bool:
-    return bool(fitted.bend is not None and fitted.moments.flats.light.groups.size)
-
-
-def _linearity(fitted: SeriesFit, saturation: Saturation) -> Estimate:
+def _linearity(fit: NoiseFit, moments: Moments, saturation: Saturation) -> Estimate:
     """Return EMVA 1288's linearity error of the fitted response, over the levels that were used."""
-    fit = fitted.bend
-    if fit is None or not _knows_light(fitted):
-        return Estimate(None, why=_NO_LIGHT if fitted.flats else "there are no flats")
     offset = fit.values["offset_dn"]
-    dark = fit.values.get("dark_signal_dn_per_s", 0.0) * fitted.moments.flats.exposure_s
-    signal = fitted.moments.flats.mean_dn - offset - dark
+    dark = fit.values.get("dark_signal_dn_per_s", 0.0) * moments.flats.exposure_s
+    signal = moments.flats.mean_dn - offset - dark
     full = float(signal.max()) if saturation.level_dn is None else saturation.level_dn - offset
-    variance = np.array(level_variances_dn2(fit.values, fitted.moments), float)
-    levels = FittedLevels(fitted.moments.flats.light, signal, variance, full)
+    variance = np.array(level_variances_dn2(fit.values, moments), float)
+    levels = FittedLevels(moments.flats.light, signal, variance, full)
     value = levels.linearity(fit.values)
     if value is None and levels.linearity({}) is not None:
         return Estimate(None, why=_POOR_RESPONSE)

@@ -1,4 +1,4 @@
-"""The marginal Gaussian likelihood of dark and flat frames, as expressions for casadi.
+"""The marginal Gaussian likelihood of dark and flat frames, as expressions for casadi, and its maximum by IPOPT.
 
 The model of a dark pixel i in frame k of series j is `dn = o_i + d_i t_j + jitter_k + noise`, the noise of variance
 
@@ -142,8 +142,7 @@ def _flat_log_likelihood(values: Mapping[str, Any], moments: Moments) -> Any:
 def _dark_level_cost(values: Mapping[str, Any], dark_v: list[Any], moments: Moments) -> Any:
     """Return −ln of the restricted likelihood (REML) of the frames' levels about the straight line μ + d t.
 
-    Offset and slope are integrated out; otherwise the two degrees of freedom that they take would make the jitter too
-    small.
+    Offset and slope are integrated out, which would otherwise make the jitter too small.
     """
     darks, t = moments.darks, moments.darks.exposure_s
     total, weight = 0.0, []
@@ -160,7 +159,6 @@ def _dark_level_cost(values: Mapping[str, Any], dark_v: list[Any], moments: Mome
 
 
 def _chi_squared(freedom: float, squares: Any, variance: Any) -> Any:
-    """Return −ln of the likelihood of a sum of squares that is `variance` times χ² of `freedom` degrees."""
     return 0.5 * (freedom * ca.log(variance) + squares / variance)
 
 
@@ -212,15 +210,14 @@ class NoiseFit:
     values : dict
         `offset_dn` μ, `log_read_dn2` ln r, `dsnu_dn2` s², `jitter_dn2` τ², and, if the series determine them,
         `dark_signal_dn_per_s` d, `dcnu_dn2_per_s2` q², `log_gain` ln g, and κ₁, κ₂ … by the names in `response.BENDS`.
-    covariance : array (parameter, parameter)
-        Covariance in the order of `values`; zero for a jitter that is zero.
+    covariance, plain_covariance : array (parameter, parameter)
+        Covariance in the order of `values`, zero for a jitter that is zero; the same without any scatter beyond that of
+        the model.
     log_likelihood : float
         Log-likelihood at the maximum, up to a constant.
     sources : tuple of (array, int)
         Derivative of the covariance by the logarithm of each scatter between series that was measured from them, with
         its degrees of freedom.
-    plain_covariance : array (parameter, parameter)
-        Covariance without any scatter beyond that of the model.
     """
 
     values: dict[str, float]
@@ -250,7 +247,7 @@ class NoiseFit:
         return float(stats.t.ppf(0.975, variance**2 / spread))
 
     def quantile_of(self, name: str) -> float:
-        """Return `quantile` of one parameter."""
+        """Return the same of one parameter."""
         return self.quantile(np.array([float(parameter == name) for parameter in self.values]))
 
     def standard_error(self, name: str) -> float:
@@ -267,7 +264,7 @@ class GaussianProblem:
     Parameters
     ----------
     moments : Moments
-        Sufficient statistics; some series must have two frames or more. The scatter in it is not used.
+        Sufficient statistics, of which some series have two frames or more; their scatter is not used.
     bends : int
         Number of coefficients κ₁, κ₂ … of the response to fit, eq. (5), which only flats can show.
     """
@@ -285,14 +282,7 @@ class GaussianProblem:
         self._hessian = ca.Function("hessian", [x, p], [ca.hessian(objective, x)[0]])
 
     def fit(self, excess: Excess, near: Mapping[str, float] | None = None) -> NoiseFit:
-        """Return the maximum; the covariance is the inverse of the exact Hessian.
-
-        Parameters
-        ----------
-        excess : Excess
-            Scatter between series.
-        near : mapping, optional
-            Parameters to start from.
+        """Return the maximum for a scatter between series; `near` are parameters to start from.
 
         Raises
         ------

@@ -55,14 +55,10 @@ _CLIP_SIGMA = 3.0
 
 @dataclass(frozen=True)
 class PixelReadNoise:
-    """Read noise of every pixel.
+    """Posterior mean and standard deviation of the read noise of every pixel (row, column).
 
-    Attributes
-    ----------
-    read_noise_dn, se_dn : array (row, column)
-        Posterior mean and standard deviation; without the error that all pixels share (see `read_noise_dn` of the fit).
-    resolved : bool
-        The pixels differ. If not, `se_dn` is the difference that would have gone unnoticed.
+    The latter is without the error that all pixels share. If the pixels are not `resolved`, they do not differ, and
+    `se_dn` is the difference that would have gone unnoticed.
     """
 
     read_noise_dn: Map
@@ -77,12 +73,10 @@ def measure_read_noise(
 
     Parameters
     ----------
-    darks : sequence of Series
-        Dark series, one of them with two frames at least.
+    darks, noise_dn2 : sequence (series,)
+        Dark series, one of them with two frames at least, and v_j of the fit, read noise included.
     read_dn2 : float
         Read variance of the sensor, by the fit.
-    noise_dn2 : sequence of float
-        v_j of the fit, read noise included.
     usable : array (row, column), bool
         Pixels of the population.
     """
@@ -105,19 +99,9 @@ def measure_read_noise(
 
 
 def kept_of(variance_of: Callable[[slice], Array], regular: Mask) -> Callable[[slice, Array], Array]:
-    """Return the variances of pixels (row, column) once the means of rows and columns are subtracted.
+    """Return a function of some rows and the variances of their pixels: what subtracted means of lines leave of these.
 
-    Parameters
-    ----------
-    variance_of : callable
-        Returns the variances of some rows of pixels, whose noise is their own.
-    regular : array (row, column), bool
-        Pixels of which the means are taken.
-
-    Returns
-    -------
-    callable
-        Function of some rows and their variances.
+    `variance_of` returns the variances of some rows, and the means of rows and columns are those of `regular` pixels.
     """
     sums = total_of(lambda rows: variance_of(rows).sum(0, where=regular[rows]), regular.shape)
     per_column, per_row = (np.maximum(regular.sum(axis), 1) for axis in (0, 1))
@@ -177,7 +161,6 @@ class _Squares:
 
 
 def _measure(darks: Sequence[Series], read_dn2: float, shot_dn2: Array, kept: Map, usable: Mask) -> PixelReadNoise:
-    """Return the posterior if `kept` is the share of its variance that each pixel shows, (row, column)."""
     shot_dn2, which = np.unique(shot_dn2, return_inverse=True)
     freedom = np.bincount(which, [series.frames - 1.0 for series in darks])
     squares = _Squares(darks, kept, which, shot_dn2, freedom)
@@ -212,19 +195,15 @@ def _measure(darks: Sequence[Series], read_dn2: float, shot_dn2: Array, kept: Ma
 
 
 def _scaled(read_dn: Array | float, factor: Array, shot_dn2: float, read_dn2: float) -> Array:
-    """Return the read noise of pixels in rows, columns or regions whose noise as a whole differs by a factor.
-
-    Where a row is noisier, the factor holds for the sum of read and shot noise.
-    """
+    """Return the read noise of pixels in lines or regions whose sum of read and shot noise differs by a factor."""
     return np.asarray(np.sqrt(np.maximum(read_dn**2 * factor + shot_dn2 * (factor - 1), 0.01 * read_dn2)))
 
 
 def _region_factors(ratio: Map, usable: Mask, precision: float) -> _LineFactor:
     """Return by which factor the variances of regions differ that are read apart.
 
-    Nothing shrinks them, and no gradient is fitted beside them. The population would draw the noise of a region towards
-    that of all pixels if a pixel has few frames, and a gradient doubles the error of a step: photon transfer would take
-    both for gain.
+    Nothing shrinks them, and no gradient, which doubles the error of a step, is fitted beside them: photon transfer
+    would take either for gain.
     """
     differs = {"rows": np.zeros(ratio.shape[0]), "columns": np.zeros(ratio.shape[1])}
     mean = mean_over(lambda rows: ratio[rows], usable)
