@@ -271,7 +271,6 @@ def _bent_response(fitted: SeriesFit) -> BentResponse | None:
 
 
 def _histograms(fitted: SeriesFit, usable: Mask) -> tuple[Histogram, ...]:
-    """Return the values of the shortest and the longest darks with their prediction; none while the gain is unknown."""
     if "log_gain" not in fitted.fit.values:
         return ()
     counts = collect_counts(fitted.darks, usable)

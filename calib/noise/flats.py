@@ -36,20 +36,13 @@ _MIN_RANGE, _TIMES_FLICKER, _LONE_RANGE = 0.05, 8.0, 0.5
 
 @dataclass(frozen=True)
 class Saturation:
-    """Saturation of a sensor, and the series of flats within its range.
+    """Saturation of a sensor, the flats within its range, and those beyond, each with the reason.
 
     Attributes
     ----------
-    limit : {"ADC", "full well", "not reached"}
-        End of the range.
-    level_dn : float, optional
-        The end of the converter's range, or the mean of the noisiest series; None if no series reaches it.
-    interval_dn : tuple of float, optional
-        Bounds of that level: means of the series next to it.
-    kept : tuple of Series
-        Flats to use.
-    left_out : tuple of (Series, str)
-        Flats beyond, each with the reason.
+    level_dn, interval_dn : float, tuple of float, optional
+        The end of the converter's range, or the mean of the noisiest series, and its bounds, the means of the series
+        next to it; None if no series reaches it.
     """
 
     limit: Literal["ADC", "full well", "not reached"]
@@ -91,12 +84,7 @@ def check_flat_levels(darks: Sequence[Series], flats: Sequence[Series]) -> None:
 def find_saturation(darks: Sequence[Series], flats: Sequence[Series], saturation_dn: float) -> Saturation:
     """Separate the flats within the range from those beyond.
 
-    Parameters
-    ----------
-    darks, flats : sequence of Series
-        At least one dark series.
-    saturation_dn : float
-        The end of the converter's range as far as it is stated, else infinity.
+    `saturation_dn` is the end of the converter's range as far as it is stated, else infinity.
 
     Raises
     ------
@@ -131,7 +119,6 @@ def _ceiling_dn(flats: Sequence[Series], saturation_dn: float) -> float:
 
 
 def _converter_end(flats: Sequence[Series], clipped: Array, ceiling: float) -> Saturation:
-    """Return the flats that the end of the converter's range does not clip."""
     shares = list(zip(flats, clipped, strict=True))
     kept = tuple(flat for flat, share in shares if share <= _MAX_CLIPPED_SHARE)
     left_out = tuple(

@@ -183,12 +183,8 @@ def _drift(fit: NoiseFit, moments: Moments, trend2: float) -> tuple[float, Known
 def fit_with_excess(moments: Moments, darks: Sequence[Series], bends: int) -> tuple[NoiseFit, Moments]:
     """Fit, measure the scatter that the fit leaves, and fit again with it until it settles.
 
-    Returns
-    -------
-    NoiseFit
-        With the degrees of freedom of each kind of scatter, and the covariance without any.
-    Moments
-        With the scatter.
+    The fit has the degrees of freedom of each kind of scatter, and the covariance without any; the moments have the
+    scatter.
     """
     problem = GaussianProblem(moments, bends)
     fit, known = problem.fit(replace(NO_EXCESS, light2=_first_light2(moments, bends))), dict[str, Known]()
@@ -235,10 +231,8 @@ def without_odd(light: Light, signal_dn: Array, variance_dn2: Array, bends: int)
 
     Parameters
     ----------
-    light : Light
-        Light of all flat series.
-    signal_dn, variance_dn2 : array (series,)
-        Mean signal, and the variance that noise alone makes of it.
+    light, signal_dn, variance_dn2 : Light, array (series,)
+        Light and mean signal of all flats, and the variance that noise alone makes of it.
     bends : int
         Number of coefficients of the response, eq. (5).
     """

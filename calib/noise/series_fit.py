@@ -53,22 +53,9 @@ class NoiseLikelihood(StrEnum):
 
 @dataclass(frozen=True)
 class SeriesFit:
-    """A fit and the series behind it.
+    """The maximum of a likelihood, with the series, the pixels in use (row, column) and their sums behind it.
 
-    Attributes
-    ----------
-    darks, flats : sequence of Series
-        Statistics of the frames.
-    moments : Moments
-        Sums of the statistics over the pixels in use.
-    likelihood : NoiseLikelihood
-        Likelihood that was maximized.
-    fit : NoiseFit
-        Its maximum.
-    bend : NoiseFit, optional
-        Fit that tells the bend of the response; None unless there are flats of three levels.
-    used : array (row, column), bool
-        Pixels in use.
+    `bend` is the fit that tells the bend of the response; None unless there are flats of three levels.
     """
 
     darks: Sequence[Series]
@@ -204,15 +191,8 @@ def _shared_noise_dn2(darks: Sequence[Series], gaussian: NoiseFit) -> float:
 def choose_likelihood(counts: Counts, gaussian: NoiseFit, shared_dn2: float) -> NoiseLikelihood:
     """Return the simplest likelihood that the frames allow.
 
-    Parameters
-    ----------
-    counts : Counts
-        Values, with their floor if they are cut off.
-    gaussian : NoiseFit
-        Fit of the Gaussian likelihood.
-    shared_dn2 : float
-        Variance of the noise that pixels share. It blurs single electrons, and the exact likelihood does not model it,
-        so that the Gaussian is better with more than a little of it.
+    `shared_dn2` is the variance of the noise that pixels share. It blurs single electrons, which the exact likelihood
+    does not model: with more than a little of it the Gaussian is better.
     """
     widest = max(int(np.ptp(values)) for values in counts.values_dn)
     if widest > MAX_TABLE_WIDTH_DN or not {"log_gain", "dark_signal_dn_per_s"} <= gaussian.values.keys():

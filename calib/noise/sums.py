@@ -161,7 +161,6 @@ def measure_series(
 
 
 def _suspects(frame_dn: NDArray[Any]) -> Mask:
-    """Return the pixels that differ much from their row and column."""
     # Medians of whole numbers, and of what is left, are multiples of a quarter, which single precision holds
     residual = frame_dn.astype(np.result_type(frame_dn, np.float32))
     _subtract_medians(residual)

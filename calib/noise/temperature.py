@@ -28,17 +28,10 @@ _USUAL_PER_K = 0.1
 
 @dataclass(frozen=True)
 class Warmth:
-    """Doubling temperature from the darks.
+    """Range of the temperatures of the darks, and warnings about them.
 
-    Attributes
-    ----------
-    doubling : Estimate, optional
-        Kelvins over which the dark current of these darks doubles, if the series were taken to one temperature by it;
-        without a value if nothing tells by what.
-    range_k : float
-        Range of the temperatures of the darks.
-    warnings : tuple of str
-        Messages for the user.
+    `doubling` are the kelvins over which the dark current doubles, if the series were taken to one temperature by it;
+    without a value if nothing tells by what.
     """
 
     doubling: Estimate | None = None

@@ -71,16 +71,9 @@ class Estimated:
 
 @dataclass(frozen=True)
 class ViewNoise:
-    """Noise of one view as its views show it: `variance = gain · mean + read_noise_dn²`.
+    """Noise of one view as its views show it: `variance = gain · mean + read_noise_dn²`, rounding included.
 
-    Attributes
-    ----------
-    gain_dn, read_noise_dn : Estimated
-        Variance per mean, and standard deviation without light, rounding included.
-    mean_dn, variance_dn2 : array (point,)
-        The photon transfer curve.
-    blocks : int
-        Number of blocks behind it.
+    `mean_dn` and `variance_dn2` (point,) are the photon transfer curve, with the number of `blocks` behind it.
     """
 
     gain_dn: Estimated
@@ -152,7 +145,6 @@ def _grey(view: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def _windows(image: NDArray[np.float32], corners: NDArray[np.int64], side: int) -> NDArray[np.float32]:
-    """Return square windows of an image with these upper left corners, (block, [colour,] row, column)."""
     windows = np.lib.stride_tricks.sliding_window_view(image, (side, side), axis=(0, 1))
     return np.asarray(windows[corners[:, 0], corners[:, 1]])
 
@@ -250,7 +242,6 @@ def estimate_view_noise(
 
 
 def _groups(blocks: ViewBlocks, flattest: float) -> list[NDArray[np.int64]]:
-    """Return the indices of the flattest blocks of each brightness."""
     root = np.sqrt(np.maximum(blocks.mean_dn, 0.0))
     edges = np.linspace(root.min(initial=0.0), root.max(initial=0.0), _BINS + 1)[1:-1]
     bins = np.digitize(root, edges)

@@ -23,18 +23,10 @@ _BLACK_TOLERANCE_DN = 2.0
 
 @dataclass(frozen=True)
 class MosaicPhase:
-    """The pixels of one phase of the colour filter mosaic; of the whole sensor when there are no filters.
+    """The statistics of one phase of the colour filter mosaic; of the whole sensor when there are no filters.
 
-    Attributes
-    ----------
-    phase, period : (int, int)
-        Row and column of its first pixel, and the distance to the next.
-    colour : str
-        Letter of its filter, "" without filters.
-    series : list of Series
-        Statistics of its pixels.
-    black_dn : list of float
-        Black level stated in each dark's file, from the sensor's masked pixels where it has any.
+    `phase` and `period` are row and column of its first pixel, and the distance to the next; `black_dn` the black level
+    stated in each dark's file, from the sensor's masked pixels where it has any.
     """
 
     phase: tuple[int, int]
@@ -55,20 +47,9 @@ class MosaicPhase:
 
 @dataclass(frozen=True)
 class Readout:
-    """All frames of a noise set, reduced.
+    """All frames of a noise set, reduced: their width and height, the region that was used, and its phases.
 
-    Attributes
-    ----------
-    size_px : (int, int)
-        Width and height of a frame.
-    rows, columns : slice
-        Region that was used.
-    mosaic : tuple of str, optional
-        Colour filters.
-    saturation_dn : float
-        As stated in `noise.toml`, else by the file, else the last value of the files' type.
-    phases : list of MosaicPhase
-        One per phase of the mosaic.
+    `saturation_dn` is as stated in `noise.toml`, else by the file, else the last value of the files' type.
     """
 
     size_px: tuple[int, int]
@@ -127,7 +108,6 @@ def _read_frames(frames: FrameSeries) -> Readout:
 
 
 def _layout(first: Path, settings: NoiseSet) -> Readout:
-    """Return the layout of all frames, from the first one and the settings."""
     frame = read_frame(first)
     if frame.pixels_dn.ndim != 2 or not np.issubdtype(frame.pixels_dn.dtype, np.integer):
         raise UnreadableImage(
@@ -150,7 +130,6 @@ def _layout(first: Path, settings: NoiseSet) -> Readout:
 
 
 def _slices(region: Region | None, shape: tuple[int, int], period: tuple[int, int]) -> tuple[slice, slice]:
-    """Return the region as slices of whole periods of the mosaic."""
     if region is None:
         return slice(0, shape[0] // period[0] * period[0]), slice(0, shape[1] // period[1] * period[1])
     spans = {"rows": region.rows, "columns": region.columns}
@@ -164,7 +143,6 @@ def _slices(region: Region | None, shape: tuple[int, int], period: tuple[int, in
 
 
 def _check_frame(frame: Frame, path: Path, readout: Readout) -> NDArray[Any]:
-    """Return a frame's pixels; a frame unlike the first is refused."""
     pixels = frame.pixels_dn
     width, height = readout.size_px
     if pixels.shape != (height, width):

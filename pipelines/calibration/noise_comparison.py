@@ -125,7 +125,6 @@ def compare_noise(first: Path, second: Path) -> NoiseComparison:
 
 
 def _judged[AnyChange: (Change, MapChange)](change: AnyChange, probability: float | None, level: float) -> AnyChange:
-    """Return a change with its verdict at a level of probability."""
     if probability is None or probability >= level:
         return change
     return msgspec.structs.replace(change, verdict="changed")
@@ -136,7 +135,6 @@ def _chance_of(change: Change) -> float | None:
 
 
 def _check_alike(first_path: Path, first: NoiseRecord, second_path: Path, second: NoiseRecord) -> None:
-    """Refuse records of sensors of different sizes or colour filters."""
     if first.size_px != second.size_px:
         sizes = [
             " x ".join(map(str, record.size_px)) + " px" if record.size_px else "of no stated size"
@@ -155,7 +153,6 @@ def _check_alike(first_path: Path, first: NoiseRecord, second_path: Path, second
 
 
 def _phases(first: NoiseRecord, second: NoiseRecord) -> Iterator[tuple[str, Quantities, Quantities]]:
-    """Yield the quantities of both, phase by phase of the mosaic."""
     if not first.planes or not second.planes:
         yield "", first, second
         return
@@ -166,12 +163,10 @@ def _phases(first: NoiseRecord, second: NoiseRecord) -> Iterator[tuple[str, Quan
 
 
 def _name(plane: PhaseRecord) -> str:
-    """Return the name of a phase."""
     return f"{plane.colour}_r{plane.phase[0]}c{plane.phase[1]}"
 
 
 def _quantities(first: NoiseRecord, second: NoiseRecord) -> Iterator[Change]:
-    """Yield every quantity of both, without verdict yet."""
     for plane, of_first, of_second in _phases(first, second):
         known = _measured(of_first), _measured(of_second)
         for name in known[0]:
@@ -189,7 +184,6 @@ def _measured(quantities: Quantities) -> dict[str, Estimate]:
 
 
 def _change(name: str, plane: str, first: Estimate, second: Estimate) -> Change:
-    """Return one quantity of both."""
     if first.value is None or second.value is None:
         whys = {which: it.why or "no reason stated" for which, it in (("A", first), ("B", second)) if it.value is None}
         if len(whys) == 2 and first.why == second.why:

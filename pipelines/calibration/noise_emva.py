@@ -23,18 +23,10 @@ _NO_PAIR = "no {} has two frames, without which the pattern of the pixels cannot
 
 @dataclass(frozen=True)
 class MeanImage:
-    """The mean image of a series, as DSNU or PRNU are taken from it.
+    """The mean image of a series (row, column), with the temporal noise that is left in it: for DSNU or PRNU.
 
-    Attributes
-    ----------
-    series : Series
-        The series.
-    values : array (row, column)
-        In DN for a dark; for a bright one relative to its mean signal, dark and vignetting taken out.
-    noise : TemporalNoise
-        What temporal noise leaves in it.
-    signal_dn : float
-        Its mean above the dark of zero exposure.
+    Values are in DN for a dark; for a bright one relative to its mean signal, dark and vignetting taken out. The mean
+    above the dark of zero exposure is `signal_dn`.
     """
 
     series: Series
@@ -50,22 +42,10 @@ class MeanImage:
 
 @dataclass(frozen=True)
 class EmvaMeasurement:
-    """Content of the report of one phase of the mosaic.
+    """Content of the report of one phase of the mosaic, whose name is "" when it is the only one.
 
-    Attributes
-    ----------
-    name : str
-        Of the phase, "" when it is the only one.
-    calibration : NoiseCalibration
-        Its calibration.
-    series : tuple of Series
-        All its series, those that were left out included.
-    exposure_s : float
-        Exposure of the dark noise.
-    estimates : dict of Estimate
-        Quantities by the names of `EmvaRecord`.
-    dark, bright : MeanImage, optional
-        The images of DSNU and PRNU.
+    `series` are all, those that were left out included; `exposure_s` is that of the dark noise; `estimates` have the
+    names of `EmvaRecord`; `dark` and `bright` are the images of DSNU and PRNU.
     """
 
     name: str
@@ -186,7 +166,6 @@ def _bright_image(darks: list[Series], calibration: NoiseCalibration) -> MeanIma
 
 
 def _end_dn(calibration: NoiseCalibration) -> float:
-    """Return the level of saturation; of the brightest flat where none is known."""
     level = calibration.saturation.level_dn
     if level is not None:
         return level
@@ -195,7 +174,6 @@ def _end_dn(calibration: NoiseCalibration) -> float:
 
 
 def _dsnu(dark: MeanImage | None, calibration: NoiseCalibration) -> dict[str, Estimate]:
-    """Return DSNU in electrons: all of it, and its parts."""
     gain = calibration.estimates["gain_dn_per_e"]
     if gain.value is None or dark is None:
         why = gain.why if gain.value is None else _NO_PAIR.format("dark")
@@ -205,7 +183,6 @@ def _dsnu(dark: MeanImage | None, calibration: NoiseCalibration) -> dict[str, Es
 
 
 def _prnu(bright: MeanImage | None, calibration: NoiseCalibration) -> dict[str, Estimate]:
-    """Return PRNU as a share of the signal: all of it, and its parts."""
     if bright is None or calibration.estimates["prnu"].value is None:
         why = calibration.estimates["prnu"].why or _NO_PAIR.format("flat")
         return {f"prnu_{part.name}": Estimate(None, why=why) for part in fields(Nonuniformity)}
@@ -214,7 +191,6 @@ def _prnu(bright: MeanImage | None, calibration: NoiseCalibration) -> dict[str, 
 
 
 def _doubling(darks: list[Series], temperature_c: Mapping[str, float]) -> Estimate:
-    """Return over which temperature difference the dark current doubles."""
     level = np.concatenate([dark.levels_dn for dark in darks])
     exposure = np.concatenate([np.full(dark.frames, dark.conditions.exposure_s) for dark in darks])
     warmth = np.array([temperature_c.get(name, np.nan) for dark in darks for name in dark.names])

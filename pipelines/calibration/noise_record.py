@@ -106,7 +106,6 @@ def _mean(estimates: Sequence[Estimate]) -> Estimate:
 
 
 def _covariance(phases: Sequence[NoiseCalibration]) -> CovarianceRecord:
-    """Return names and matrix; of the phases' mean where there are several."""
     names = phases[0].covariance[0]
     if any(c.covariance[0] != names for c in phases):
         return CovarianceRecord([], [])
@@ -115,7 +114,6 @@ def _covariance(phases: Sequence[NoiseCalibration]) -> CovarianceRecord:
 
 
 def _fit_record(calibration: NoiseCalibration) -> FitRecord:
-    """Return the record of saturation, response and scatter of one phase."""
     estimates, saturation, response = calibration.estimates, calibration.saturation, calibration.response
     bends = None
     if response is not None:
@@ -169,7 +167,6 @@ def _gain_map(calibration: NoiseCalibration) -> tuple[NDArray[np.float32] | None
 
 
 def _interleave(readout: Readout, parts: Sequence[NDArray[Any]], fill: float | bool) -> NDArray[Any]:
-    """Return the phases' arrays interleaved to the size of a frame."""
     width, height = readout.size_px
     whole = np.full((height, width), fill, parts[0].dtype)
     region = whole[readout.rows, readout.columns]

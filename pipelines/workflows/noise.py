@@ -72,7 +72,6 @@ def _inform_of(record: NoiseRecord) -> None:
 
 
 def _inform_of_fit(fit: FitRecord) -> None:
-    """Print what the flats say of saturation and response, as far as they do."""
     saturation, error = fit.saturation, fit.linearity_error
     if saturation.level_dn is not None:
         full, capacity = fit.saturation_e, ""
@@ -117,7 +116,6 @@ def compare_sensors(first: Path, second: Path) -> NoiseComparison:
 
 
 def _inform_of_map(change: MapChange) -> None:
-    """Print how the maps of a quantity differ."""
     label = f"{change.plane}: {change.name} map" if change.plane else f"{change.name} map"
     if change.rms_dn is None or change.expected_dn is None:
         inform(f"{label}: {change.verdict}: {change.why}")

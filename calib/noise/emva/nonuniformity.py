@@ -45,7 +45,6 @@ class TemporalNoise:
         return TemporalNoise(self.variances * factor, self.errors * factor)
 
     def __add__(self, other: "TemporalNoise") -> "TemporalNoise":
-        """Return the noise of a sum or difference of images."""
         errors = np.array([*map(math.hypot, self.errors, other.errors)])
         return TemporalNoise(self.variances + other.variances, errors)
 

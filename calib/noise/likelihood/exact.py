@@ -44,16 +44,11 @@ def fit_exact(
 
     Parameters
     ----------
-    counts : Counts
-        Dark values.
-    start : dict
-        Initial values of `PARAMETERS`; they also decide the grids.
-    moments : Moments
-        Statistics of the flat series, if there are any, with the scatter of their noise.
-    bend : Bend
-        Response of the flats, which darks do not reach.
-    exact : bool
-        Use the Poisson sum, eq. (2), rather than the censored normal law, eq. (3).
+    counts, start, exact
+        As for `MarginalLikelihood`.
+    moments, bend : Moments, Bend
+        Statistics of the flat series, if there are any, with the scatter of their noise; and their response, which
+        darks do not reach.
     try_spread : bool
         Try dark currents that differ from pixel to pixel, which takes five times as long.
 

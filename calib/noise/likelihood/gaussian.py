@@ -188,7 +188,6 @@ def _wishart_cost(values: Mapping[str, Any], dark_v: list[Any], moments: Moments
 
 
 def _quadratic(weight: list[Any], a: Array, b: Array, scatter: Array) -> Any:
-    """Return aᵀ W S W b with W = diag(weight)."""
     left, right = (ca.vertcat(*[w * side[j] for j, w in enumerate(weight)]) for side in (a, b))
     return ca.mtimes([left.T, ca.DM(scatter), right])
 

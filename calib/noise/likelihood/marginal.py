@@ -221,12 +221,10 @@ def mass_function(
 
 
 def _normal_tail(u_dn: Array, charge: ca.MX, gain: ca.MX, read: ca.MX) -> ca.MX:
-    """Return Φ((u − g λ) / s), eq. (3)."""
     return _ndtr((ca.MX(u_dn) - gain * charge) / (gain * ca.sqrt(read**2 + charge)))
 
 
 def _poisson_tail(u_dn: Array, charge: ca.MX, gain: ca.MX, read: ca.MX, max_charge_e: float) -> ca.MX:
-    """Return Σ_k P(k; λ) Φ((u − g k) / gσ), eq. (2)."""
     k = np.arange(int(max_charge_e + 8 * np.sqrt(max_charge_e) + 10))
     poisson = ca.exp(ca.DM(k) * ca.log(charge) - charge - ca.DM(gammaln(k + 1.0)))
     u, electrons = np.repeat(u_dn[:, None], k.size, 1), np.repeat(k[None, :].astype(float), u_dn.size, 0)

@@ -54,7 +54,6 @@ def charge_slope(values: Mapping[str, Any], signal_dn: Any) -> Any:
 
 
 def _polynomial(coefficients: Sequence[Any], x: Any) -> Any:
-    """Return c₁ x + c₂ x² and so on."""
     total: Any = 0.0
     for coefficient in reversed(coefficients):
         total = (coefficient + total) * x
@@ -178,10 +177,8 @@ def level_log_likelihood(
     ----------
     values : mapping
         Parameters; numbers or casadi expressions.
-    mean_dn, dark_time_s : array (series,)
-        Mean level, and exposure by which dark signal grows.
-    variance_dn2 : sequence (series,)
-        Variance of each mean level, which includes that of the light.
+    mean_dn, dark_time_s, variance_dn2 : array, sequence (series,)
+        Mean level, exposure by which dark signal grows, and variance of the level, that of the light included.
     """
     total: Any = 0.0
     for group in light.groups:
@@ -228,16 +225,9 @@ def linearity_error(signal_dn: Array, light: Array) -> float:
 
 @dataclass(frozen=True)
 class FittedLevels:
-    """Levels of flats with the response that was fitted to them, for the linearity error.
+    """Light and mean signal of all flats (series,), dark signal removed, with its variance, for the linearity error.
 
-    Attributes
-    ----------
-    light : Light
-        Light of all flat series.
-    signal_dn, variance_dn2 : array (series,)
-        Mean signal, dark signal removed, and the variance of its error.
-    full_dn : float
-        Signal at saturation, or of the brightest level.
+    `full_dn` is the signal at saturation, or of the brightest level.
     """
 
     light: Light

@@ -52,14 +52,9 @@ class PixelGain:
 
 @dataclass(frozen=True)
 class PhotonTransfer:
-    """ε by the photon transfer of each pixel alone.
+    """ε by the photon transfer of each pixel alone (row, column), and its inverse variance given the read noise.
 
-    Attributes
-    ----------
-    epsilon, information : array (row, column)
-        ε, and its inverse variance given the read noise.
-    of_read : float
-        Variance that the error of the read noise adds to the mean of many pixels, relative to that of ε itself.
+    `of_read` is the variance that the error of the read noise adds to the mean of many pixels, over that of ε itself.
     """
 
     epsilon: Map
@@ -74,12 +69,10 @@ def photon_transfer(
 
     Parameters
     ----------
-    flats : sequence of Series
-        Flat series of two frames at least.
+    flats, values : sequence of Series, mapping
+        Flat series of two frames at least, and parameters of the fit.
     offset_dn, read_dn : array (row, column)
         Offset and read noise of each pixel.
-    values : mapping
-        Parameters of the fit.
     dark_freedom : float
         Degrees of freedom of the darks' variance of a pixel, from which its read noise is known.
     """
@@ -213,7 +206,6 @@ def _gain_seams(
 
 
 def _over_mean(response: Response, weight: Map) -> tuple[Map, Mask, float]:
-    """Return the response over its mean, the pixels that count, and the inverse variance of each."""
     counts = map_of(lambda rows: weight[rows] > 0, weight.shape, bool)
     mean = mean_over(lambda rows: response.relative[rows], counts)
     relative = map_of(lambda rows: response.relative[rows] / mean, weight.shape)

@@ -94,18 +94,12 @@ class Pixels:
 
     Attributes
     ----------
-    read, levels : PixelReadNoise, PixelLevels
-        Read noise; offset and dark signal.
-    variance_ratio : array (row, column)
-        Variance over that of the model.
     telegraph, noisy : array (row, column), bool
         Pixels that jump between two levels; pixels that are too noisy to be of use.
     response, response_e : Response, optional
         Response to light in DN, and in electrons of the pixels' own gain; None without flats.
     gain, gain_why : PixelGain, str
         Gain over the mean; None if the frames do not determine it, and the reason.
-    offset_seams : tuple of Seam
-        Regions whose offsets differ.
     """
 
     read: PixelReadNoise
@@ -222,7 +216,6 @@ def _read_noise(fitted: SeriesFit, hot: Mask) -> tuple[PixelReadNoise, Mask]:
 
 
 def _levels(fitted: SeriesFit, read: PixelReadNoise, hot: Mask) -> PixelLevels:
-    """Return offset and dark signal of every pixel; the sensor's own if values are cut off."""
     values = fitted.fit.values
     if fitted.likelihood is _CENSORED:
         names = ("offset_dn", "dark_signal_dn_per_s", "dsnu_dn2", "dcnu_dn2_per_s2")
@@ -238,12 +231,7 @@ def _levels(fitted: SeriesFit, read: PixelReadNoise, hot: Mask) -> PixelLevels:
 def line_pattern(darks: Sequence[Series], dsnu_dn2: float) -> LinePattern:
     """Return what rows and columns share in the offsets, by the dark series of most frames, shrunk by chance.
 
-    Parameters
-    ----------
-    darks : sequence of Series
-        Dark series, at least one.
-    dsnu_dn2 : float
-        Variance of the offsets of the pixels, which scatters the means of rows and columns, too.
+    `dsnu_dn2` is the variance of the offsets of the pixels, which scatters the means of rows and columns, too.
     """
     most = max(darks, key=lambda dark: dark.frames)
     rows, columns = most.pattern_dn.shape
@@ -270,10 +258,8 @@ def pixel_levels(
 
     Parameters
     ----------
-    darks : sequence of Series
-        Dark series, at least one.
-    values : mapping
-        `offset_dn`, `dark_signal_dn_per_s`, `dsnu_dn2`, `dcnu_dn2_per_s2` of the fit.
+    darks, values : sequence of Series, mapping
+        Dark series, and `offset_dn`, `dark_signal_dn_per_s`, `dsnu_dn2`, `dcnu_dn2_per_s2` of the fit.
     noise_dn2 : sequence of callables
         Return the noise of some rows of pixels (row, column) in each series, or one number for all.
     pattern : LinePattern

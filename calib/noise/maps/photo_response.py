@@ -47,10 +47,8 @@ class Response:
 
     Attributes
     ----------
-    relative, vignetting : array (row, column)
-        Response over its mean, and its smooth part.
-    relative_se : array (row, column)
-        Standard error of the response of a pixel beside the smooth part.
+    relative, vignetting, relative_se : array (row, column)
+        Response over its mean, its smooth part, and the standard error of the rest.
     prnu, prnu_se : float
         Standard deviation of the rest relative to the mean (EMVA 1288's PRNU after its high-pass filter), and its
         standard error.
@@ -173,7 +171,6 @@ def _dead(raw: Map, usable: Mask) -> Mask:
 
 
 def _width(shape: tuple[int, ...]) -> int:
-    """Return the width of the running mean: a sixteenth of the frame."""
     return int(max(_WINDOW_PX, min(shape) // 16) | 1)
 
 
@@ -213,7 +210,6 @@ def _surface(response: Map, usable: Mask) -> Callable[[slice], Array]:
 
 
 def _running_mean(response: Map, usable: Mask, window: int) -> Map:
-    """Return the mean over the usable pixels of a window around each pixel (row, column)."""
     mean = _box(np.where(usable, response, response.dtype.type(0)), window)
     share = _box(usable.astype(response.dtype), window)
     return map_of(lambda rows: mean[rows] / np.maximum(share[rows], 1e-6), mean.shape, mean.dtype)

@@ -113,7 +113,6 @@ def _profiles(values: NDArray[Any], weight: NDArray[Any], precision: float) -> d
 
 
 def _find_seam(profile: Array, weight: Array, lines: str) -> Seam | None:
-    """Return the likeliest seam of a profile (line,), None without any."""
     count = profile.size
     x = np.linspace(-1, 1, count)
     before = _fit(np.stack([np.ones(count), x, x**2], axis=1), profile, weight)[2]

@@ -58,18 +58,8 @@ class NoiseSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
 class FrameSeries:
     """The frames of a noise set or a session, checked, in series of one kind, exposure, light and temperature.
 
-    Attributes
-    ----------
-    folder : Path
-        Folder that file names are relative to.
-    settings : NoiseSet
-        Names of the frames and what is stated of them.
-    series : dict of Conditions to list of Path
-        Frames by what they have in common, darks first, each kind by exposure.
-    warnings : list of str
-        Problems of the temperatures.
-    described_in : str
-        File that names the frames.
+    File names in `settings` are relative to `folder`, and so is `described_in`, the file that names the frames. Darks
+    come first, each kind by exposure; `warnings` are problems of the temperatures.
     """
 
     folder: Path
@@ -117,7 +107,6 @@ def load_noise_set(folder: Path) -> FrameSeries:
 
 
 def _check_settings(path: Path, settings: NoiseSet) -> None:
-    """Refuse settings without frames, files that are missing or named twice, and impossible numbers."""
     if not settings.frame:
         raise BadValue(f"{path}: names no frame; give a [[frame]] with file, kind and exposure_s for each")
     seen: set[Path] = set()
@@ -247,13 +236,11 @@ def _split_by_temperature(frames: list[tuple[Path, float | None]]) -> list[list[
 
 
 def _known(settings: NoiseSet, *kinds: str) -> list[float]:
-    """Return the temperatures that are stated, of all frames or of some kinds."""
     frames = (frame for frame in settings.frame if not kinds or frame.kind in kinds)
     return [frame.temperature_c for frame in frames if frame.temperature_c is not None]
 
 
 def _temperature_warnings(settings: NoiseSet) -> list[str]:
-    """Return warnings about temperatures that are not stated, or not steady."""
     missing = [frame.file for frame in settings.frame if frame.temperature_c is None]
     known, warnings = _known(settings), list[str]()
     if missing:
