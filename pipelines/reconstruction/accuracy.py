@@ -99,16 +99,8 @@ def _back_projections(noise_free: ElementalSet, depths: list[float]) -> dict[flo
 class DepthErrors(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Errors of the depths that are known, at the samples where the truth is known, too.
 
-    Attributes
-    ----------
-    file : str
-        The map that was compared.
-    samples, share : int, float
-        Number of samples that were compared, and their share of those with a true depth.
-    median_error_mm, median_relative_error : float
-        Median of the error's size, in mm and as a share of the true depth.
-    within_2_percent : float
-        Share of the compared samples whose error is at most 2 % of the true depth.
+    `share` is that of the samples with a true depth, `median_relative_error` a share of the true depth, and
+    `within_2_percent` the share of the compared samples whose error is at most that.
     """
 
     file: str

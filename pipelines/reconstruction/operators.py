@@ -206,3 +206,13 @@ def seen_from(
     shifts = elemental_set.principal_points_px() - np.array([camera.cx_px, camera.cy_px])
     straight, plane = pixels - shifts[elemental_set.reference_view], fronto_parallel_rt_ref_plane(depth_mm)
     return np.array([transfer(elemental_set.lens, poses[view], plane, straight) + shifts[view] for view in views])
+
+
+def blind_views(elemental_set: ElementalSet, operator: SceneOperator | SurfaceOperator, what: str) -> str | None:
+    """Return a message on views that see nothing of a plane or surface, as a pose may be wrong; None without such."""
+    phases = len(operator.all_views) // len(elemental_set.settings.view)
+    blind = {int(view) // phases for view in np.setdiff1d(operator.all_views, operator.seeing_views)}
+    if not blind:
+        return None
+    first = elemental_set.settings.view[min(blind)].image
+    return f"{len(blind)} views see nothing of {what}, {first} for one; are their poses right?"

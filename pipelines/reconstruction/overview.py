@@ -1,6 +1,6 @@
 """A set at a glance: how dark it is, where its objects are, and its views as pictures."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +9,13 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.pipelines.errors import BadValue, UnreadableImage
+from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import write_record, write_whole
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import Picture, contact_sheet, encoded, grey_levels, white_level
 from faintfield.pipelines.formats.results.figures import OVERVIEW_FILE, Brightness, Overview
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, in_units
-from faintfield.pipelines.reconstruction.channels import channel_layouts, lattice_noise, view_electrons
+from faintfield.pipelines.reconstruction.channels import channel_layouts, checked_frame, lattice_noise, view_electrons
 from faintfield.recon.metrics import photons_from_linear_snr, photons_from_moments, snr_from_powers
 from faintfield.recon.threads import map_in_threads
 
@@ -140,28 +140,21 @@ def _figures(
     )
 
 
-@dataclass(frozen=True)
-class SetAtAGlance:
-    """A set at a glance: its pictures by file name, as PNG, and their record."""
-
-    pictures: dict[str, bytes]
-    record: Overview
-
-
-def look_at(elemental_set: ElementalSet) -> SetAtAGlance:
-    """Return a set at a glance; all its views share one grey scale.
+def inspect_set(elemental_set: ElementalSet) -> tuple[Overview, dict[str, bytes]]:
+    """Return the record of a set, and its pictures as PNG by file name; all its views share one grey scale.
 
     Every view is read, so that one that cannot be used is found before planes are made (InputError).
     """
-    size_px = elemental_set.settings.camera.size_px
-    reference = elemental_set.read_frame(elemental_set.image_paths[elemental_set.reference_view], size_px).pixels_dn
+    size_px, layout = elemental_set.settings.camera.size_px, channel_layouts(elemental_set)[0]
+    reference_path = elemental_set.image_paths[elemental_set.reference_view]
+    reference = checked_frame(elemental_set, reference_path, layout).pixels_dn
     black, white = grey_scale_dn(reference)
     grid = _grid(elemental_set)
     columns = grid[1] if grid else int(np.ceil(np.sqrt(len(elemental_set.settings.view))))
     small_px = max(_SHEET_WIDTH_PX // columns, 24)
 
     def shrunk_view(path: Path) -> Picture:
-        return grey_levels(_every_nth(_pixels_like(elemental_set, reference, path), small_px), white, black)
+        return grey_levels(_every_nth(checked_frame(elemental_set, path, layout).pixels_dn, small_px), white, black)
 
     small = map_in_threads(shrunk_view, elemental_set.image_paths)
     pictures = {
@@ -197,25 +190,14 @@ def look_at(elemental_set: ElementalSet) -> SetAtAGlance:
         raise BadValue(
             f"{elemental_set.folder}: its light is not finite ({failure}); correct its noise model or object region"
         ) from failure
-    return SetAtAGlance({name: encoded(picture, ".png") for name, picture in pictures.items()}, record)
+    return record, {name: encoded(picture, ".png") for name, picture in pictures.items()}
 
 
-def _pixels_like(elemental_set: ElementalSet, reference: NDArray[Any], path: Path) -> NDArray[Any]:
-    height, width = reference.shape[:2]
-    pixels = elemental_set.read_frame(path, (width, height)).pixels_dn
-    if pixels.shape != reference.shape:
-        kind = "colour" if pixels.ndim == 3 else "grey"
-        raise UnreadableImage(
-            f"{path}: is {kind}, unlike the set's reference view; all views must be of one kind; export all alike"
-        )
-    return pixels
-
-
-def write_overview(overview: SetAtAGlance, out: Path) -> None:
+def write_overview(record: Overview, pictures: Mapping[str, bytes], out: Path) -> None:
     """Write the pictures of a set and `overview.json` into `out`."""
-    for name, picture in overview.pictures.items():
+    for name, picture in pictures.items():
         write_whole(out / name, picture)
-    write_record(out / OVERVIEW_FILE, overview.record)
+    write_record(out / OVERVIEW_FILE, record)
 
 
 def _bright_views(elemental_set: ElementalSet, region: Region | None) -> dict[str, Picture]:

@@ -45,22 +45,9 @@ type _Unit = Literal["mm", "px", "own"]
 class Request:
     """Planes of a set to reconstruct, and how.
 
-    Attributes
-    ----------
-    depths_mm, tilted : list
-        Depths of planes, and planes given by a pose.
-    methods, solver : list of Method, SolverOptions
-        Methods by which each is reconstructed, and their options.
-    pitch_mm : float, optional
-        Distance of the planes' samples; one detector pixel of the reference view if None.
-    with_focus, with_depth_map : bool
-        Make a curve of focus against depth, or a depth map and an all-in-focus picture.
-    disparities_px : dict of depth in mm to px
-        Disparities that were asked for instead of depths, if any.
-    found : BestFocusRecord, optional
-        How the depths were found, if they were.
-    auto_sweep : int, optional
-        How many depths `--sweep auto` found, the last ones; None if it was not asked for.
+    The samples of a plane are `pitch_mm` apart, one detector pixel of the reference view if None. `disparities_px` has
+    the disparity of each depth if disparities were asked for. `found` says how the depths were found, if they were, and
+    `auto_sweep` how many of them, the last ones, are those of `--sweep auto`.
     """
 
     depths_mm: list[float]

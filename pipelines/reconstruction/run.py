@@ -2,6 +2,7 @@
 
 import shutil
 import time
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
@@ -35,7 +36,7 @@ from faintfield.pipelines.reconstruction.channels import SHARE_OF_DISK, channel_
 from faintfield.pipelines.reconstruction.depth.depth_map import kept_depth_map, write_depth_map
 from faintfield.pipelines.reconstruction.depth.search import check_overlap, check_views, default_bins, depths_of_set
 from faintfield.pipelines.reconstruction.operators import default_pitch_px, plane_grid, tilted_grid
-from faintfield.pipelines.reconstruction.overview import look_at, write_overview
+from faintfield.pipelines.reconstruction.overview import inspect_set, write_overview
 from faintfield.pipelines.reconstruction.planes.sweep import Runner, Sweep, run_serially
 from faintfield.pipelines.reconstruction.request import Request, folder_of_method
 from faintfield.recon.operator.grid import PlaneGrid
@@ -50,10 +51,10 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     out: str
     report: str | UnsetType = UNSET
     planes: list[PlaneRecord]
-    focus: FocusCurve | None
-    best_focus: BestFocusRecord | None
-    depth_map: DepthMapRecord | None
-    metrics: Metrics | None
+    focus: FocusCurve | None = None
+    best_focus: BestFocusRecord | None = None
+    depth_map: DepthMapRecord | None = None
+    metrics: Metrics | None = None
     surface: SurfaceRecord | UnsetType = UNSET
     units: StatedUnits | UnsetType = UNSET
 
@@ -67,22 +68,17 @@ def reconstruct_set(elemental_set: ElementalSet, out: Path, request: Request, ru
     """
     started = time.monotonic()
     found = in_units(elemental_set, request.found) if request.found else None
-    _refuse_pitch(elemental_set, request)
     folders = {name: folder_of_method(out, name, request.methods) for name in request.methods}
-    range_mm = min(request.depths_mm, default=0.0), max(request.depths_mm, default=0.0)
-    if request.with_depth_map:
-        _refuse_surfaces(list(folders.values()))
-        check_views(elemental_set, "a depth map")
-        check_overlap(elemental_set, range_mm)
+    _check(elemental_set, folders.values(), request)
     sweep = _sweep(elemental_set, folders, request)
-    overview = look_at(elemental_set)  # here, as what is wrong with a set is to be found before its planes are made
+    overview, pictures = inspect_set(elemental_set)  # what is wrong with a set is to be found before planes are made
     read_truth(elemental_set.folder)
     depth_map = kept_depth_map(folders, sweep.origins) if request.with_depth_map else None
     estimate = None
     if request.with_depth_map and depth_map is None:
-        _, estimate = depths_of_set(elemental_set, default_bins(elemental_set), range_mm, out)
+        _, estimate = depths_of_set(elemental_set, default_bins(elemental_set), _range_mm(request), out)
     _make_planes(sweep, folders, out, runner)
-    write_overview(overview, out)
+    write_overview(overview, pictures, out)
     if estimate is not None:
         depth_map = write_depth_map(elemental_set, estimate, sweep.written, request.disparities_px, sweep.origins)
     if depth_map is not None:
@@ -114,20 +110,26 @@ def reconstruct_set(elemental_set: ElementalSet, out: Path, request: Request, ru
     )  # fmt: skip
 
 
-def _refuse_pitch(elemental_set: ElementalSet, request: Request) -> None:
+def _check(elemental_set: ElementalSet, folders: Iterable[Path], request: Request) -> None:
+    """Refuse a pitch in mm for a set that knows no lengths, and sets and folders that can have no depth map."""
     if request.pitch_mm and elemental_set.units.depth == "disparity_px":
         raise BadValue(
             f"{elemental_set.folder}: knows disparities, no lengths; a pitch of {request.pitch_mm:g} means nothing; "
             "leave --pitch-mm out, or import the pictures again with the pitch of the nodes and the focal length"
         )
-
-
-def _refuse_surfaces(folders: list[Path]) -> None:
+    if not request.with_depth_map:
+        return
     for folder in folders:
         if (folder / SURFACE_FILE).exists():
             raise OutputExists(
                 f"{folder}: holds a surface, whose files have the names of the depth map's; give another --out"
             )
+    check_views(elemental_set, "a depth map")
+    check_overlap(elemental_set, _range_mm(request))
+
+
+def _range_mm(request: Request) -> tuple[float, float]:
+    return min(request.depths_mm), max(request.depths_mm)
 
 
 def _make_planes(sweep: Sweep, folders: dict[Method, Path], out: Path, runner: Runner) -> None:
@@ -176,28 +178,21 @@ def _sweep(elemental_set: ElementalSet, folders: dict[Method, Path], request: Re
 
 def _warn(elemental_set: ElementalSet, records: list[PlaneRecord]) -> None:
     """Inform the user of planes that may be wrong: unsettled, not converged, or without light."""
-    certificates = [
-        record.certificate for record in records if record.certificate and record.certificate.oscillates is not UNSET
-    ]
-    swings = [
-        certificate.relative_change
-        for certificate in certificates
-        if certificate.oscillates and certificate.relative_change is not UNSET
-    ]
+    certificates = [record.certificate for record in records if record.certificate]
+    steps = [certificate for certificate in certificates if certificate.oscillates is not UNSET]
+    swings = [certificate.relative_change or 0.0 for certificate in steps if certificate.oscillates]
     if swings:
         inform(
-            f"the one-step-late iteration does not settle on {len(swings)} of {len(certificates)} planes: it swings by "
-            f"up to {max(swings):.1%} per pass (see reconstruction.json). A few percent hide little; a smaller "
+            f"the one-step-late iteration does not settle on {len(swings)} of {len(steps)} planes: it swings by up to "
+            f"{max(swings):.1%} per pass (see reconstruction.json). A few percent hide little; a smaller "
             "--penalty-weight calms it, and leaves more noise."
         )
-    certificates = [record.certificate for record in records if record.certificate and record.certificate.is_bound]
-    missed = [
-        certificate.value for certificate in certificates if not certificate.reached and certificate.value is not UNSET
-    ]
+    bounds = [certificate for certificate in certificates if certificate.is_bound]
+    missed = [certificate.value or 0.0 for certificate in bounds if not certificate.reached]
     if missed:
         inform(
-            f"pmlem stopped before its certificate on {len(missed)} of {len(certificates)} planes: up to "
-            f"{max(missed):.1%} from the optimum instead of {certificates[0].tolerance:.0%}; allow more --passes"
+            f"pmlem stopped before its certificate on {len(missed)} of {len(bounds)} planes: up to {max(missed):.1%} "
+            f"from the optimum instead of {bounds[0].tolerance:.0%}; allow more --passes"
         )
     without = [record.prior.left_out for record in records if record.prior and record.prior.left_out]
     if without:

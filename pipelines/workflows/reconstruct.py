@@ -76,10 +76,7 @@ def surface_and_report(elemental_set: ElementalSet, out: Path, request: SurfaceR
             report = write_report(page_in)
     sure = f"{record.known_share:.0%} of its depths known, {record.sure_share:.0%} sure"
     inform(f"a surface in {time.monotonic() - started:.1f} s, {sure}: {report}")
-    return Outcome(
-        out=str(out), report=str(report), planes=[], focus=None, best_focus=None, depth_map=None, metrics=None,
-        surface=record, units=elemental_set.units,
-    )  # fmt: skip
+    return Outcome(out=str(out), report=str(report), planes=[], surface=record, units=elemental_set.units)
 
 
 def open_set(

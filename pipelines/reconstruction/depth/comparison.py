@@ -1,6 +1,6 @@
 """Views of a set compared in bins of pixels: their agreement at each depth, and whether it could be chance."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations
 from math import factorial
@@ -119,20 +119,6 @@ def binned_views(elemental_set: ElementalSet, middle_mm: float, out: Path, *, mi
     return BinnedViews(elemental_set, colours, bins * max(lattice.step))
 
 
-@dataclass(frozen=True)
-class _Views:
-    """Views from each other's places; the arguments of `disagreement`, and the nodes."""
-
-    light_e: NDArray[np.float32]
-    seen: NDArray[np.bool_]
-    known_variance_e2: float
-    nodes: list[tuple[int, int] | None]
-
-    def tried(self, places: NDArray[np.intp]) -> float:
-        """Return how much the views disagree if taken from these places."""
-        return disagreement(self.light_e, self.seen, places, self.known_variance_e2)
-
-
 def check_places(views: BinnedViews, range_mm: tuple[float, float]) -> Significance | None:
     """Return how much better the views agree at their places than shuffled, over a whole range of depths.
 
@@ -149,12 +135,15 @@ def check_places(views: BinnedViews, range_mm: tuple[float, float]) -> Significa
         return None
     depths_mm = (1 / np.linspace(1 / range_mm[0], 1 / range_mm[1], _DEPTHS)).tolist()
     with working("preparing the comparison of shuffled views"):
-        shown = _from_all_places(views, chosen, depths_mm)
-    stated = shown.tried(np.arange(count))
-    shuffled = [shown.tried(places) for places in progress(_shuffles(count), "comparing shuffled views")]
+        disagreement_from = _from_all_places(views, chosen, depths_mm)
+    stated = disagreement_from(np.arange(count))
+    shuffled = [disagreement_from(places) for places in progress(_shuffles(count), "comparing shuffled views")]
     found = significance(stated, shuffled)
     largest = next(p_value for fewest, p_value in _LARGEST_P.items() if count >= fewest)
-    _refuse_rearranged(views.elemental_set, shown, stated, shuffled, min(largest, _MAX_P_REARRANGED))
+    nodes = [views.elemental_set.settings.view[view].node for view in chosen]
+    rearranged = [(disagreement_from(places), remedy) for remedy, places in _arrangements(nodes)]
+    if rearranged:
+        _refuse_rearranged(views.elemental_set, min(rearranged), stated, shuffled, min(largest, _MAX_P_REARRANGED))
     if found.p_value > largest:
         raise NothingInFocus(
             f"{views.elemental_set.folder}: the views agree no better than shuffled ones (p = {found.p_value:.2g} of "
@@ -182,15 +171,11 @@ def _shuffles(count: int) -> list[NDArray[np.intp]]:
 
 
 def _refuse_rearranged(
-    elemental_set: ElementalSet, shown: _Views, statistic: float, shuffled: list[float], largest_p: float
+    elemental_set: ElementalSet, rearranged: tuple[float, str], statistic: float, shuffled: list[float], max_p: float
 ) -> None:
     """Refuse views that agree clearly better with their rows or columns reversed, or exchanged (NothingInFocus)."""
-    chance = float(np.mean(shuffled))
-    tried = [(shown.tried(places), remedy) for remedy, places in _arrangements(shown.nodes)]
-    if not tried:
-        return
-    best, remedy = min(tried)
-    if significance(best, shuffled).p_value <= largest_p and chance - best > _CLEARLY * (chance - statistic):
+    chance, (best, remedy) = float(np.mean(shuffled)), rearranged
+    if significance(best, shuffled).p_value <= max_p and chance - best > _CLEARLY * (chance - statistic):
         raise NothingInFocus(
             f"{elemental_set.folder}: the views agree better with {remedy}: "
             f"by {chance - best:.3g} in squared deviations, "
@@ -231,8 +216,10 @@ def _compared(views: BinnedViews) -> list[int]:
     return [view for view in chosen if known[view] >= _MIN_KNOWN]
 
 
-def _from_all_places(views: BinnedViews, chosen: list[int], depths_mm: list[float]) -> _Views:
-    """Return what some views show of the planes, in one colour, if taken from each of their places."""
+def _from_all_places(
+    views: BinnedViews, chosen: list[int], depths_mm: list[float]
+) -> Callable[[NDArray[np.intp]], float]:
+    """Return a function of places that returns how much some views, in one colour, disagree if taken from there."""
     elemental_set, (layout, images) = views.elemental_set, views.colours[0]
     shape, bins = images.electrons.shape[1:], 1
     while (shape[0] // bins) * (shape[1] // bins) > _MAX_SAMPLES and min(shape) // (2 * bins) >= _MIN_BINS:
@@ -250,12 +237,12 @@ def _from_all_places(views: BinnedViews, chosen: list[int], depths_mm: list[floa
                 image, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
             )
     inside = (places_px >= 0) & (places_px <= np.array(light.shape[:0:-1]) - 1)
-    return _Views(
-        shown,
-        inside.all(axis=-1),
-        known / len(layout.lattices),
-        [elemental_set.settings.view[view].node for view in chosen],
-    )
+    inside, known_variance_e2 = inside.all(axis=-1), known / len(layout.lattices)
+
+    def disagreement_from(places: NDArray[np.intp]) -> float:
+        return disagreement(shown, inside, places, known_variance_e2)
+
+    return disagreement_from
 
 
 def _places_px(

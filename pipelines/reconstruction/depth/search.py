@@ -18,7 +18,7 @@ from faintfield.pipelines.console import inform, working
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.frames import Lattice
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
-from faintfield.pipelines.reconstruction.channels import ChannelLayout, channel_layouts, lattice_noise, view_electrons
+from faintfield.pipelines.reconstruction.channels import channel_layouts, lattice_noise, view_electrons
 from faintfield.pipelines.reconstruction.depth.autofocus import overlap, views_of_search
 from faintfield.pipelines.reconstruction.depth.comparison import BETWEEN_PIXELS, check_places
 from faintfield.pipelines.reconstruction.operators import plane_grid, principal_shift, response_of
@@ -61,7 +61,10 @@ def luminance(elemental_set: ElementalSet, bins: int) -> PinholeViews:
     layouts = channel_layouts(elemental_set)
     parts = [(layout, lattice) for layout in layouts for lattice in layout.lattices]
     responses = [_response(elemental_set, lattice, bins) for _, lattice in parts]
-    backgrounds, variances = zip(*(_known(elemental_set, lattice) for _, lattice in parts), strict=True)
+    noises = [lattice_noise(elemental_set, lattice, None) for _, lattice in parts]
+    backgrounds = [elemental_set.background_e(noise) for noise in noises]
+    read_variances = [float(np.mean(elemental_set.read_variance_e2(noise))) for noise in noises]
+    variances = [float(np.mean(dark)) + read for dark, read in zip(backgrounds, read_variances, strict=True)]
     grid = plane_grid(elemental_set, 1.0).binned(bins)
     views = len(elemental_set.settings.view)
     width, height = elemental_set.settings.camera.size_px
@@ -71,8 +74,10 @@ def luminance(elemental_set: ElementalSet, bins: int) -> PinholeViews:
 
     def read(view: int) -> None:
         total = np.zeros(shape, np.float32)
-        for response, background, (lattice, sum_e, over) in zip(
-            responses, backgrounds, _electrons(elemental_set, layouts, view), strict=True
+        paths = elemental_set.frame_paths(view)
+        electrons = (found for layout in layouts for found in view_electrons(elemental_set, layout, paths))
+        for (_, lattice), response, background, (sum_e, over) in zip(
+            parts, responses, backgrounds, electrons, strict=True
         ):
             usable = (response > 0) & (_summed(over, lattice, bins) == 0)
             light_e = _summed(sum_e - np.asarray(background, np.float32), lattice, bins)
@@ -109,22 +114,6 @@ def _summed(values: NDArray[Any], lattice: Lattice, bins: int) -> NDArray[Any]:
     rows, columns = values.shape[0] // down, values.shape[1] // right
     whole = values[: rows * down, : columns * right].reshape(rows, down, columns, right)
     return np.asarray(whole.sum(axis=(1, 3)))
-
-
-def _electrons(
-    elemental_set: ElementalSet, layouts: list[ChannelLayout], view: int
-) -> Iterator[tuple[Lattice, NDArray[np.float32], NDArray[np.bool_]]]:
-    for layout in layouts:
-        found = view_electrons(elemental_set, layout, elemental_set.frame_paths(view))
-        for lattice, (sum_e, over) in zip(layout.lattices, found, strict=True):
-            yield lattice, sum_e, over
-
-
-def _known(elemental_set: ElementalSet, lattice: Lattice) -> tuple[float | NDArray[np.floating], float]:
-    """Return the background of a lattice (row, column), and the mean variance that is not of the light."""
-    noise = lattice_noise(elemental_set, lattice, None)
-    background_e = elemental_set.background_e(noise)
-    return background_e, float(np.mean(background_e)) + float(np.mean(elemental_set.read_variance_e2(noise)))
 
 
 def _undistorted_places(

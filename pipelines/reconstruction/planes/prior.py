@@ -7,8 +7,9 @@ from functools import partial
 import numpy as np
 from msgspec import UNSET, structs
 
-from faintfield.pipelines.arguments import PriorName, SolverOptions
+from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.formats.results.records import PriorRecord, SolveRecord
+from faintfield.pipelines.reconstruction.planes.learned_prior import learned_estimate, outside_range
 from faintfield.pipelines.reconstruction.planes.penalised import Objective, Solution, certified, with_sigma
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.prior.collaborative import patch_candidates
@@ -32,21 +33,12 @@ def with_prior(
     win. Its record says how far they moved it. Groups of alike patches are found in the sum with `other_colours`
     (samples), if given. Standard deviations are added where the options ask for them.
     """
-    operator = objective.posed.operator
-    if not options.has_prior:
-        found, answers = list(solutions), None
-    elif len(operator.seeing_views) < MIN_VIEWS:
-        found, answers = [_without(solution, "too few views to hold some out") for solution in solutions], None
-    else:
-        samples = operator.samples_of([solution.plane for solution in solutions])
-        evidences = evidence_of_planes(operator, objective.posed.images, samples, other_colours=other_colours)
-        why_not = _contradiction(objective, samples, evidences)
-        made = (
-            None if why_not else _about_proposals(objective, solutions, evidences, options, other_colours=other_colours)
-        )
-        if made is None:
-            why_not = why_not or "total variation predicts held-out views best"
-            found, answers = [_without(solution, why_not) for solution in solutions], None
+    found, answers = list(solutions), None
+    if options.has_prior:
+        made = _about_proposals(objective, solutions, options, other_colours=other_colours)
+        if isinstance(made, str):
+            prior = PriorRecord(name="tv", left_out=made)
+            found = [replace(solution, record=structs.replace(solution.record, prior=prior)) for solution in solutions]
         else:
             found, answers = made
     return with_sigma(objective, found, answers) if options.uncertainty else found
@@ -67,22 +59,27 @@ def _contradiction(objective: Objective, samples: Image, evidences: Sequence[Evi
 
 
 def _about_proposals(
-    objective: Objective,
-    solutions: Sequence[Solution],
-    evidences: Sequence[Evidence],
-    options: SolverOptions,
-    *,
-    other_colours: Image | None,
-) -> tuple[list[Solution], Callable[[int, LocalProblem], Answers]] | None:
-    """Return the planes about their proposals, and how each answers to noise; None if nothing is proposed."""
+    objective: Objective, solutions: Sequence[Solution], options: SolverOptions, *, other_colours: Image | None
+) -> tuple[list[Solution], Callable[[int, LocalProblem], Answers]] | str:
+    """Return the planes about their proposals, and how each answers to noise; or why nothing is proposed."""
     operator, first = objective.posed.operator, solutions[0].record
+    if len(operator.seeing_views) < MIN_VIEWS:
+        return "too few views to hold some out"
     weight = first.penalty_weight or 0.0
     samples = operator.samples_of([solution.plane for solution in solutions])
-    no_network = _why_no_network(evidences) if options.prior != "patches" else None
-    candidates = _candidates(options.prior if no_network is None else "patches")
+    evidences = evidence_of_planes(operator, objective.posed.images, samples, other_colours=other_colours)
+    if contradiction := _contradiction(objective, samples, evidences):
+        return contradiction
+    candidates: Candidates = patch_candidates
+    no_network = None
+    if options.prior != "patches":
+        reasons = (outside_range(evidence.pilot, evidence.noise) for evidence in evidences)
+        no_network = next((reason for reason in reasons if reason is not None), None)
+        if no_network is None:
+            candidates = partial(_with_network, alone=options.prior == "learned")
     proposals = propose(objective.posed, samples, evidences, weight, candidates, other_colours=other_colours)
     if all(weights.get("tv") == 1 for proposal in proposals for weights in proposal.mixture.values()):
-        return None
+        return "total variation predicts held-out views best"
     proposed = operator.samples_of([proposal.picture for proposal in proposals])
     dual = replace(objective.posed.dual(), proposal=proposed)
     record, found = certified(objective, np.maximum(proposed, 1e-3 * objective.start), weight, dual, options)
@@ -103,24 +100,8 @@ def _about_proposals(
     ], answers
 
 
-def _why_no_network(evidences: Sequence[Evidence]) -> str | None:
-    """Return why a plane is unlike those that the network knows, None if all are like them."""
-    from faintfield.pipelines.reconstruction.planes.learned_prior import outside_range  # OpenCV is slow to load
-
-    reasons = (outside_range(evidence.pilot, evidence.noise) for evidence in evidences)
-    return next((reason for reason in reasons if reason is not None), None)
-
-
-def _candidates(prior: PriorName | None) -> Candidates:
-    if prior == "patches":
-        return patch_candidates
-    return partial(_with_network, alone=prior == "learned")
-
-
 def _with_network(evidence: Evidence, *, alone: bool) -> dict[str, Image]:
     """Return the candidates from patches and what the network makes of them; alone: only that and total variation's."""
-    from faintfield.pipelines.reconstruction.planes.learned_prior import learned_estimate  # OpenCV is slow to load
-
     found = patch_candidates(evidence)
     patches = (found["wiener"] + found["twice"]) / 2
     variance = evidence.noise.variance
@@ -150,7 +131,3 @@ def _solution(
     if options.proposal:
         sidecars = sidecars | {"proposal": proposal.picture, "moved": moved}
     return Solution(plane, structs.replace(record, prior=prior), sidecars)
-
-
-def _without(solution: Solution, reason: str) -> Solution:
-    return replace(solution, record=structs.replace(solution.record, prior=PriorRecord(name="tv", left_out=reason)))

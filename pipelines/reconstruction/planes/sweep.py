@@ -25,7 +25,7 @@ from faintfield.pipelines.formats.results.records import (
 )
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, in_units, light_per_e
 from faintfield.pipelines.reconstruction.channels import ChannelLayout, load_channel
-from faintfield.pipelines.reconstruction.operators import OperatorFactory
+from faintfield.pipelines.reconstruction.operators import OperatorFactory, blind_views
 from faintfield.pipelines.reconstruction.planes.penalised import Pilot, Solution
 from faintfield.pipelines.reconstruction.planes.solve import solve, solve_together
 from faintfield.recon.depth.focus import FocusMeasure, focus_measure, sharp_depths_mm
@@ -57,10 +57,7 @@ class Channel:
     """One colour of a set in memory: what all of its tasks share."""
 
     def __init__(self, elemental_set: ElementalSet, layout: ChannelLayout, images: ElementalImages) -> None:
-        self._loaded = elemental_set
-        self._layout = layout
-        self._images = images
-        self._phases = len(layout.lattices)
+        self._set, self._layout, self._images = elemental_set, layout, images
         self._factory = OperatorFactory(elemental_set, layout, images)
 
     def total_variation(self, task: PlaneTask) -> dict[Place, Solution]:
@@ -77,7 +74,8 @@ class Channel:
         focus: dict[Place, FocusPoint | None] = dict.fromkeys(task.grids)
         for place, grid in task.grids.items():
             operator = self._operator(place, grid)
-            messages += self._blind_views(operator, place)
+            if message := blind_views(self._set, operator, "the plane"):
+                messages.append(f"{self._describe(place)}: {message}")
             if task.with_focus:
                 focus[place] = FocusPoint(*focus_measure(operator, self._images, self._halves()))
             for files in task.files:
@@ -103,7 +101,7 @@ class Channel:
     def _save(self, task: PlaneTask, files: PlaneFiles, solution: Solution, focus: FocusPoint | None) -> None:
         place, grid = files.place, task.grids[files.place]
         tilted = place if isinstance(place, TiltedPlane) else None
-        px_per_sample = grid.pitch_mm * self._loaded.settings.camera.fx_px / depth_of(place)  # on the axis
+        px_per_sample = grid.pitch_mm * self._set.settings.camera.fx_px / depth_of(place)  # on the axis
         cosine = abs(float(tilted.normal[2])) if tilted else 1.0
         record = PlaneRecord(
             name=tilted.name if tilted else UNSET,
@@ -120,30 +118,21 @@ class Channel:
             flux_e=float(solution.plane.sum(dtype=np.float64)) * (px_per_sample**2 * cosine),
         )
         arrays = {"plane": solution.plane, **solution.sidecars}
-        light = light_per_e(self._loaded)
+        light = light_per_e(self._set)
         if light != 1:
             arrays |= {name: light * arrays[name] for name in ("plane", "sigma", "proposal") if name in arrays}
-        focus = in_units(self._loaded, focus) if focus else None
-        files.save_part(self._layout.name, arrays, in_units(self._loaded, record), focus)
+        focus = in_units(self._set, focus) if focus else None
+        files.save_part(self._layout.name, arrays, in_units(self._set, record), focus)
 
     def _describe(self, place: Place) -> str:
-        return f"'{place.name}'" if isinstance(place, TiltedPlane) else self._loaded.depth_text(place)
+        return f"'{place.name}'" if isinstance(place, TiltedPlane) else self._set.depth_text(place)
 
     def _halves(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return the views on both colours of a checkerboard of nodes; even and odd ones if no nodes are stated."""
-        views = self._loaded.settings.view
+        views = self._set.settings.view
         odd = np.array([(sum(view.node) if view.node else index) % 2 for index, view in enumerate(views)])
-        odd = np.repeat(odd, self._phases)
+        odd = np.repeat(odd, len(self._layout.lattices))
         return np.flatnonzero(odd == 0), np.flatnonzero(odd == 1)
-
-    def _blind_views(self, operator: PlaneOperator, place: Place) -> list[str]:
-        """Return a message on views that see nothing of a plane: a pose may be wrong."""
-        blind = {int(view) // self._phases for view in np.setdiff1d(operator.all_views, operator.seeing_views)}
-        if not blind:
-            return []
-        first, count = self._loaded.settings.view[min(blind)].image, len(blind)
-        place_words = self._describe(place)
-        return [f"{place_words}: {count} views see nothing of the plane, {first} for one; are their poses right?"]
 
 
 def do_task(task: PlaneTask, opened: Callable[[ChannelLayout], Channel]) -> list[str]:

@@ -89,7 +89,11 @@ def write_surface(
     for name in (POINTS, FILM, *depths, *_PROPOSED, *map(preview_name, (*depths, *_PROPOSED))):
         remove(folder / name)
     levels = grey_levels(maps.picture, white_level(maps.picture))
-    points = _write_points(folder, maps, levels, facts.unit) if facts.unit != "px" else None
+    points = None if facts.unit == "px" else POINTS
+    if points is not None:
+        (left, top), pitch, (rows, columns) = maps.grid.origin_mm, maps.grid.pitch_mm, maps.grid.shape
+        x, y = left + pitch * np.arange(columns), top + pitch * np.arange(rows)
+        write_points(folder / POINTS, maps.depth, x, y, levels, in_mm=facts.unit == "mm")
     record = _record(maps, facts, points, _write_film(folder, maps, levels))
     for name, values, preview in _named_maps(record, maps, levels, units_of(origin)):
         write_plane(folder / name, values, ONE_PIXEL)
@@ -132,10 +136,8 @@ def _named_maps(
     if proposal is not None and moved is not None:
         yield _PROPOSED[0], proposal, encoded(grey_levels(proposal, white_level(maps.picture)), ".png")
         yield _PROPOSED[1], moved, _colour_map(moved, "picture less proposal (σ)")
-    label = f"{what} ({record.unit})"
-    yield record.depth, maps.depth, map_picture(maps.depth, label, *robust_limits(maps.depth))
-    label = f"σ of the {what} ({record.unit})"
-    yield record.depth_sigma, maps.depth_sigma, map_picture(maps.depth_sigma, label, *robust_limits(maps.depth_sigma))
+    yield record.depth, maps.depth, _colour_map(maps.depth, f"{what} ({record.unit})")
+    yield record.depth_sigma, maps.depth_sigma, _colour_map(maps.depth_sigma, f"σ of the {what} ({record.unit})")
     confidence = maps.depth_confidence
     yield record.depth_confidence, confidence, map_picture(confidence, f"probability of the {what}", 0.0, 1.0)
     visibility = maps.visibility.astype(np.float32)
@@ -147,17 +149,6 @@ def _colour_map(values: NDArray[np.floating], label: str) -> bytes:
     """Return the preview of a map (row, column[, colour]); one scale for all colours: that of their mean."""
     shown = values if values.ndim == 2 else values.mean(axis=2)
     return map_picture(shown, label, *robust_limits(shown))
-
-
-def _write_points(folder: Path, maps: SurfaceMaps, levels: Picture, unit: str) -> str:
-    """Write the samples whose depth is known as a point cloud, and return its name."""
-    grid = maps.grid
-    x, y = (
-        first + grid.pitch_mm * np.arange(count)
-        for first, count in zip(grid.origin_mm, reversed(grid.shape), strict=True)
-    )
-    write_points(folder / POINTS, maps.depth, x, y, levels, in_mm=unit == "mm")
-    return POINTS
 
 
 def _write_film(folder: Path, maps: SurfaceMaps, levels: Picture) -> str | None:

@@ -43,7 +43,7 @@ from faintfield.pipelines.reconstruction.depth.search import (
     in_unit,
     naming_range,
 )
-from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
+from faintfield.pipelines.reconstruction.operators import OperatorFactory, blind_views, plane_grid
 from faintfield.pipelines.reconstruction.planes.penalised import Objective, Solution, solve_then_sigma
 from faintfield.pipelines.reconstruction.planes.prior import with_prior
 from faintfield.pipelines.reconstruction.surface.files import SurfaceMaps, write_surface
@@ -54,7 +54,6 @@ from faintfield.recon.prior.collaborative import refined
 from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.surface.confidence import RIGHT_WITHIN, SURE, UNKNOWN_BELOW
 from faintfield.recon.surface.estimate import SurfaceEstimate
-from faintfield.recon.surface.goodness import Prediction
 
 # Bytes of a sample in the files: TIFFs of one number and of one per colour, a point, and the picture on the page; and
 # bytes of previews, film and page, which do not grow with the picture.
@@ -67,18 +66,9 @@ def reconstruct_surface(
     """Reconstruct the surface of a set, and write it with its record; one that is up to date is kept.
 
     The caller has `out` to itself, see `formats.files.exclusive`. Earlier `pages` are removed before the files that
-    they show are.
-
-    Raises
-    ------
-    BadValue
-        The set has too few views, or too small ones.
-    OutputExists
-        `out` holds a depth map, whose files have the same names.
-    GeometryMismatch
-        The views share too little at the depths of a given range, or the range is too wide.
-    NothingInFocus
-        The views tell no depths, agree no better than shuffled ones, or show nothing in the range.
+    they show are. Raises BadValue for too few or too small views, OutputExists if `out` holds a depth map, whose files
+    have the same names, GeometryMismatch if the views share too little in a given range, or that is too wide, and
+    NothingInFocus if the views tell no depths, or agree no better than shuffled ones.
     """
     started = time.monotonic()
     check_views(elemental_set, "a surface")
@@ -112,6 +102,9 @@ def reconstruct_surface(
             layout.name: _light(elemental_set, layout, inverse_depth, request, out)
             for layout in progress(layouts, "picture")
         }
+    held_out, prediction = None, estimate.prediction
+    if prediction is not None and prediction.pixels:
+        held_out = HeldOutRecord(**vars(prediction) | {"views": prediction.views.tolist()})
     facts = SurfaceFacts(
         unit=unit,
         searched=(in_unit(elemental_set, near, unit), in_unit(elemental_set, far, unit)),
@@ -120,7 +113,7 @@ def reconstruct_surface(
         bins_px=bins,
         rounds=estimate.rounds,
         sure_above=SURE,
-        held_out=_held_out(estimate.prediction),
+        held_out=held_out,
         channels=[in_units(elemental_set, _channel(name, light)) for name, light in lights.items()],
         wall_time_s=time.monotonic() - started,
     )
@@ -153,7 +146,8 @@ def _light(
     images = load_channel(elemental_set, layout, memory_or_file(out))
     factory = OperatorFactory(elemental_set, layout, images)
     operator = factory.of_surface(inverse_depth, plane_grid(elemental_set, 1.0))
-    _name_blind_views(elemental_set, operator, len(layout.lattices))
+    if message := blind_views(elemental_set, operator, "the surface"):
+        inform(message)
     objective = Objective.of(SceneProblem(operator, images), request.solver)
     solution, sigma = solve_then_sigma(objective, request.solver)
     if request.solver.prior is None:
@@ -176,14 +170,6 @@ def _visibility(operator: SurfaceOperator, layout: ChannelLayout) -> NDArray[np.
     return operator.adjoint_of_map(inverse) * operator.dtype.type(samples_per_px)
 
 
-def _name_blind_views(elemental_set: ElementalSet, operator: SurfaceOperator, phases: int) -> None:
-    """Inform the user of views that see nothing of the surface: a pose may be wrong."""
-    blind = {int(view) // phases for view in np.setdiff1d(operator.all_views, operator.seeing_views)}
-    if blind:
-        first = elemental_set.settings.view[min(blind)].image
-        inform(f"{len(blind)} views see nothing of the surface, {first} for one; are their poses right?")
-
-
 def _channel(name: str, light: Solution) -> SurfaceChannel:
     record = light.record
     return SurfaceChannel(
@@ -196,20 +182,6 @@ def _channel(name: str, light: Solution) -> SurfaceChannel:
         likelihood=record.likelihood or "",
         mean_e=float(np.mean(light.plane, dtype=np.float64)),
         prior=record.prior,
-    )
-
-
-def _held_out(prediction: Prediction | None) -> HeldOutRecord | None:
-    """Return the record of the views that were left out, None if there are none, or none sees the surface."""
-    if prediction is None or not prediction.pixels:
-        return None
-    return HeldOutRecord(
-        views=prediction.views.tolist(),
-        pixels=prediction.pixels,
-        surface=prediction.surface,
-        planes=prediction.planes,
-        standard_error=prediction.standard_error,
-        neighbours=prediction.neighbours,
     )
 
 
