@@ -160,8 +160,7 @@ class PlaneAccumulator:
     def picture(self, index: int, kind: PictureKind) -> tuple[Image, NDArray[np.bool_], int] | None:
         """Return a plane (row, column) in electrons per pixel, where it is covered, and from how many nodes."""
         per_px = np.float32(1 / self.scene.bins**2)
-        running = self._running[index]
-        latest, refined = self._latest[index], self._refined.get(index)
+        running, latest, refined = self._running[index], self._latest[index], self._refined.get(index)
         if kind == "mean" and self.frames:
             return running.mean() * per_px, running.covered, len(self.nodes)
         if kind == "view" and latest is not None:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -59,33 +59,26 @@ _FLAT = 0.5
 _SWING_MM, _SWING_HZ, _SWING_DECAY_S = 1.5, 7.0, 0.25
 
 
+@dataclass(eq=False)
 class SimulatedLab:
     """Scene, light and sensor around a simulated stage, whose position of the reference pose is `centre`.
 
     The callables return the true position of the carriages, and the time since they stopped.
     """
 
-    def __init__(
-        self,
-        centre: Point,
-        true_position: Callable[[], Point],
-        still_s: Callable[[], float],
-        boards: tuple[BoardSettings, ...],
-        settings: SimulatedSettings,
-    ) -> None:
-        self._true_position = true_position
-        self._still_s = still_s
-        self._boards = boards
-        self._settings = settings
-        self._centre = centre
-        self._planes: tuple[TexturedPlane, ...] = ()
-        self._photons_per_s = 0.0
-        self._flat = False
+    centre: Point
+    true_position: Callable[[], Point]
+    still_s: Callable[[], float]
+    boards: tuple[BoardSettings, ...]
+    settings: SimulatedSettings
+    _planes: tuple[TexturedPlane, ...] = ()
+    _photons_per_s: float = 0.0
+    _flat: bool = False
 
     @cached_property
     def experiment(self) -> SimulatedExperiment:
         """The objects and the camera."""
-        return lab_experiment(self._settings)
+        return lab_experiment(self.settings)
 
     @cached_property
     def _illumination(self) -> NDArray[np.float32]:
@@ -96,11 +89,11 @@ class SimulatedLab:
         self._planes = ()
         if kind == "charuco":
             optics = self.experiment.optics
-            self._planes = tuple(standing_board(board, sweep, at, optics) for at, board in enumerate(self._boards))
+            self._planes = tuple(standing_board(board, sweep, at, optics) for at, board in enumerate(self.boards))
         elif kind in ("bright", "dark_scene"):
             self._planes = self.experiment.planes
-        settings = self._settings
-        self._photons_per_s = settings.unlit_photons_per_s if kind == "dark_scene" else settings.lit_photons_per_s
+        lit, unlit = self.settings.lit_photons_per_s, self.settings.unlit_photons_per_s
+        self._photons_per_s = unlit if kind == "dark_scene" else lit
         self._flat = kind == "flat"
 
     def expose(self, exposure_s: float, number: int) -> NDArray[np.uint16]:
@@ -111,18 +104,18 @@ class SimulatedLab:
         elif self._planes:
             pose = self.rt_cam_ref(exposure_s)[np.newaxis]
             light = next(render(self._planes, self.experiment.optics, pose, samples_per_px=1)).light
-            if light.ndim == 3 and self._settings.mosaic is not None:
-                light = through_mosaic(light, self._settings.mosaic)
-        generator = np.random.default_rng([self._settings.seed, number])
+            if light.ndim == 3 and self.settings.mosaic is not None:
+                light = through_mosaic(light, self.settings.mosaic)
+        generator = np.random.default_rng([self.settings.seed, number])
         return self.experiment.sensor.expose(light * self._photons_per_s * exposure_s, exposure_s, generator)
 
     def rt_cam_ref(self, exposure_s: float) -> NDArray[np.float64]:
         """Return the true pose (6,) in the middle of an exposure that begins now, including the swing."""
-        x_mm, y_mm = self._true_position()
-        after_s = self._still_s() + 0.5 * exposure_s
+        x_mm, y_mm = self.true_position()
+        after_s = self.still_s() + 0.5 * exposure_s
         swing_mm = _SWING_MM * math.exp(-after_s / _SWING_DECAY_S) * math.cos(2.0 * math.pi * _SWING_HZ * after_s)
-        right_mm, down_mm = x_mm + swing_mm - self._centre.x_mm, y_mm + swing_mm - self._centre.y_mm
-        return _carriage_pose(self._settings, right_mm, down_mm)
+        right_mm, down_mm = x_mm + swing_mm - self.centre.x_mm, y_mm + swing_mm - self.centre.y_mm
+        return _carriage_pose(self.settings, right_mm, down_mm)
 
 
 def flat_photons_per_s(settings: SimulatedSettings) -> float:

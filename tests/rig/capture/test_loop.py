@@ -141,7 +141,7 @@ def test_stage_rests_before_every_frame(folder: Path) -> None:
     expose = SimulatedLab.expose
 
     def watched(lab: SimulatedLab, exposure_s: float, number: int) -> NDArray[np.uint16]:
-        rests_s.append(lab._still_s())  # noqa: SLF001
+        rests_s.append(lab.still_s())
         return expose(lab, exposure_s, number)
 
     settings = replace(SMALL_RIG, settle=SettleSettings(measure=False, wait_s=2.0))
