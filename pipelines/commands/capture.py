@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from faintfield.pipelines.arguments import Count, PaperName, Positive
+from faintfield.pipelines.console import inform
+from faintfield.pipelines.errors import OutputExists
 from faintfield.pipelines.planning.options import PlanOptions
 
 if TYPE_CHECKING:
@@ -31,9 +33,14 @@ def init(rig: Path = Path("rig.toml"), /) -> dict[str, str]:
     rig
         File to write; an existing one is left alone.
     """
-    from faintfield.pipelines.workflows.capture import write_template
+    from faintfield.pipelines.formats.files import write_whole
+    from faintfield.pipelines.formats.toml_files import rig_template
 
-    return write_template(rig)
+    if rig.exists():
+        raise OutputExists(f"{rig}: exists and is not overwritten; name another file, or edit this one")
+    write_whole(rig, rig_template())
+    inform(f"wrote {rig}; describe your rig in it, then: faintfield check {rig}")
+    return {"rig": str(rig)}
 
 
 def check(rig: Path, /, *, remember: bool = False, session: Path | None = None) -> Check:

@@ -1,4 +1,4 @@
-"""At the rig: a rig.toml begun and checked without motion, and a session captured with guidance."""
+"""At the rig: a rig.toml checked without motion, and a session captured with guidance."""
 
 import sys
 from pathlib import Path
@@ -6,9 +6,9 @@ from pathlib import Path
 import msgspec
 
 from faintfield.pipelines.console import console, inform
-from faintfield.pipelines.errors import MissingFile, OutputExists, WrongUsage
-from faintfield.pipelines.formats.files import require_room, write_json, write_whole
-from faintfield.pipelines.formats.toml_files import read_rig, read_stage_settings, rig_template, stage_settings_path
+from faintfield.pipelines.errors import MissingFile, WrongUsage
+from faintfield.pipelines.formats.files import require_room, write_json
+from faintfield.pipelines.formats.toml_files import read_rig, read_stage_settings, stage_settings_path
 from faintfield.pipelines.live.guided import capture_session, changed_settings, needed_bytes, survey_lines
 from faintfield.pipelines.live.planes_client import MAX_DEPTHS, LiveOrder
 from faintfield.pipelines.reconstruction.options import sweep_values
@@ -33,15 +33,6 @@ class RigCheck(msgspec.Struct, frozen=True):
     changed_settings: list[str]
     changed_since_session: list[str]
     warnings: list[str]
-
-
-def write_template(rig: Path) -> dict[str, str]:
-    """Write a commented rig.toml of a simulated rig, unless the file exists."""
-    if rig.exists():
-        raise OutputExists(f"{rig}: exists and is not overwritten; name another file, or edit this one")
-    write_whole(rig, rig_template())
-    inform(f"wrote {rig}; describe your rig in it, then: faintfield check {rig}")
-    return {"rig": str(rig)}
 
 
 def check_rig(rig: Path, remember: bool, session: Path | None) -> RigCheck:
