@@ -125,7 +125,6 @@ def print_prediction(record: PredictionRecord) -> None:
 
 
 def _print_depth(depth: DepthPrediction, record: PredictionRecord) -> None:
-    """Print what is predicted of a plane."""
     name = "plane at unknown depth" if depth.depth_mm is None else f"plane at {depth.depth_mm:g} mm"
     everywhere = depth.seen_by_all_mm
     count = record.rows * record.columns
@@ -141,14 +140,12 @@ def _print_depth(depth: DepthPrediction, record: PredictionRecord) -> None:
     for feature in depth.features:
         side = f"{feature.side_px:.3g} px ({_number_text(feature.side_mm, 'mm')})"
         contrast = _number_text(feature.smallest_contrast)
-        hidden = (feature.smallest_contrast.value or 0.0) > 1
-        contrast += ", so none is" if hidden else ""
+        contrast += ", so none is" if (feature.smallest_contrast.value or 0.0) > 1 else ""
         inform(f"  square of {side}: visible (k = {record.rose_k:g}) from contrast {contrast}")
         inform(f"    depth of a black one: +- {_number_text(feature.depth_sigma_mm, 'mm')}")
 
 
 def _print_table(record: PredictionRecord) -> None:
-    """Print the table of alternatives, and the cheapest."""
     inform(f"sigma in e⁻ of one frame of {1e3 * record.exposure_s:g} ms; contrast of the first square")
     inform(" ".join(f"{head:>{wide}}" for head, wide in _COLUMNS))
     for row in record.alternatives:
@@ -159,19 +156,15 @@ def _print_table(record: PredictionRecord) -> None:
     unknown = {f"time unknown: {row.time_s.why}": None for row in record.alternatives if row.time_s.value is None}
     for reason in hindrances | unknown:
         inform(reason)
-    if record.wanted_sigma_e is None:
-        return
-    if record.cheapest is None:
-        inform(
-            f"sigma of {record.wanted_sigma_e:g} e⁻: none of these is known to reach it; give longer exposures or more"
-        )
-    else:
-        inform(f"sigma of {record.wanted_sigma_e:g} e⁻ in the shortest session:")
+    wanted = f"sigma of {record.wanted_sigma_e:g} e⁻" if record.wanted_sigma_e is not None else ""
+    if wanted and record.cheapest is None:
+        inform(f"{wanted}: none of these is known to reach it; give longer exposures or more")
+    elif record.cheapest is not None:
+        inform(f"{wanted} in the shortest session:")
         inform(f"{_asked(record.cheapest)} {'':>8} {_cell(record.cheapest.sigma_e)}")
 
 
 def _asked(row: Alternative) -> str:
-    """Return what a row compares."""
     shape = f"{row.rows} x {row.columns}"
     return f"{1e3 * row.exposure_s:>7g} ms {shape:>9} {row.frames_per_node:>6}"
 
@@ -185,17 +178,14 @@ def _number_text(number: Estimate, unit: str = "") -> str:
 
 
 def _cell(number: Estimate) -> str:
-    """Return a number in a column."""
     return f"{'unknown' if number.value is None else format(number.value, '.3g'):>8}"
 
 
 def _minutes(number: Estimate) -> str:
-    """Return a duration in a column."""
     return f"{'unknown' if number.value is None else format(number.value / 60, '.1f') + ' min':>9}"
 
 
 def _exposures(record: PredictionRecord) -> str:
-    """Return the exposures of a node's frames in words."""
     total_ms, first_ms = 1e3 * record.total_exposure_s, 1e3 * record.exposure_s
     if math.isclose(total_ms, record.frames_per_node * first_ms):
         return f"{first_ms:g} ms"
