@@ -21,7 +21,6 @@ from faintfield.pipelines.formats.exchange.imported_set import (
     ExportedSet,
     ImportedSet,
     PosedImage,
-    PosedModel,
     export_posed,
     import_posed,
 )
@@ -98,7 +97,7 @@ def import_model(src: Path, out: Path, options: ImportOptions) -> ImportedSet:
         PosedImage(inside(folder, image.name, f"{files[1]}: name"), model.lenses[image.camera], image.rt_cam_world)
         for image in model.images
     ]
-    return import_posed(out, PosedModel(files, images), options, "import colmap")
+    return import_posed(out, files, images, options, "import colmap")
 
 
 def export_model(set_path: Path, out: Path, *, binary: bool, overwrite: bool) -> ExportedSet:

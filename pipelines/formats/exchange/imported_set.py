@@ -61,14 +61,6 @@ class PosedImage:
     node: tuple[int, int] | None = None
 
 
-@dataclass(frozen=True)
-class PosedModel:
-    """Another program's model: the files that it was read from, and its images."""
-
-    files: list[Path]
-    images: list[PosedImage]
-
-
 class ImportProvenance(Provenance[dict[str, Any]], frozen=True, kw_only=True):
     """Record of an import: the tone curve, which was undone, and where its gain and read noise come from."""
 
@@ -92,22 +84,24 @@ class ExportedSet(msgspec.Struct, frozen=True):
     unit: str
 
 
-def import_posed(out: Path, model: PosedModel, options: ImportOptions, command: str) -> ImportedSet:
-    """Make an elemental set of the images of a model; without the length of its unit, poses are relative.
+def import_posed(
+    out: Path, files: Sequence[Path], posed: Sequence[PosedImage], options: ImportOptions, command: str
+) -> ImportedSet:
+    """Make an elemental set of the images of a model in some files; without the length of its unit, poses are relative.
 
     Raises
     ------
     MissingFile, BadValue
         An image is missing, a pose is not finite, or the reference is none of the images.
     """
-    if not model.images:
-        raise BadValue(f"{model.files[-1]}: names no image; export a model of the images")
+    if not posed:
+        raise BadValue(f"{files[-1]}: names no image; export a model of the images")
     scale = np.repeat([1.0, options.mm_per_unit or 1.0], 3)
     images = [
         replace(image, rt_cam_world=image.rt_cam_world * scale, node=node)
-        for image, node in zip(model.images, _nodes(model.images), strict=True)
+        for image, node in zip(posed, _nodes(posed), strict=True)
     ]
-    for image, stated in zip(images, model.images, strict=True):
+    for image, stated in zip(images, posed, strict=True):
         _check_image(image, stated)
     index = _reference(images, options.reference)
     write_imported_set(
@@ -117,7 +111,7 @@ def import_posed(out: Path, model: PosedModel, options: ImportOptions, command: 
         reference=index,
         command=command,
         recorded={name: getattr(options, name) for name in ("mm_per_unit", "reference", "exposure_s")},
-        models=model.files,
+        models=files,
         units=Units() if options.mm_per_unit else Units(depth="relative"),
     )
     width, height = images[index].lens.size_px

@@ -18,7 +18,6 @@ from faintfield.pipelines.formats.exchange.imported_set import (
     ExportedSet,
     ImportedSet,
     PosedImage,
-    PosedModel,
     export_posed,
     import_posed,
 )
@@ -79,7 +78,8 @@ def camera_model_text(lens: Lens, lens_model: str, rt_cam_ref: ArrayLike) -> str
 def import_camera_models(src: Path, out: Path, options: ImportOptions) -> ImportedSet:
     """Make an elemental set of the models in a folder and their images."""
     options = replace(options, mm_per_unit=options.mm_per_unit or _MM_PER_M)
-    return import_posed(out, read_camera_models(src, options.images or src), options, "import mrcal")
+    models = read_camera_models(src, options.images or src)
+    return import_posed(out, list(models), list(models.values()), options, "import mrcal")
 
 
 def export_camera_models(set_path: Path, out: Path, *, overwrite: bool) -> ExportedSet:
@@ -97,8 +97,8 @@ def export_camera_models(set_path: Path, out: Path, *, overwrite: bool) -> Expor
     return export_posed(set_path, out, "m", [f"*{SUFFIX}"] if overwrite else (), write)
 
 
-def read_camera_models(folder: Path, images: Path) -> PosedModel:
-    """Return the images of the .cameramodel files in a folder, one of the same name for each in the folder `images`.
+def read_camera_models(folder: Path, images: Path) -> dict[Path, PosedImage]:
+    """Return the image of each .cameramodel file in a folder, which has the same name in the folder `images`.
 
     Raises
     ------
@@ -108,7 +108,7 @@ def read_camera_models(folder: Path, images: Path) -> PosedModel:
     paths = sorted(folder.glob(f"*{SUFFIX}"))
     if not paths:
         raise MissingFile(f"{folder}: holds no {SUFFIX} files; name the folder that holds one per image")
-    return PosedModel(paths, [_read(path, images) for path in paths])
+    return {path: _read(path, images) for path in paths}
 
 
 def _read(path: Path, images: Path) -> PosedImage:

@@ -20,7 +20,6 @@ from faintfield.pipelines.formats.exchange.imported_set import (
     ExportedSet,
     ImportedSet,
     PosedImage,
-    PosedModel,
     export_posed,
     import_posed,
     pose_of,
@@ -81,7 +80,8 @@ class _Transforms(_Intrinsics, omit_defaults=True, kw_only=True):
 
 def import_transforms(src: Path, out: Path, options: ImportOptions) -> ImportedSet:
     """Make an elemental set of a `transforms.json` and its images."""
-    return import_posed(out, read_transforms(src, options.images), options, "import nerfstudio")
+    path = src / FILE_NAME if is_folder(src) else src
+    return import_posed(out, [path], read_transforms(path, options.images), options, "import nerfstudio")
 
 
 def export_transforms(set_path: Path, out: Path, *, overwrite: bool) -> ExportedSet:
@@ -95,8 +95,8 @@ def export_transforms(set_path: Path, out: Path, *, overwrite: bool) -> Exported
     return export_posed(set_path, out, "mm", [FILE_NAME] if overwrite else (), _write_transforms)
 
 
-def read_transforms(src: Path, images: Path | None = None) -> PosedModel:
-    """Return the images of a `transforms.json`, or of the folder that holds one, with lenses and poses in its unit.
+def read_transforms(path: Path, images: Path | None = None) -> list[PosedImage]:
+    """Return the images of a `transforms.json` with their lenses and poses, in its own unit.
 
     Names of images count from the folder `images`, by default from that of the file.
 
@@ -107,7 +107,6 @@ def read_transforms(src: Path, images: Path | None = None) -> PosedModel:
     BadValue
         It is damaged, a lens has no counterpart here, a pose is none, or a name leads out of the folder.
     """
-    path = src / FILE_NAME if is_folder(src) else src
     if not is_file(path):
         raise MissingFile(f"{path}: no such file; name a {FILE_NAME} or the folder that holds it")
     remedy = "export it again"
@@ -125,7 +124,7 @@ def read_transforms(src: Path, images: Path | None = None) -> PosedModel:
         except (ValueError, OverflowError) as failure:
             raise BadValue(f"{place} ({frame.file_path}): {failure}; {remedy}") from failure
         posed.append(PosedImage(image, lens, pose))
-    return PosedModel([path], posed)
+    return posed
 
 
 def _lens(content: _Transforms, frame: _Frame, image: Path, sizes: dict[Path, tuple[int, int]]) -> Lens:

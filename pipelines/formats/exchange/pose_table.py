@@ -15,7 +15,6 @@ from faintfield.pipelines.formats.exchange.grid_names import picture_named
 from faintfield.pipelines.formats.exchange.imported_set import (
     ImportedSet,
     PosedImage,
-    PosedModel,
     import_posed,
     pose_of,
     read_picture,
@@ -57,7 +56,7 @@ def import_table(src: Path, out: Path, lens_options: LensOptions, options: Impor
     except ValueError as failure:
         raise WrongUsage(f"the lens of the options cannot be: {failure}; correct them") from failure
     images = [PosedImage(path, lens, pose) for path, pose in poses.items()]
-    return import_posed(out, PosedModel([src], images), options, "import poses")
+    return import_posed(out, [src], images, options, "import poses")
 
 
 def read_poses(path: Path, images: Path) -> tuple[dict[Path, NDArray[np.float64]], float | None]:

@@ -213,7 +213,7 @@ def test_camera_model_is_read_without_its_measurements(tmp_path: Path) -> None:
     text = repr(MODEL)[:-1] + ", 'icam_intrinsics': 0, 'optimization_inputs': b'" + "x!" * 1_000_000 + "'}"
     (tmp_path / "view.cameramodel").write_text(f"# written by hand\n{text}\n")
     (tmp_path / "view.tiff").touch()
-    (posed,) = read_camera_models(tmp_path, tmp_path).images
+    (posed,) = read_camera_models(tmp_path, tmp_path).values()
     assert (posed.lens.size_px, posed.lens.distortion) == ((640, 480), (0.1, 0.0, 0.0, 0.0))
     np.testing.assert_array_equal(posed.rt_cam_world, MODEL["extrinsics"])
 

@@ -95,7 +95,7 @@ def test_file_without_lens_states_its_angle(tmp_path: Path) -> None:
     content = transforms(camera_angle_x=0.8)
     for key in ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_model"):
         del content[key]
-    lens = read_transforms(write_transforms(tmp_path, content)).images[1].lens
+    lens = read_transforms(write_transforms(tmp_path, content))[1].lens
     assert lens.size_px == (16, 12)
     assert (lens.cx_px, lens.cy_px) == (7.5, 5.5)
     # The left edge of the picture is half the angle off the axis, half a pixel beyond the first pixel's centre
@@ -106,7 +106,7 @@ def test_file_without_lens_states_its_angle(tmp_path: Path) -> None:
 def test_lens_of_frame_precedes_lens_of_file(tmp_path: Path) -> None:
     content = transforms(k1=-0.1, k2=0.02, p1=0.003, p2=-0.004, k3=0.005)
     content["frames"][1] |= {"cx": 7.25, "k1": -0.2}
-    first, second = (image.lens for image in read_transforms(write_transforms(tmp_path, content)).images)
+    first, second = (image.lens for image in read_transforms(write_transforms(tmp_path, content)))
     assert (first.cx_px, second.cx_px, first.cy_px, second.cy_px) == (8.5, 6.75, 5.0, 5.0)
     assert first.distortion == (-0.1, 0.02, 0.003, -0.004, 0.005)
     assert second.distortion == (-0.2, 0.02, 0.003, -0.004, 0.005)
