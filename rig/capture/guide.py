@@ -3,19 +3,21 @@
 from collections import defaultdict
 from collections.abc import Mapping
 from statistics import median
-from typing import Literal, NoReturn, Protocol
+from typing import TYPE_CHECKING, Literal, NoReturn, Protocol
 
 from msgspec import Struct
 
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.clock import Clock
-from faintfield.rig.devices import Rig
 from faintfield.rig.errors import CaptureStopped
 from faintfield.rig.plan import PlannedFrame, StepKind
 from faintfield.rig.session.session import Session
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.motion import one_sided_path, path_duration_s
 from faintfield.rig.stages.protocol import Point
+
+if TYPE_CHECKING:  # views of a capture need no drivers
+    from faintfield.rig.devices import Rig
 
 type Answer = Literal["go", "again", "keep", "retake", "skip", "stop"]
 type OperatorRequest = Literal["pause", "skip", "retake", "stop"]
@@ -213,7 +215,7 @@ class Dialogue:
     `pace` estimates the remaining time; `warnings` are the latest ones, shown with the status.
     """
 
-    def __init__(self, session: Session, rig: Rig, operator: OperatorInterface) -> None:
+    def __init__(self, session: Session, rig: "Rig", operator: OperatorInterface) -> None:
         self.session = session
         self.rig = rig
         self.pace = Pace(rig.stage, rig.clock, session.plan.settle_s, session.plan.readout_s)
