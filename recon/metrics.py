@@ -9,12 +9,7 @@ from faintfield.recon.likelihood.images import Image
 def snr_from_powers(object_e: NDArray[np.floating], reference_e: NDArray[np.floating]) -> float:
     """Return eq. (4), `( <g_o²> − <n²> ) / <n²>`, a ratio of powers.
 
-    Parameters
-    ----------
-    object_e : array
-        Pixels of a dark view in the object region, offset removed.
-    reference_e : array
-        Pixels of the noise-reference image, offset removed.
+    The pixels are those of a dark view in the object region, and of the noise-reference image, offset removed.
     """
     noise_power = np.mean(np.square(reference_e, dtype=np.float64))
     return float((np.mean(np.square(object_e, dtype=np.float64)) - noise_power) / noise_power)
@@ -60,16 +55,13 @@ def noise_variance_e2(
     read_noise_e: float,
     background_photons_per_s: float = 0.0,
 ) -> float:
-    """Return eq. (6): `η (Φ_o + Φ_b) t + D t + σ²`, the variance of a pixel in e⁻²."""
+    """Return eq. (6), `η (Φ_o + Φ_b) t + D t + σ²`, the variance of a pixel in e⁻²."""
     light_e = quantum_efficiency * (photons_per_s + background_photons_per_s) * exposure_s
     return light_e + dark_current_e_per_s * exposure_s + read_noise_e**2
 
 
 def photons_from_linear_snr(snr: float, *, quantum_efficiency: float, read_noise_e: float) -> float:
-    """Return the photons per pixel and exposure, Φ_o t, from an SNR by eq. (7), `SNR = η Φ_o t / σ²`, as in the paper.
-
-    It gives 3.84 at SNR 0.16.
-    """
+    """Return the photons per pixel and exposure, Φ_o t, by eq. (7), `SNR = η Φ_o t / σ²`: 3.84 at SNR 0.16."""
     return snr * read_noise_e**2 / quantum_efficiency
 
 
@@ -82,10 +74,7 @@ def photons_from_moments(snr: float, *, quantum_efficiency: float, read_noise_e:
 
 
 def mean_square_error(plane: Image, truth: Image, region: NDArray[np.bool_] | None = None) -> float:
-    """Return the mean square difference of two planes over a region, both divided by the truth's maximum there.
-
-    This scales the object to 0…1; the reconstruction is not fitted to the truth.
-    """
+    """Return the mean square difference of two planes over a region, both divided by the truth's maximum there."""
     where = np.ones(truth.shape, bool) if region is None else region
     peak = float(np.max(truth[where]))
     return float(np.mean(np.square((plane[where] - truth[where]) / peak, dtype=np.float64)))

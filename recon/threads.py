@@ -34,9 +34,8 @@ def run_in_threads[Part, Result](work: Callable[[Part], Result], parts: Sequence
 def map_in_threads[Item, Result](work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
     """Call `work` on each item, in as many threads as numba takes; return the results in order.
 
-    A thread begins its next item when it is done with one, so no more items than threads are worked on at a time.
-    After a failure or an interrupt no further item is begun, and no thread is left working. Of several failures, that
-    of the first item is raised.
+    No more items than threads are worked on at a time. After a failure or an interrupt no further item is begun, and no
+    thread is left working. Of several failures, that of the first item is raised.
 
     `work` must not call the functions of this module: it would wait for threads that wait for it.
     """

@@ -40,16 +40,12 @@ def form_ratio_of_block(model, count, expected, observed, background, variance, 
 
     Parameters
     ----------
-    model : int
-        One of the constants above.
-    count : int
-        Number of pixels.
+    model, count : int
+        One of the constants above; number of pixels.
     expected : pointer
         H f on entry, the ratio on return.
-    observed, background, variance : pointer
-        g, b and σ² of each pixel.
-    response : pointer
-        Relative response; a pixel of response zero does not count, and its ratio is meaningless.
+    observed, background, variance, response : pointer
+        g, b, σ² and the response of each pixel; one of response zero does not count, and its ratio is meaningless.
     level : number
         Expected light of a pixel of response one, for the variance of least squares.
     work : pointer

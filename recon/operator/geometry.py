@@ -106,7 +106,11 @@ def scene_geometry(
         raise GeometryMismatch("a pose is not a finite number; check the calibration it came from")
     valid = np.zeros((0, 0, 0), bool) if valid is None else np.ascontiguousarray(valid)
     lattice_of_view = np.zeros(views, np.intp) if lattice_of_view is None else np.array(lattice_of_view, np.intp)
-    _check_views(valid, lattice_of_view, (views, lattices, rows, columns))
+    if valid.size and valid.shape != (views, rows, columns):
+        raise GeometryMismatch(
+            f"valid has shape {valid.shape}, the pixels {(views, rows, columns)}; give it that shape"
+        )
+    check_lattices(lattice_of_view, views, lattices)
     homographies = np.stack([grid.index_from_plane() @ h for grid, h in zip(grids, plane_from_ray, strict=True)])
     middle = views // 2, lattice_of_view[views // 2]
     advances = [_advance(matrices[middle[0]], maps.layers[:2, middle[1], :, :columns]) for matrices in homographies]
@@ -188,10 +192,8 @@ def _pixels_of(
     return int(met_rows[0]), int(met_rows[-1]) + 1, int(met_columns[0]), int(met_columns[-1]) + 1
 
 
-def _check_views(valid: NDArray[Any], lattice_of_view: NDArray[np.intp], sizes: tuple[int, int, int, int]) -> None:
-    views, lattices, *detector = sizes
-    if valid.size and valid.shape != (views, *detector):
-        raise GeometryMismatch(f"valid has shape {valid.shape}, the pixels {(views, *detector)}; give it that shape")
+def check_lattices(lattice_of_view: NDArray[np.intp], views: int, lattices: int) -> None:
+    """Raise GeometryMismatch unless every view has a lattice that exists."""
     if lattice_of_view.shape != (views,) or not 0 <= lattice_of_view.min() <= lattice_of_view.max() < lattices:
         raise GeometryMismatch(
             f"lattice_of_view has shape {lattice_of_view.shape}; give each of the {views} views one of {lattices} "

@@ -39,24 +39,20 @@ class SceneGeometry(NamedTuple):
         From a ray (x, y, 1) to a plane's (column, row, 1), homogeneous. For a surface, their change with 1/depth
         follows as if it were a second plane's.
     layout : int array (plane, 4)
-        Index of each plane's first sample among all samples, its rows, its columns, and how many columns about a pixel
-        lies beyond the one before.
-    lattice_of_view : int array (view,)
-        The lattice of detector pixels of each view.
-    detector : (int, int, int)
-        Rows and columns of the images, and padded columns of the maps below.
+        Index of each plane's first sample among all samples, its rows, its columns, and the columns by which a pixel
+        lies about beyond the one before.
+    lattice_of_view, detector : int array (view,), (int, int, int)
+        The lattice of each view; rows and columns of the images, and padded columns of the maps.
     maps : array (3 × lattice × row × padded column,)
         The ray of each pixel, x and y at unit depth, and its response: the flat field, zero for pixels that do not
         count in any view. Rows are padded to whole blocks with rays of NaN, which see nothing.
     valid : uint8 array (view × row × column,)
         Zero for pixels that do not count in this view; of size zero when all do.
-    relief : int16 array (view × row × column,)
-        How much nearer than the depth of the homographies each pixel meets the surface, in units of `relief_step`;
-        `UNSEEN` where it sees no part of it. Of size zero for planes.
-    relief_step : float
-        Unit of the relief, in 1/depth.
+    relief, relief_step : int16 array (view × row × column,), float
+        1/depth at which each pixel meets the surface less that of the homographies, in units of `relief_step`; `UNSEEN`
+        where it sees no part of it. Of size zero for planes.
     bent : (True,) or ()
-        Whether there is a surface. Its type says so: the compiler makes one sweep for surfaces and one for planes.
+        The former for a surface: its type makes the compiler make one sweep for surfaces and one for planes.
     reach : int array (view, row, 2)
         First and past-the-last padded column at which a row's pixels see any plane. Written by `REACH`.
     """
@@ -81,14 +77,8 @@ def size_of(geometry: SceneGeometry) -> int:
 class Hiding(NamedTuple):
     """Occlusion by nearer planes, as the kernel reads it.
 
-    Attributes
-    ----------
-    opacities : array (sample,)
-        α of all planes; of size zero where nothing hides anything.
-    opaque : int array (row × 2,)
-        First and past-the-last column of each row, of all planes, that has some opacity.
-    depths : array (plane,)
-        Only planes that are farther are hidden.
+    `opacities` (sample,) are α of all planes, of size zero where nothing hides anything; `opaque` (row × 2,) is the
+    first and the past-the-last column of each row with some opacity. Only planes of greater depth are hidden.
     """
 
     opacities: NDArray[Any]
@@ -99,14 +89,8 @@ class Hiding(NamedTuple):
 class PixelModel(NamedTuple):
     """The statistics of the numbers that pixels read, as the kernels read them.
 
-    Attributes
-    ----------
-    model : int
-        One of `recon.likelihood.pixel_models`.
-    background, variance : array (lattice × row × column,)
-        Expected electrons that are not light of the scene, and variance of the read noise.
-    level : float
-        Light level at which least squares takes the variance.
+    Background and read noise's variance are (lattice × row × column,), and `level` is the light at which least squares
+    takes the variance. The model is one of `recon.likelihood.pixel_models`.
     """
 
     model: int
@@ -139,10 +123,6 @@ def sweep(
         The samples that are read, and those that are added to: all planes, one after the other.
     seen, images : array (image × row × column,)
         The images that are written, and those that are read; view v has image `image_of_view[v]`.
-    pixels : PixelModel
-        Statistics of the pixels.
-    hiding : Hiding
-        What nearer planes hide.
     space : BlockWorkspace
         The worker's own.
     """

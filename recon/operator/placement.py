@@ -54,17 +54,9 @@ _HALF_SIZE = 5
 
 
 class BlockWorkspace(NamedTuple):
-    """The arrays that a worker needs to itself.
+    """The arrays that a worker needs to itself: the rows above, scratch of the pixel models, and numbers of each half.
 
-    Attributes
-    ----------
-    scratch : array (number,)
-        The rows above.
-    models : array (WORK_ROWS, BLOCK_PX)
-        Scratch of the pixel models.
-    blocks : int array (plane × half × 5,)
-        How the halves of the block lie on each plane, the first sample of their taps, its row and column, and the
-        number of pixels.
+    They are (number,), (WORK_ROWS, BLOCK_PX) and (plane × half × 5,).
     """
 
     scratch: NDArray[Any]
@@ -83,19 +75,19 @@ def make_workspace(planes: int, dtype: np.dtype[Any]) -> BlockWorkspace:
 
 @inlined
 def place_of(plane):
-    """Return where the three rows of a plane begin in the scratch."""
+    """Return the begin of the three rows of a plane in the scratch."""
     return index(_PLACES) + plane * index(_PLACE_SIZE)
 
 
 @inlined
 def weights_of(plane):
-    """Return where the weights of a block's pixels on a plane begin in the scratch."""
+    """Return the begin of the weights of a block's pixels on a plane in the scratch."""
     return place_of(plane) + index(WEIGHT)
 
 
 @inlined
 def half_of(plane, half):
-    """Return where the numbers of half a block begin in `blocks`."""
+    """Return the begin of the numbers of half a block in `blocks`."""
     return index(_HALF_SIZE) * (index(2) * plane + half)
 
 

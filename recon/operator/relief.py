@@ -61,9 +61,9 @@ def draw_relief(
 ) -> Relief:
     """Draw a surface into every view.
 
-    Cells of four samples are drawn as two triangles into a depth buffer, which has the pitch of the samples and keeps
-    the nearest. Cells across a step are left out. Each pixel then interpolates 1/depth between the four numbers around
-    its ray. It sees nothing where one of these is missing, or where they belong to two surfaces.
+    Cells of four samples, but for those across a step, are drawn as two triangles into a depth buffer, which has the
+    pitch of the samples and keeps the nearest. Each pixel interpolates 1/depth between the four numbers around its ray;
+    it sees nothing where one of these is missing, or where they belong to two surfaces.
 
     Parameters
     ----------

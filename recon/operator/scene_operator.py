@@ -24,11 +24,11 @@ class SceneOperator:
 
     One camera takes every view, so the lens (distortion included) is one shared map from detector pixel to ray, and a
     view is one homography from rays to each plane. H interpolates a plane bilinearly at each detector pixel; Hᵀ spreads
-    each pixel to the same four samples with the same weights. The images themselves are never resampled. A pixel sees a
-    plane when all four samples around its point exist; otherwise its weights on that plane are zero.
+    each pixel to the same four samples with the same weights. The images are never resampled. A pixel sees a plane when
+    all four samples around its point exist; otherwise its weights on that plane are zero.
 
-    *Samples* are an array of the shape `samples_shape`: those of all planes, one plane after the other. Methods that
-    take `views` use all views by default. `recon.operator.plane_operator.PlaneOperator` is the scene of one plane.
+    *Samples* are an array of the shape `samples_shape`: those of all planes, one after the other. Methods that take
+    `views` use all views by default. `recon.operator.plane_operator.PlaneOperator` is the scene of one plane.
 
     Parameters
     ----------
@@ -40,18 +40,16 @@ class SceneOperator:
         maps, which include `flat`, share their memory.
     grids : sequence of PlaneGrid
         The samples of each plane.
-    flat : array (row, column) or (lattice, row, column), optional
-        Relative response of each pixel (vignetting); zero for pixels that never count.
-    valid : bool array (view, row, column), optional
-        False for pixels that do not count in one view.
+    flat, valid : array (row, column) or (lattice, row, column), bool array (view, row, column), optional
+        Relative response of each pixel (vignetting), zero for pixels that never count; False for pixels that do not
+        count in one view.
     occluders : Occluders, optional
         Opacities by which planes hide those behind them, in H and Hᵀ; none by default.
     lattice_of_view : int array (view,), optional
         The lattice of detector pixels of each view; the first by default.
-    dtype : dtype
-        Type of samples and images: float32 for work, float64 for tests.
-    workers : int, optional
-        Number of threads; as many as the process may use by default. The last digits of sums depend on it.
+    dtype, workers : dtype, int, optional
+        Type of samples and images, and number of threads, by default as many as the process may use; the last digits
+        of sums depend on them.
     surface : (array (view, 3, 3), Relief), optional
         Bend of the only plane to a surface, for `recon.operator.surface_operator.SurfaceOperator`.
     sweeps : class, optional

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.recon.errors import GeometryMismatch
-from faintfield.recon.operator.geometry import DetectorMaps
+from faintfield.recon.operator.geometry import DetectorMaps, check_lattices
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.placement import UNSEEN
 from faintfield.recon.operator.plane_operator import PlaneOperator
@@ -110,11 +110,7 @@ def _check_surface(
     """Refuse what cannot be drawn (GeometryMismatch); the rest is checked with the geometry."""
     if ray_from_surface.ndim != 3 or ray_from_surface.shape[1:] != (3, 4):
         raise GeometryMismatch(f"matrices of shape {ray_from_surface.shape} do not fit; give (view, 3, 4)")
-    if lattice_of_view.shape != (len(ray_from_surface),) or not set(lattice_of_view.tolist()) <= set(range(lattices)):
-        raise GeometryMismatch(
-            f"lattice_of_view has shape {lattice_of_view.shape}; give each of the {len(ray_from_surface)} views one of "
-            f"{lattices} lattices, counted from 0"
-        )
+    check_lattices(lattice_of_view, len(ray_from_surface), lattices)
     if inverse_depth.shape != grid.shape:
         raise GeometryMismatch(
             f"inverse_depth has shape {inverse_depth.shape}, the samples {grid.shape}; give it that shape"

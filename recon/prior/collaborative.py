@@ -74,7 +74,7 @@ def collaborative_wiener(
     ValueError
         Shapes differ, the picture is smaller than a patch, or the size of a patch is not a multiple of four.
     """
-    (wiener,) = _filtered(picture, pilot, noise, patches or Patches(), guide, workers, also_thresholded=False)
+    (wiener,) = _filtered(picture, pilot, noise, patches or Patches(), guide, workers, 1)
     return wiener
 
 
@@ -89,22 +89,15 @@ def wiener_and_thresholded(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return what `collaborative_wiener` returns, and the picture whose groups keep what stands out of the noise.
 
-    The second (the filter's first step) keeps the coefficients of the picture itself that exceed 2.7 standard
-    deviations of their noise. So it also shows what the pilot lost.
+    The second, the filter's first step, keeps the picture's own coefficients above 2.7 standard deviations of their
+    noise. So it also shows what the pilot lost.
     """
-    wiener, thresholded = _filtered(picture, pilot, noise, patches, guide, workers, also_thresholded=True)
+    wiener, thresholded = _filtered(picture, pilot, noise, patches, guide, workers, 2)
     return wiener, thresholded
 
 
 def _filtered(
-    picture: Image,
-    pilot: Image,
-    noise: Noise,
-    patches: Patches,
-    guide: Image | None,
-    workers: int | None,
-    *,
-    also_thresholded: bool,
+    picture: Image, pilot: Image, noise: Noise, patches: Patches, guide: Image | None, workers: int | None, filters: int
 ) -> list[NDArray[np.float32]]:
     guide = pilot if guide is None else guide
     picture, pilot, guide, variance = (
@@ -113,7 +106,7 @@ def _filtered(
     _check(picture, pilot, guide, variance, patches)
     # A distance to NaN is below none
     guide = np.where(np.isfinite(variance), guide, np.float32(np.nan))
-    above, below = np.zeros((2, 2 if also_thresholded else 1, *pilot.shape), np.float32)
+    above, below = np.zeros((2, filters, *pilot.shape), np.float32)
     transform = _transform(noise.kernel, patches.size)
     rows, columns = (_corners(length, patches) for length in pilot.shape)
 

@@ -42,10 +42,8 @@ def filter_rows(picture, pilot, guide, variance, rows, columns, search, transfor
     rows, columns : int array
         First row and column of the reference patches.
     search : (int, int, float)
-        How far from its reference a member may lie, along rows and columns, the largest number of members, and the
+        Largest distance of a member from its reference, along rows and columns, largest number of members, and the
         least magnitude of the coefficients that the second filter keeps, in standard deviations of their noise.
-    transform : Transform
-        The transform of patches, and their size.
     above, below : float32 array (filter, row, column)
         Sums to which the filtered patches times their weights, and the weights, are added. The first filter is
         Wiener's; the second, if there is one, keeps large coefficients.

@@ -30,8 +30,8 @@ _TOLERANCE, _MAX_PASSES = 0.02, 4
 # Spacings of the blur of the border between what is lit and what is dark.
 _BORDER_BLUR = (1, 1, 2)
 
-# A sample is in detail where the pilot changes by this share of the noise's deviation from sample to sample. Chosen on
-# photographs, as are the spacings of the blurs of the change and of what is in detail.
+# A sample is in detail where the pilot changes by this share of the noise's deviation from sample to sample; blurs of
+# the change and of the detail. Chosen on photographs.
 _DETAIL_SHARE, _CHANGE_BLUR, _DETAIL_BLUR = 0.15, (1, 1), (1, 1, 2)
 
 # What a plane has beyond its blurred self counts where its square exceeds this share of the noise's variance. Chosen on
@@ -140,8 +140,8 @@ def propose(
 ) -> list[PlaneProposal]:
     """Return a proposal for each plane of a scene: a mixture of candidates, with weights from held-out views.
 
-    The mixture that best predicts the back-projections of views that were held out, in the mean over folds. It differs
-    from region to region: with and without light, with and without detail.
+    The mixture best predicts the back-projections of held-out views, in the mean over folds. It differs from region to
+    region: with and without light, with and without detail.
 
     Parameters
     ----------
@@ -236,9 +236,7 @@ def _proposal(
     candidates: Candidates, plane: Image, evidence: Evidence, regions: Regions, mixture: list[NDArray[np.float64]]
 ) -> PlaneProposal:
     made = candidates(evidence)
-    named = {
-        region: dict(zip(made, weights.tolist(), strict=True)) for region, weights in zip(regions, mixture, strict=True)
-    }
+    named = {name: dict(zip(made, a.tolist(), strict=True)) for name, a in zip(regions, mixture, strict=True)}
 
     def again(other: Evidence, other_plane: Image) -> Image:
         return _sharpened(_mixed(candidates(other), regions, mixture), other_plane, other)
@@ -250,9 +248,8 @@ def _proposal(
 def _sharpened(mixed: Image, plane: Image, evidence: Evidence) -> Image:
     """Return x̂ ≥ 0: a mixture, which is as blurred as the evidence, with the edges that the plane f has beyond that.
 
-    They are `s (f − u)` with `s = d / (d + c v)`, d the mean of (f − u)² nearby and v the noise's variance: where the
-    noise is small they are what the views show, and where it is large the blur does less harm than what TV removed.
-    Where no view sees the plane, f is all there is.
+    They are `s (f − u)` with `s = d / (d + c v)`, d the mean of (f − u)² nearby and v the noise's variance, because
+    large noise does more harm than the blur. Where no view sees the plane, f is all there is.
     """
     edges = plane - evidence.pilot
     variance = evidence.noise.variance

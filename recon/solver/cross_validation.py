@@ -3,7 +3,7 @@
 Windows stand for a large plane.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -103,8 +103,8 @@ def cross_validated_weight(
 
     Notes
     -----
-    The data's part of the objective grows with the number of views n, and its noise with √n. A weight that balances
-    that noise is therefore scaled by the ratio of the roots, from the training views to all views.
+    The noise of the data's part of the objective grows as the root of the number of views, and so does the weight from
+    the training views to all views.
     """
     views = len(problem.operator.seeing_views)
     if views < MIN_VIEWS:
@@ -116,7 +116,7 @@ def cross_validated_weight(
         folds = [fold for of_window in per_window for fold in of_window]
     else:
         folds = _folds_of(problem, penalty, folds_to_predict(problem))
-    losses = _losses(folds, guess, apply=map_in_threads if windows else _in_turn)
+    losses = _losses(folds, guess, apply=map_in_threads if windows else map)
     best = min(losses, key=losses.__getitem__)
     offset = _lowest_offset([losses.get(best + n) for n in (-1, 0, 1)])
     candidates = {guess * _CANDIDATE_RATIO**step: loss for step, loss in sorted(losses.items())}
@@ -133,7 +133,7 @@ def _folds_of(problem: SceneProblem, penalty: Penalty, count: int, level_e: floa
 
 
 def folds_to_predict(problem: SceneProblem) -> int:
-    """Return how many folds it takes to predict `MIN_SCORED_PIXELS`, or the number of all."""
+    """Return the number of folds that predict `MIN_SCORED_PIXELS`, or that of all."""
     count = len(problem.operator.seeing_views)
     pixels_per_fold = problem.images.electrons[0].size * count / _folds(count)
     return min(int(np.ceil(MIN_SCORED_PIXELS / pixels_per_fold)), _folds(count))
@@ -175,12 +175,8 @@ class _Fold:
         return problem.operator.negative_log_likelihood(iterate.plane, problem.images, self._validation)
 
 
-def _in_turn(work: Callable[[_Fold], float], folds: Sequence[_Fold]) -> list[float]:
-    return [work(fold) for fold in folds]
-
-
 def _losses(
-    folds: list[_Fold], guess: float, apply: Callable[[Callable[[_Fold], float], Sequence[_Fold]], list[float]]
+    folds: list[_Fold], guess: float, apply: Callable[[Callable[[_Fold], float], Sequence[_Fold]], Iterable[float]]
 ) -> dict[int, float]:
     """Return the loss of each candidate `guess · ratioⁿ` by n; `apply` scores all folds."""
     losses: dict[int, float] = {}

@@ -94,10 +94,10 @@ def pmlem(
 
     Parameters
     ----------
-    fit, penalty : DataFit, Penalty
-        L and φ; total variation by default.
-    start, penalty_weight : float array (samples), float
-        Positive samples to start from; β ≥ 0, in the unit of s.
+    fit, start : DataFit, float array (samples)
+        L; positive samples to start from.
+    penalty_weight, penalty : float, Penalty
+        β ≥ 0, in the unit of s, and φ, total variation by default.
     tolerance : float
         The distance that the caller wants to reach, which sets the accuracy of inner problems.
     dual : DualField, optional

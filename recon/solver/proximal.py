@@ -141,8 +141,7 @@ class DualField:
 class _PrimalDual:
     """The accelerated primal-dual iteration (Chambolle and Pock 2011, algorithm 2), in a diagonal metric.
 
-    It changes p and x of one plane, which belong to the caller. Its x is much nearer the minimum than the plane that
-    belongs to p, whose ripples the penalty counts.
+    It changes p and x of one plane, which belong to the caller. Its x is much nearer the minimum than the primal of p.
     """
 
     def __init__(

@@ -28,10 +28,8 @@ def step_strip(
         The rows before and after the strip of p, of x and of x ahead; without rows at an edge of the plane.
     dual, plane, ahead : array (2, row, column), (row, column), (row, column)
         p; x; x extrapolated beyond its last step, less x̂. They are changed.
-    centre, reach, sizes : array (row, column)
-        v, β/w, and the size of a step on p.
-    origin : array (row, column)
-        x̂; of size zero where it is zero everywhere.
+    centre, reach, sizes, origin : array (row, column)
+        v, β/w, the size of a step on p, and x̂, of size zero where it is zero everywhere.
     smoothing, bounded : number, bool
         δ of the penalty, in the unit of the plane; whether |p| ≤ 1.
     lengths, momenta : array (step,)
@@ -78,7 +76,6 @@ def step_strip(
 
 @compiled
 def _load(rows, row, p, x, x_ahead):
-    """Copy a row of a neighbour."""
     p[0, 1:], p[1, 1:], x[:], x_ahead[: x.size] = rows[0, row], rows[1, row], rows[2, row], rows[3, row]
 
 

@@ -75,11 +75,10 @@ def standard_deviation(local: LocalFit, weight: float, penalty: Penalty, generat
     """Return the standard deviation (row, column) of a plane in electrons: the root of its expected squared error.
 
     The plane is solved again from data with added noise of the size that they have already, on the quadratic that L is
-    near the optimum. Where the weight predicts best, the mean square of these answers V is about the squared error,
-    what the penalty removed included. How much they differ is measured: Stein's unbiased estimate of
-    `|K(f − truth)|²` is compared with `|K answer|²`, where K is HᵀH divided by its row sums, on opaque samples and
-    beside them, and weighted against the usual ratio. What the error has beyond the usual ratio is the contrast that
-    the penalty removed; it is spread evenly, because it is not where the answers are.
+    near the optimum. Where the weight predicts best, the mean square of these answers is about the squared error. Their
+    ratio is measured: Stein's unbiased estimate of `|K(f − truth)|²` is compared with `|K answer|²`, where K is HᵀH
+    divided by its row sums, on opaque samples and beside them, and weighted against the usual ratio. The error beyond
+    that is the contrast that the penalty removed; it is spread evenly, because it is not where the answers are.
 
     `weight` and `penalty` are β ≥ 0 of the optimum, and φ. Without a penalty, the variance is 1/W.
     """
