@@ -132,7 +132,7 @@ def depth_sigma_mm(
 def depth_resolution_mm(depth_mm: float, f_px: float, aperture_mm: float) -> float:
     """Return the change of depth that moves a point by one pixel between the outermost views, `z² / (f B)`.
 
-    It is the derivative of the disparity `d = f B / z` (Gallup, Frahm, Mordohai and Pollefeys, CVPR 2008).
+    It follows from the disparity `d = f B / z` (Gallup, Frahm, Mordohai and Pollefeys, CVPR 2008).
     """
     return depth_mm**2 / (f_px * aperture_mm)
 
@@ -144,7 +144,7 @@ def _length_px(side_px: float, blur_px: float) -> float:
 
 
 def _overlap(shift_px: float, blur_px: float) -> float:
-    """Return the overlap of two pixels along an axis, both blurred by the lens: of the triangle, at its centre 1."""
+    """Return the overlap of two pixels along an axis, both blurred by the lens; without blur 1 at no shift."""
     left, centre, right = (_mean_distance(shift_px + step, blur_px) for step in (-1, 0, 1))
     return (left + right) / 2 - centre
 

@@ -59,8 +59,7 @@ class SurfaceOperator(PlaneOperator):
 
     Notes
     -----
-    The light of a surface is that of its samples in every direction (Lambert), however the surface is inclined; see
-    docs/physics.md, "Through a surface".
+    The light of a sample is the same in every direction (Lambert); see docs/physics.md, "Through a surface".
     """
 
     def __init__(
