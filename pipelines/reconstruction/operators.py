@@ -119,10 +119,7 @@ class OperatorFactory:
     def __init__(
         self, elemental_set: ElementalSet, layout: ChannelLayout, images: ElementalImages | None, *, bins: int = 1
     ) -> None:
-        self._loaded = elemental_set
-        self._valid = None if images is None else images.valid
-        self._phases = len(layout.lattices)
-        lattices = layout.lattices
+        lattices, self._phases = layout.lattices, len(layout.lattices)
         rays = np.empty((len(lattices), *lattices[0].shape, 2), np.float32)
         for part, at in zip(rays, lattices, strict=True):  # one at a time: they are as large as two images each
             part[:] = elemental_set.lens.rays(at.first, at.step)[: at.shape[0], : at.shape[1]]
@@ -131,23 +128,27 @@ class OperatorFactory:
         whole = binned(response > 0, bins) == 1  # a bin with an unusable pixel holds the electrons of that, too
         self._maps = DetectorMaps(rays, np.where(whole, binned(response, bins), 0))
         self._poses, self._principal_shift = elemental_set.poses_rt_cam_ref, principal_shift(elemental_set)
+        valid, lattice_of_view = (
+            None if images is None else images.valid,
+            np.tile(np.arange(self._phases), len(self._poses)),
+        )
+        self._shared: dict[str, Any] = {"valid": valid, "lattice_of_view": lattice_of_view}
 
     def at(self, place: Place, grid: PlaneGrid) -> PlaneOperator:
         """Return H of a plane at a depth, or of a pose."""
-        return PlaneOperator(self._homographies(place), self._maps, grid, **self._shared())
+        return PlaneOperator(self._homographies(place), self._maps, grid, **self._shared)
 
     def of_views(
         self, place: Place, grid: PlaneGrid, views: Sequence[int], valid: NDArray[np.bool_] | None
     ) -> PlaneOperator:
         """Return H of a plane in some views alone, in their order, with a mask (view, row, column) of their own."""
         own = {"valid": valid, "lattice_of_view": np.tile(np.arange(self._phases), len(views))}
-        return PlaneOperator(self._homographies(place, views), self._maps, grid, **self._shared() | own)
+        return PlaneOperator(self._homographies(place, views), self._maps, grid, **self._shared | own)
 
     def of_surface(self, inverse_depth: NDArray[np.floating], grid: PlaneGrid) -> SurfaceOperator:
         """Return H of the surface with these 1/depths in 1/mm, on the samples of a grid at unit depth."""
-        matrices = ray_from_surface(self._loaded.poses_rt_cam_ref, self._principal_shift)
-        matrices = np.repeat(matrices, self._phases, axis=0)
-        return SurfaceOperator(matrices, self._maps, grid, inverse_depth, **self._shared())
+        matrices = np.repeat(ray_from_surface(self._poses, self._principal_shift), self._phases, axis=0)
+        return SurfaceOperator(matrices, self._maps, grid, inverse_depth, **self._shared)
 
     def of_scene(self, grids: Mapping[Place, PlaneGrid], opacities: Sequence[Image] | None = None) -> SceneOperator:
         """Return H of all planes together, in the order of `grids`.
@@ -156,7 +157,7 @@ class OperatorFactory:
         """
         homographies = np.stack([self._homographies(place) for place in grids])
         occluders = None if opacities is None else Occluders(opacities, [depth_of(place) for place in grids])
-        return SceneOperator(homographies, self._maps, list(grids.values()), occluders=occluders, **self._shared())
+        return SceneOperator(homographies, self._maps, list(grids.values()), occluders=occluders, **self._shared)
 
     def _homographies(self, place: Place, views: Sequence[int] | None = None) -> NDArray[np.float64]:
         """Return the homographies from the rays of some views, and each phase of its mosaic, to a plane."""
@@ -164,15 +165,9 @@ class OperatorFactory:
             rt_ref_plane = np.array(place.rt_ref_plane)
         else:
             rt_ref_plane = fronto_parallel_rt_ref_plane(place)
-        poses, shift = self._poses, self._principal_shift
-        if views is not None:
-            poses, shift = poses[list(views)], None if shift is None else shift[list(views)]
-        return np.repeat(plane_from_ray(poses, rt_ref_plane, shift), self._phases, axis=0)
-
-    def _shared(self) -> dict[str, Any]:
-        views = len(self._loaded.settings.view)
-        lattices = np.tile(np.arange(self._phases), views)
-        return {"valid": self._valid, "lattice_of_view": lattices}
+        chosen = slice(None) if views is None else list(views)
+        shift = None if self._principal_shift is None else self._principal_shift[chosen]
+        return np.repeat(plane_from_ray(self._poses[chosen], rt_ref_plane, shift), self._phases, axis=0)
 
 
 def response_of(elemental_set: ElementalSet, lattice: Lattice) -> NDArray[np.float32]:

@@ -170,9 +170,9 @@ def searched_range_mm(elemental_set: ElementalSet) -> tuple[float, float]:
     best = int(shared.argmax())
     if shared[best] < _MIN_OVERLAP:
         raise NothingInFocus(
-            f"the views share {shared[best]:.0%} of the reference view at most, "
-            f"at {elemental_set.depth_text(depths[best])}; "
-            "give the range to search by --sweep, or that of a surface by --depth-range-mm"
+            f"the views share {shared[best]:.0%} of the reference view at most, at "
+            f"{elemental_set.depth_text(depths[best])}; give the range to search by --sweep, or that of a surface by "
+            "--depth-range-mm"
         )
     overlapping = shared >= _MIN_OVERLAP
     first = best - int(np.argmin(np.append(overlapping[best::-1], False))) + 1
@@ -191,9 +191,8 @@ def _range_of_disparities(elemental_set: ElementalSet, least_px: float, largest_
     far, near = sorted(at_zero + slope * end_px for end_px in (least_px - margin_px, largest_px + margin_px))
     if near <= 0:
         raise NothingInFocus(
-            f"{elemental_set.folder}: arrangement.disparity_range_px = "
-            f"{least_px:g} to {largest_px:g} lies behind infinity by "
-            "the poses; correct one of them"
+            f"{elemental_set.folder}: arrangement.disparity_range_px = {least_px:g} to {largest_px:g} lies behind "
+            "infinity by the poses; correct one of them"
         )
     return 1 / near, 1 / max(far, near / _INFINITY)
 
@@ -218,8 +217,7 @@ def _refined(
 
 def _nothing(elemental_set: ElementalSet, range_mm: tuple[float, float]) -> NothingInFocus:
     return NothingInFocus(
-        f"between {elemental_set.depths_text(*range_mm, join=' and ')} "
-        f"there is no depth at which the views agree on at least "
-        f"{MIN_SAMPLES} bins of pixels that stand out of the noise; give another range by --sweep "
+        f"between {elemental_set.depths_text(*range_mm, join=' and ')} there is no depth at which the views agree on "
+        f"at least {MIN_SAMPLES} bins of pixels that stand out of the noise; give another range by --sweep "
         "FIRST:LAST:COUNT, more light, or --depth"
     )

@@ -177,9 +177,8 @@ def _refuse_rearranged(
     chance, (best, remedy) = float(np.mean(shuffled)), rearranged
     if significance(best, shuffled).p_value <= max_p and chance - best > _CLEARLY * (chance - statistic):
         raise NothingInFocus(
-            f"{elemental_set.folder}: the views agree better with {remedy}: "
-            f"by {chance - best:.3g} in squared deviations, "
-            f"and by {chance - statistic:.3g} as stated; import the pictures again so"
+            f"{elemental_set.folder}: the views agree better with {remedy}: by {chance - best:.3g} in squared "
+            f"deviations, and by {chance - statistic:.3g} as stated; import the pictures again so"
         )
 
 

@@ -160,9 +160,8 @@ def check_views(elemental_set: ElementalSet, purpose: str) -> None:
         )
     if not np.linalg.norm(elemental_set.poses_rt_cam_ref[:, 3:], axis=1).max() > 0:
         raise NothingInFocus(
-            f"{elemental_set.folder}: all views were taken from one place, "
-            "which tells no depths apart; correct the poses, or "
-            "capture several nodes"
+            f"{elemental_set.folder}: all views were taken from one place, which tells no depths apart; correct the "
+            "poses, or capture several nodes"
         )
 
 

@@ -248,12 +248,11 @@ class Sweep:
     @property
     def records(self) -> list[PlaneRecord]:
         """The records of all planes: by channel, plane, method."""
-        methods = list(dict.fromkeys(files.method for files in self.files))
         return [
             self.finished[method, place].planes[index]
             for index in range(len(self.layouts))
             for place in self.grids
-            for method in methods
+            for method in self.origins
         ]
 
     @property
