@@ -66,7 +66,6 @@ def assess(
 def _plane_errors(
     folder: Path, poses: Poses, truth: Truth, method: Method, depth: float, plane: NDArray[Any], bright: NDArray[Any]
 ) -> PlaneErrors | None:
-    """Return the errors of one plane, None if its samples are not those of the truth."""
     at_depth = true_plane(truth, depth)
     assert at_depth is not None
     texture, region = texture_and_region(folder, at_depth)

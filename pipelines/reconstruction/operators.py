@@ -89,7 +89,6 @@ def tilted_grid(elemental_set: ElementalSet, plane: TiltedPlane, pitch_mm: float
 
 
 def _covered_part(elemental_set: ElementalSet, plane: TiltedPlane) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the lowest and highest x, y in mm of a plane: of its stated size, or what the reference view sees."""
     if plane.size_mm is not None:
         half = np.array(plane.size_mm) / 2
         return -half, half

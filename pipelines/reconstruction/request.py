@@ -157,7 +157,6 @@ def select_planes(options: Options) -> Selection:
 
 
 def _methods(options: Options) -> list[Method]:
-    """Return the methods given by name or by an option of their own, each once; the default if there are none."""
     by_option: dict[Method, bool] = {"joint": options.joint, "occlusion": options.occlusion}
     given = [*(options.method or []), *(name for name, wanted in by_option.items() if wanted)]
     return list(dict.fromkeys(given)) or [DEFAULT_METHOD]
@@ -168,7 +167,6 @@ def _swept(option: str, text: str | None, example: str = "400:900:64") -> list[f
 
 
 def _default_prior(selection: Selection) -> PriorName:
-    """Return auto, or tv where a prior has no effect or, in a sweep, would take long."""
     options, solver = selection.options, selection.solver
     helps = solver.penalty == "tv" and solver.penalty_weight != 0 and bool(_WITH_PRIOR & set(selection.methods))
     sweeps = bool(options.sweep or options.sweep_mm or options.sweep_px) and not selection.auto
@@ -275,7 +273,6 @@ def _found_earlier(earlier: ReconstructionRecord, range_mm: tuple[float, float])
 
 
 def _refuse_mm(selection: Selection, elemental_set: ElementalSet) -> None:
-    """Refuse depths in mm for a set without a scale (WrongUsage)."""
     if elemental_set.units.depth == "mm" or not (in_mm := selection.numbers("mm")):
         return
     own, in_px = ("--depth", "--disparity-px") if selection.single["mm"] else ("--sweep", "--sweep-px")

@@ -150,7 +150,6 @@ def _make_planes(sweep: Sweep, folders: dict[Method, Path], out: Path, runner: R
 
 
 def _sweep(elemental_set: ElementalSet, folders: dict[Method, Path], request: Request) -> Sweep:
-    """Return the planes of a request, none of them made yet."""
     layouts = channel_layouts(elemental_set)
     mm_per_depth = default_pitch_px(elemental_set, layouts) / elemental_set.settings.camera.fx_px
     grids: dict[Place, PlaneGrid] = {
@@ -177,7 +176,6 @@ def _sweep(elemental_set: ElementalSet, folders: dict[Method, Path], request: Re
 
 
 def _warn(elemental_set: ElementalSet, records: list[PlaneRecord]) -> None:
-    """Inform the user of planes that may be wrong: unsettled, not converged, or without light."""
     certificates = [record.certificate for record in records if record.certificate]
     steps = [certificate for certificate in certificates if certificate.oscillates is not UNSET]
     swings = [certificate.relative_change or 0.0 for certificate in steps if certificate.oscillates]

@@ -98,7 +98,6 @@ def luminance(elemental_set: ElementalSet, bins: int) -> PinholeViews:
 
 
 def _response(elemental_set: ElementalSet, lattice: Lattice, bins: int) -> NDArray[np.float32]:
-    """Return the response of bins of a lattice (row, column), zero where one of their pixels is unusable."""
     response, pixels = response_of(elemental_set, lattice), _pixels(lattice, bins)
     whole = _summed(response > 0, lattice, bins) == pixels
     return np.where(whole, _summed(response, lattice, bins) / np.float32(pixels), np.float32(0))

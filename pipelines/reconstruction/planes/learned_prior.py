@@ -114,7 +114,6 @@ def _output(network: Any, inputs: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _tiles(shape: tuple[int, ...]) -> Iterator[tuple[_Tile, _Tile]]:
-    """Yield the tiles of a plane, and each with its margin, as slices of rows and columns."""
     for top, left in product(range(0, shape[0], _TILE), range(0, shape[1], _TILE)):
         at = ((top, shape[0]), (left, shape[1]))
         rows, columns = (slice(first, min(first + _TILE, length)) for first, length in at)

@@ -117,7 +117,6 @@ def _solution(
     options: SolverOptions,
     no_network: str | None,
 ) -> Solution:
-    """Return one plane with how far the data moved it from its proposal."""
     moved = np.zeros_like(plane)
     np.divide(plane - proposal.picture, proposal.sigma, out=moved, where=proposal.sigma > 0)
     seen = np.isfinite(proposal.sigma)

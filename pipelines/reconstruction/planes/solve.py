@@ -79,7 +79,6 @@ def solve(
 def _solve_one_step_late(
     operator: PlaneOperator, images: ElementalImages, method: Method, options: SolverOptions
 ) -> Solution:
-    """Run MLEM or one-step-late PMLEM as published."""
     start = smooth_start(operator, images)
     likelihood = select_likelihood(images, options.likelihood, mean_light_e(operator, start))
     images = replace(images, likelihood=likelihood)
@@ -145,7 +144,6 @@ def solve_together(
 
 
 def _check_memory(grids: Iterable[PlaneGrid]) -> None:
-    """Refuse to begin without memory for the arrays as large as all planes."""
     samples = sum(rows * columns for rows, columns in (grid.shape for grid in grids))
     arrays = _ARRAYS_OF_SAMPLES + int(numba.config.NUMBA_NUM_THREADS)
     needed, free = arrays * samples * np.dtype(np.float32).itemsize, available_bytes()

@@ -92,7 +92,6 @@ class Channel:
         return messages
 
     def _operator(self, place: Place, grid: PlaneGrid) -> PlaneOperator:
-        """Return H of a plane; a failure names the plane."""
         try:
             return self._factory.at(place, grid)
         except GeometryMismatch as failure:

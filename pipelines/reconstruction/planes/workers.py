@@ -209,7 +209,6 @@ def _distributed() -> Any:
 
 @contextmanager
 def _client(scheduler: str) -> Iterator[Any]:
-    """Connect to the workers of a scheduler."""
     try:
         client = _distributed().Client(scheduler)
     except (OSError, ValueError) as failure:
@@ -325,7 +324,6 @@ def _share(elemental_set: ElementalSet, layout: ChannelLayout, shared: Path) -> 
 
 @lru_cache(maxsize=1)
 def _opened(colour: _Colour) -> Channel:
-    """Return the colour of files of `_share`; a worker keeps the last one."""
     with np.load(colour.path.with_suffix(".npz"), allow_pickle=False) as file:
         maps: dict[str, Any] = {name: values if values.ndim else float(values) for name, values in file.items()}
     elemental_set = replace(colour.elemental_set, flat=maps.pop("flat", None), unusable=maps.pop("unusable"))

@@ -152,7 +152,6 @@ def _colour_map(values: NDArray[np.floating], label: str) -> bytes:
 
 
 def _write_film(folder: Path, maps: SurfaceMaps, levels: Picture) -> str | None:
-    """Write the picture from viewpoints between the nodes, and return its name; None if there is no film."""
     if not any(maps.aperture_mm):
         return None
     pitch = maps.grid.pitch_mm

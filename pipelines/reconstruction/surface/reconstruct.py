@@ -218,5 +218,4 @@ def _maps(
 
 
 def _colours(parts: list[NDArray[np.floating]]) -> NDArray[np.floating]:
-    """Return one array of all colours, (row, column[, colour])."""
     return parts[0] if len(parts) == 1 else np.stack(parts, -1)

@@ -84,7 +84,6 @@ def select_surface(options: Options) -> SurfaceRequest | None:
 
 
 def _ends(option: str, text: str, example: str) -> tuple[float, float]:
-    """Return the two ends of a range in ascending order."""
     parts = re.fullmatch(f"{_NUMBER}:{_NUMBER}", text)
     if parts is None or float(parts[1]) == float(parts[2]):
         raise WrongUsage(f"{option} {text}: is no range; give two different numbers as NEAR:FAR, such as {example}")
