@@ -85,7 +85,8 @@ def measure_emva(
         charge_error=_charge_error(calibration),
     )
     estimates = derived_quantities(inputs, exposure_s)
-    estimates |= _dsnu(dark, calibration) | _prnu(bright, calibration)
+    estimates |= _spreads("dsnu_{}_e", dark, calibration, "gain_dn_per_e", "dark")
+    estimates |= _spreads("prnu_{}", bright, calibration, "prnu", "flat")
     estimates["dark_current_doubling_k"] = _doubling(darks, temperature_c)
     return EmvaMeasurement(name, calibration, tuple(series), exposure_s, estimates, dark, bright)
 
@@ -173,21 +174,16 @@ def _end_dn(calibration: NoiseCalibration) -> float:
     return calibration.saturation_dn if np.isfinite(calibration.saturation_dn) else brightest
 
 
-def _dsnu(dark: MeanImage | None, calibration: NoiseCalibration) -> dict[str, Estimate]:
-    gain = calibration.estimates["gain_dn_per_e"]
-    if gain.value is None or dark is None:
-        why = gain.why if gain.value is None else _NO_PAIR.format("dark")
-        return {f"dsnu_{part.name}_e": Estimate(None, why=why) for part in fields(Nonuniformity)}
-    parts = nonuniformity(dark.values, ~calibration.maps.unusable, dark.noise, 1 / gain.value)
-    return {f"dsnu_{part.name}_e": getattr(parts, part.name) for part in fields(parts)}
-
-
-def _prnu(bright: MeanImage | None, calibration: NoiseCalibration) -> dict[str, Estimate]:
-    if bright is None or calibration.estimates["prnu"].value is None:
-        why = calibration.estimates["prnu"].why or _NO_PAIR.format("flat")
-        return {f"prnu_{part.name}": Estimate(None, why=why) for part in fields(Nonuniformity)}
-    parts = nonuniformity(bright.values, ~calibration.maps.unusable, bright.noise)
-    return {f"prnu_{part.name}": getattr(parts, part.name) for part in fields(parts)}
+def _spreads(
+    names: str, image: MeanImage | None, calibration: NoiseCalibration, known: str, kind: str
+) -> dict[str, Estimate]:
+    """Return DSNU or PRNU, all of it and its parts; those of darks in electrons, which need the gain."""
+    needed, parts = calibration.estimates[known], [part.name for part in fields(Nonuniformity)]
+    if image is None or needed.value is None:
+        return {names.format(part): Estimate(None, why=needed.why or _NO_PAIR.format(kind)) for part in parts}
+    scale = 1 / needed.value if kind == "dark" else 1.0
+    spreads = nonuniformity(image.values, ~calibration.maps.unusable, image.noise, scale)
+    return {names.format(part): getattr(spreads, part) for part in parts}
 
 
 def _doubling(darks: list[Series], temperature_c: Mapping[str, float]) -> Estimate:

@@ -94,19 +94,15 @@ def load_noise_set(folder: Path) -> FrameSeries:
     MissingFile, BadValue
         A file is missing, is not what it should be, or names a frame that is not there or whose exposure is not known.
     """
-    if has_session(folder) and not is_file(folder / FILE_NAME):
-        settings, scene_c = _of_session(folder)
-        warnings = [*_temperature_warnings(settings), *_scene_warnings(settings, scene_c)]
-        return FrameSeries(folder, settings, group_frames(folder, settings), warnings, PLAN)
-    path = folder if is_file(folder) else folder / FILE_NAME
+    session = has_session(folder) and not is_file(folder / FILE_NAME)
+    path = folder / PLAN if session else folder if is_file(folder) else folder / FILE_NAME
+    settings, scene_c = _of_session(folder) if session else (_read_settings(path), [])
+    warnings = [*_temperature_warnings(settings), *_scene_warnings(settings, scene_c)]
+    return FrameSeries(path.parent, settings, group_frames(path.parent, settings), warnings, path.name)
+
+
+def _read_settings(path: Path) -> NoiseSet:
     settings = read_toml(path, NoiseSet)
-    _check_settings(path, settings)
-    return FrameSeries(
-        path.parent, settings, group_frames(path.parent, settings), _temperature_warnings(settings), path.name
-    )
-
-
-def _check_settings(path: Path, settings: NoiseSet) -> None:
     if not settings.frame:
         raise BadValue(f"{path}: names no frame; give a [[frame]] with file, kind and exposure_s for each")
     seen: set[Path] = set()
@@ -136,6 +132,7 @@ def _check_settings(path: Path, settings: NoiseSet) -> None:
         raise BadValue(
             f'{path}: mosaic = {list(mosaic)}; give rows of equal length, at most {MAX_PERIOD_PX}, such as ["RG", "GB"]'
         )
+    return settings
 
 
 def _of_session(folder: Path) -> tuple[NoiseSet, list[float]]:
