@@ -52,16 +52,9 @@ _MAX_STRAIGHT = 1e-3
 
 @dataclass(frozen=True)
 class Histogram:
-    """Observed and predicted values of the dark series of one exposure.
+    """Values of the dark series of one exposure, from the lowest to the highest (value,).
 
-    Attributes
-    ----------
-    exposure_s : float
-        Exposure time.
-    value_dn : array (value,)
-        All digital numbers from the lowest to the highest.
-    count, expected : array (value,)
-        Number of times each occurred among the sampled pixels and frames, and its expectation by the fit.
+    `count` is the number of times each occurred among the sampled pixels and frames, `expected` the same by the fit.
     """
 
     exposure_s: float

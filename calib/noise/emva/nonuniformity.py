@@ -30,11 +30,8 @@ _LINES, _CHUNK_PX = 128, 1 << 16
 class TemporalNoise:
     """Temporal noise that is left in a mean image.
 
-    Attributes
-    ----------
-    variances, errors : array (3,)
-        Variance of a pixel, of the mean of a row and of that of a column, and their standard errors: of few frames, the
-        noise is known no better than the pattern.
+    `variances` (3,) are those of a pixel, of the mean of a row and of that of a column, with their standard errors: of
+    few frames, the noise is known no better than the pattern.
     """
 
     variances: Array
@@ -129,12 +126,8 @@ def _parts(image: NDArray[Any], used: Mask) -> tuple[Array, Array, float]:
 class Spectrogram:
     """Mean power spectrum of the lines of an image.
 
-    Attributes
-    ----------
-    frequency : array (bin,)
-        In cycles per pixel, from above 0 to 1/2.
-    power : array (bin,)
-        In the image's unit squared: where there is no pattern, the variance of the pixels.
+    Frequencies are in cycles per pixel, from above 0 to 1/2; the power is in the image's unit squared: the variance of
+    the pixels where there is no pattern.
     """
 
     frequency: Array
@@ -166,16 +159,9 @@ def spectrogram(image: NDArray[Any], used: Mask, axis: int) -> Spectrogram:
 
 @dataclass(frozen=True)
 class AccumulatedHistogram:
-    """Percentage of the pixels that deviate at least so far.
+    """Percentage of the pixels that deviate at least so far from the mean, in steps that ascend from 0.
 
-    Attributes
-    ----------
-    deviation : array (step,)
-        Absolute deviation from the mean, in the image's unit, ascending from 0.
-    percent : array (step,)
-        Percentage of the pixels.
-    sigma : float
-        Robust standard deviation, that of the normal law to compare with.
+    `sigma` is the robust standard deviation, that of the normal law to compare with.
     """
 
     deviation: Array

@@ -49,14 +49,7 @@ def snr(charge_e: Array, gain_dn_per_e: float, noise_e: float, dsnu_e: float = 0
 class Inputs:
     """Inputs of the derived quantities: values by name, the reasons for those without, and the covariance.
 
-    Attributes
-    ----------
-    values : dict of float
-        In the order of `covariance`.
-    whys : dict of str
-        Why the others have no value.
-    covariance : array (quantity, quantity)
-        Covariance of the values, scaled so that 1.96 standard errors are the half width of each interval.
+    The covariance, in the order of `values`, is scaled: 1.96 standard errors are the half width of each interval.
     """
 
     values: dict[str, float]
@@ -100,10 +93,9 @@ def gather_inputs(
 
     Parameters
     ----------
-    estimates : mapping
-        `gain_dn_per_e, read_noise_e, dark_current_e_per_s, quantum_efficiency, saturation_e`.
-    covariance : tuple (names, array)
-        Covariance of those of the first three that have values, possibly with others.
+    estimates, covariance : mapping, tuple (names, array)
+        `gain_dn_per_e, read_noise_e, dark_current_e_per_s, quantum_efficiency, saturation_e`, and the covariance of
+        those of the first three that have values, possibly with others.
     full_well : bool
         The full well saturates, not the converter.
     charge_error : float
@@ -136,14 +128,7 @@ def gather_inputs(
 
 
 def derived_quantities(inputs: Inputs, exposure_s: float) -> dict[str, Estimate]:
-    """Return the quantities that follow from gain, noise, efficiency and saturation.
-
-    Parameters
-    ----------
-    inputs : Inputs
-        Gain, noise, efficiency and capacity with their covariance.
-    exposure_s : float
-        Exposure of the dark noise.
+    """Return the quantities that follow from gain, noise, efficiency and saturation, for an exposure of the dark noise.
 
     Returns
     -------

@@ -46,16 +46,9 @@ _CHUNK_PX = 2048
 
 @dataclass(frozen=True)
 class Counts:
-    """Values of the pixels in use.
+    """Exposure of each dark series, and its values (frame, pixel), for the same pixels in each.
 
-    Attributes
-    ----------
-    exposure_s : tuple of float
-        Exposure of each dark series.
-    values_dn : tuple of arrays (frame, pixel), int
-        Values of each series, for the same pixels in each.
-    floor_dn : int, optional
-        Black level at which values are cut off; None if none is.
+    `floor_dn` is the black level at which values are cut off; None if none is.
     """
 
     exposure_s: tuple[float, ...]
@@ -184,10 +177,8 @@ def mass_function(
 
     Parameters
     ----------
-    u_dn : array (u,)
-        Values y − o at which to tabulate.
-    exposure_s : float
-        Exposure time t.
+    u_dn, exposure_s : array (u,), float
+        Values y − o at which to tabulate, and exposure time t.
     max_charge_e : float
         Largest λ at which the function will be evaluated; the Poisson sum extends well above it.
     exact, spread : bool

@@ -35,8 +35,6 @@ class SeriesNoise:
 
     Attributes
     ----------
-    frames : int
-        Number of frames.
     share : float
         Degrees of freedom that rows and columns leave, over the number of pixels.
     nodes_dn : array (node,)
@@ -169,15 +167,7 @@ class Moments:
 
 
 def gather_moments(darks: Sequence[Series], flats: Sequence[Series], used: Mask) -> Moments:
-    """Sum the statistics of the series over the pixels in use.
-
-    Parameters
-    ----------
-    darks, flats : sequence of Series
-        At least one dark series; all of one size.
-    used : array (row, column), bool
-        Pixels that are neither defective nor suspect.
-    """
+    """Sum the statistics of the series, at least one of darks, over pixels that are neither defective nor suspect."""
     pixels = float(used.sum())
     freedom = max(pixels - sum(used.shape) + 1.0, 1.0)
     both, first_flat = (*darks, *flats), len(darks)

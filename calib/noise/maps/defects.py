@@ -45,10 +45,7 @@ _MIN_FRAMES, _SIMULATED = 8, 4_000_000
 def hot_pixels(darks: Sequence[Series]) -> Mask:
     """Return the pixels (row, column) with a large dark signal, the longest exposure minus the shortest.
 
-    Parameters
-    ----------
-    darks : sequence of Series
-        If all have one exposure, dark signal and offset cannot be separated, and no pixel is hot.
+    If all darks have one exposure, dark signal and offset cannot be separated, and no pixel is hot.
     """
     exposure_s = [series.conditions.dark_time_s for series in darks]
     shortest, longest = darks[int(np.argmin(exposure_s))], darks[int(np.argmax(exposure_s))]
@@ -121,15 +118,7 @@ def variance_ratio(darks: Sequence[Series], noise_dn2: Sequence[float]) -> tuple
 
 
 def telegraph_pixels(darks: Sequence[Series], read: PixelReadNoise, noise_dn2: Sequence[float]) -> Mask:
-    """Return the telegraph pixels (row, column).
-
-    Parameters
-    ----------
-    darks, noise_dn2 : sequence (series,)
-        Dark series, and the pixel noise v_j of each by the fit.
-    read : PixelReadNoise
-        Read noise of their pixels.
-    """
+    """Return the telegraph pixels (row, column) by dark series, their read noise and the noise v_j of each series."""
     frames = np.array([dark.frames for dark in darks])
     if not read.resolved or frames.sum() < _MIN_FRAMES:
         return np.zeros(read.read_noise_dn.shape, bool)

@@ -27,10 +27,8 @@ class Seam:
 
     Attributes
     ----------
-    lines : str
-        "rows" or "columns".
-    regions : str
-        "halves", "quarters" or "alternate".
+    lines, regions : str
+        "rows" or "columns"; "halves", "quarters" or "alternate".
     effect : array (line,)
         By how much the region of each line differs from the mean.
     se : float
