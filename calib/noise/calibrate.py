@@ -26,13 +26,7 @@ from faintfield.calib.noise.misfit import (
     transfer_points,
 )
 from faintfield.calib.noise.series import Series
-from faintfield.calib.noise.series_fit import (
-    MAX_TABLE_WIDTH_DN,
-    NoiseLikelihood,
-    SeriesFit,
-    collect_counts,
-    fit_series,
-)
+from faintfield.calib.noise.series_fit import MAX_TABLE_WIDTH_DN, NoiseLikelihood, SeriesFit, collect_counts, fit_series
 from faintfield.calib.noise.strips import Array, Mask
 from faintfield.calib.noise.temperature import settle_temperature, with_doubling_error
 from faintfield.calib.noise_model import BentResponse, Map, NoiseModel

@@ -14,11 +14,7 @@ from faintfield.calib.noise.likelihood.exact import censored_start, fit_exact, g
 from faintfield.calib.noise.likelihood.gaussian import NoiseFit, dark_variances_dn2, flat_variances_dn2
 from faintfield.calib.noise.likelihood.marginal import Counts
 from faintfield.calib.noise.likelihood.moments import Moments, gather_moments
-from faintfield.calib.noise.likelihood.response import (
-    MEASURED_BEND_SE,
-    UNKNOWN_BEND_SE,
-    choose_bends,
-)
+from faintfield.calib.noise.likelihood.response import MEASURED_BEND_SE, UNKNOWN_BEND_SE, choose_bends
 from faintfield.calib.noise.scatter import fit_with_excess, without_odd
 from faintfield.calib.noise.series import Series, any_suspect, sample_index
 from faintfield.calib.noise.strips import Mask
