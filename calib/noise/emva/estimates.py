@@ -19,7 +19,7 @@ from faintfield.calib.noise.likelihood.gaussian import (
     main_quantities,
 )
 from faintfield.calib.noise.likelihood.moments import Moments
-from faintfield.calib.noise.likelihood.response import FittedLevels, charge_dn
+from faintfield.calib.noise.likelihood.response import FittedLevels, charge_dn, quantum_efficiency
 from faintfield.calib.noise.maps.photo_response import Response
 from faintfield.calib.noise.misfit import series_goodness
 from faintfield.calib.noise.series_fit import NoiseLikelihood, SeriesFit
@@ -62,16 +62,8 @@ def estimate_all(
 ) -> tuple[dict[str, Estimate], tuple[tuple[str, ...], Array]]:
     """Return all quantities, and the covariance of offset, gain, read noise and dark current.
 
-    Parameters
-    ----------
-    fitted : SeriesFit
-        Fit and series.
-    response : Response, optional
-        Photo response; None without flats.
-    saturation : Saturation
-        Saturation of the sensor.
-    levels_hold, noise_holds : bool
-        The dark levels lie on a straight line over exposure time; the noise of all series follows eq. (1).
+    There is no response to light without flats. `levels_hold` if the dark levels lie on a straight line over exposure
+    time, and `noise_holds` if the noise of all series follows eq. (1).
     """
     fit, moments = fitted.fit, fitted.moments
     levels_quantile = _levels_quantile(fit, moments)
@@ -128,10 +120,7 @@ def _in_electrons(
 
 
 def _levels_quantile(fit: NoiseFit, moments: Moments) -> float:
-    """Return the half width of a 95 % interval, in standard errors, of a quantity that follows from the dark levels.
-
-    The quantile is that of Student's t if jitter between frames dominates, because few frames determine it.
-    """
+    """Return the quantile of Student's t if jitter between frames dominates, because few frames determine it."""
     pixel_part = float(np.exp(fit.values["log_read_dn2"])) / moments.pixels
     freedom = float((moments.darks.frames - 1).sum())
     if freedom >= 1 and fit.values.get("jitter_dn2", 0.0) > 0.5 * pixel_part:
@@ -278,17 +267,6 @@ def _from_flats(fitted: SeriesFit, gain: Estimate, response: Response | None) ->
         efficiency = interval(*slope, positive=True)
     prnu = Estimate(None, why=_NO_FLATS) if response is None else response.prnu_estimate()
     return {"prnu": prnu, "nonlinearity_per_dn": nonlinearity, "quantum_efficiency": efficiency}
-
-
-def quantum_efficiency(photons: Array, charge_e: Array, gain_relative_se: float) -> tuple[float, float]:
-    """Return electrons per photon with the standard error, from the charges of flats (series,) and their photons.
-
-    EMVA 1288's η = R/K is the slope of charge over photons through the origin. Its error is that of the gain and of the
-    light's steadiness.
-    """
-    slope = float(charge_e @ photons / (photons @ photons))
-    scatter = float(np.sum((charge_e - slope * photons) ** 2)) / max(photons.size - 1, 1) / float(photons @ photons)
-    return slope, float(np.hypot(slope * gain_relative_se, np.sqrt(scatter)))
 
 
 def _lamp_flicker(fit: NoiseFit, moments: Moments) -> Estimate:

@@ -223,6 +223,17 @@ def linearity_error(signal_dn: Array, light: Array) -> float:
     return float(np.mean(np.abs(signal_dn / line - 1)))
 
 
+def quantum_efficiency(photons: Array, charge_e: Array, gain_relative_se: float) -> tuple[float, float]:
+    """Return electrons per photon with the standard error, from the charges of flats (series,) and their photons.
+
+    EMVA 1288's η = R/K is the slope of charge over photons through the origin. Its error is that of the gain and of the
+    light's steadiness.
+    """
+    slope = float(charge_e @ photons / (photons @ photons))
+    scatter = float(np.sum((charge_e - slope * photons) ** 2)) / max(photons.size - 1, 1) / float(photons @ photons)
+    return slope, float(np.hypot(slope * gain_relative_se, np.sqrt(scatter)))
+
+
 @dataclass(frozen=True)
 class FittedLevels:
     """Light and mean signal of all flats (series,), dark signal removed, with its variance, for the linearity error.

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from faintfield.calib.noise import Conditions, NoiseCalibration, Series, calibrate, measure_series
-from faintfield.calib.noise.emva.estimates import quantum_efficiency
+from faintfield.calib.noise.likelihood.response import quantum_efficiency
 from faintfield.calib.noise.maps.defects import outlying_pixels
 from faintfield.calib.noise.maps.measure import LinePattern, line_pattern, pixel_levels
 from faintfield.calib.noise.maps.photo_response import Response, _kept_share, _running_mean, measure_response
