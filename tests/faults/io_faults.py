@@ -64,12 +64,16 @@ class Outcome(NamedTuple):
 
 # What takes long and touches no file. A trial takes its result from the commands that were run first, as long as the
 # arguments are the same to the byte.
-_CALIBRATION, _WORKFLOWS = "faintfield.pipelines.calibration", "faintfield.pipelines.workflows"
+_WORKFLOWS = "faintfield.pipelines.workflows"
 _COMPUTATIONS = (
     "faintfield.calib.detection.detect_boards",
     "faintfield.rig.simulation.lab.lab_experiment",
-    *(f"{_CALIBRATION}.geometry.{name}" for name in ("calibrate_geometry", "stage_report", "transfer_sigma_at")),
-    *(f"{_CALIBRATION}.noise.calibrate", f"{_WORKFLOWS}.noise.emva_page", f"{_WORKFLOWS}.noise.draw_page"),
+    *(f"{_WORKFLOWS}.geometry.{name}" for name in ("calibrate_geometry", "stage_report", "transfer_sigma_at")),
+    *(
+        "faintfield.pipelines.calibration.noise.calibrate",
+        f"{_WORKFLOWS}.noise.emva_page",
+        f"{_WORKFLOWS}.noise.draw_page",
+    ),
     f"{_WORKFLOWS}.geometry.geometry_page",
     *(f"faintfield.pipelines.pages.calibration_pages.{name}" for name in ("node_drawing", "sigma_maps")),
 )
