@@ -143,7 +143,7 @@ def _simulated_bench(settings: StageSettings) -> Bench:
     name, _, cable = settings.port.removeprefix(SIMULATED).partition(":")
     firmware = SIMULATED_FIRMWARE.get(name or "grbl")
     if firmware is None or cable not in ("", "pty"):
-        raise PlanRefused(f"{settings.port}: no such stage; choose {', '.join(SIMULATED_FIRMWARE)}")
+        raise PlanRefused(f"{settings.port}: no such stage; choose {', '.join(SIMULATED_FIRMWARE)}, alone or with :pty")
     if not cable:
         return Bench(firmware)
     link = PtyLink()

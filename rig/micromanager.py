@@ -49,7 +49,7 @@ class SharedCore:
             import pymmcore_plus  # noqa: F401
         except ImportError as failure:
             remedy = "pip install 'faintfield[micromanager]'"
-            raise MissingExtra(f"'micromanager' is not installed; run: {remedy}") from failure
+            raise MissingExtra(f"pymmcore-plus for Micro-Manager is not installed; run: {remedy}") from failure
 
     def acquire(self, user: User) -> Any:
         """Return the core, with its devices loaded.

@@ -147,8 +147,8 @@ class PlaneAccumulator:
 
     def remove(self, frame: LiveFrame) -> None:
         """Take a frame away that is not valid any more; raises as `add` does."""
-        del self.frames[frame.intent]
         read = self._read(frame)
+        del self.frames[frame.intent]
         for index, running in enumerate(self._running):
             if (view := self._project(index, read)) is not None:
                 running.remove(view, _half(frame))

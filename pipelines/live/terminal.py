@@ -1,6 +1,7 @@
 """Show a capture in the terminal: prompts, keys, a status line, and the last frame as a picture."""
 
 import os
+import re
 import select
 import sys
 import termios
@@ -33,6 +34,9 @@ _KEYS = {"go": "g", "again": "a", "keep": "k", "retake": "r", "skip": "s", "stop
 # Widths of the frame's picture and histogram in characters.
 _PICTURE_COLUMNS, _HISTOGRAM_COLUMNS = 48, 24
 _BARS = " ▁▂▃▄▅▆▇█"
+# Cursor and function keys, whose letters are no keys of ours.
+_ESCAPES = re.compile(rb"\x1b(\[[0-9;]*[~A-Za-z]|O[A-Z]|.)?")
+
 # Longest wait in s between two looks at the keyboard.
 _LOOK_S = 0.1
 
@@ -138,12 +142,15 @@ def _keys(panel: CapturePanel) -> Iterator[None]:
         while not ended.is_set():
             if not select.select([sys.stdin], [], [], _LOOK_S)[0]:
                 continue
-            key = os.read(sys.stdin.fileno(), 1).decode(errors="ignore").lower()
-            asked = panel.asked
-            if key in "\r\n" and asked is not None:
-                panel.press(asked.prompt.answers[0], asked.number)
-            elif key in words:
-                panel.press(words[key])
+            data = os.read(sys.stdin.fileno(), 32)
+            if not data:  # the terminal is gone
+                return
+            for key in _ESCAPES.sub(b"", data).decode(errors="ignore").lower():
+                asked = panel.asked
+                if key in "\r\n" and asked is not None:
+                    panel.press(asked.prompt.answers[0], asked.number)
+                elif key in words:
+                    panel.press(words[key])
 
     tty.setcbreak(sys.stdin)
     listener = threading.Thread(target=listen, daemon=True)

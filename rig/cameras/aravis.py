@@ -14,8 +14,8 @@ from faintfield.rig.errors import CameraError, CameraTimeout
 
 # The most frequent ArvBufferStatus, in words; 0 is success.
 _STATUS = {1: "no data came", 2: "its packets did not all come in time", 3: "packets are missing"}
-# No frame has more bytes.
-_MAX_PAYLOAD = 2_000_000_000
+# No sensor has more rows or columns, and no frame more bytes.
+_MAX_SIDE_PX, _MAX_PAYLOAD = 65_536, 2_000_000_000
 # ARV_GV_STREAM_OPTION_PACKET_SOCKET_DISABLED, and ARV_AUTO_OFF
 _NO_PACKET_SOCKET = 1
 _AUTO_OFF = 0
@@ -105,7 +105,8 @@ class AravisDevice:
                 now = Moment.now()
             if frame is None:
                 waited = f"{1e-6 * wait_us:g} s"
-                raise CameraTimeout(f"no frame came within {waited}; check cable, firewall and camera.packet_bytes")
+                remedy = "check its cable, and for a network camera firewall and camera.packet_bytes"
+                raise CameraTimeout(f"no frame came within {waited}; {remedy}")
             try:
                 return self._values(frame.pointer), self._metadata(frame.pointer, requested, now, exposure_s)
             finally:
@@ -150,13 +151,15 @@ class AravisDevice:
             left, upper, width, height = region_px
             columns, rows = self._numbers("arv_camera_get_sensor_size", c_int, 2)
             if left + width > columns or upper + height > rows:
-                problem = f"camera.region_px = {region_px} leaves the sensor of {columns} x {rows} pixels"
+                problem = f"camera.region_px = {list(region_px)} leaves the sensor of {columns} x {rows} pixels"
                 raise CameraError(f"{problem}; correct it")
             self._call("arv_camera_set_region", *region_px)
         region = self._numbers("arv_camera_get_region", c_int, 4)
         if region_px is not None and region != region_px:
             raise CameraError(f"the camera reads the region {list(region)} instead of {list(region_px)}; set another")
-        left, upper = region[:2]
+        left, upper, width, height = region
+        if not (0 < width <= _MAX_SIDE_PX and 0 < height <= _MAX_SIDE_PX):
+            raise CameraError(f"the camera reports a frame of {width} x {height} pixels; set camera.region_px")
         if self._format.mosaic is not None and (left % 2 or upper % 2):
             problem = f"the camera's region begins at column {left}, row {upper}, which shifts its mosaic"
             raise CameraError(f"{problem}; set camera.region_px with an even column and row")

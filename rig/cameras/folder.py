@@ -98,7 +98,8 @@ class FolderCamera:
         state = (
             "no file came" if arrival is None else f"{arrival.path.name} {arrival.problem or 'never stopped growing'}"
         )
-        raise CameraTimeout(f"{self._folder}: {state} within {bound_s:g} s; check that the program saves there")
+        remedy = "check that the camera's program is triggered and saves there"
+        raise CameraTimeout(f"{self._folder}: {state} within {bound_s:g} s; {remedy}")
 
     def close(self) -> None:
         """Forget the folder's files."""

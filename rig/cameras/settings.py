@@ -44,7 +44,9 @@ class CoolingSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
             limits = f"{self.settle_tolerance_c:g} and settle_limit_s = {self.settle_limit_s:g}"
             raise ValueError(f"camera.settle_tolerance_c = {limits}; both are positive, correct them")
         if wanted_c is None and (self.settle_tolerance_c, self.settle_limit_s) != (0.5, 900.0):
-            raise ValueError("settle_tolerance_c and settle_limit_s need settle_temperature_c; give it, or remove them")
+            raise ValueError(
+                "camera.settle_tolerance_c and settle_limit_s need settle_temperature_c; give it, or remove them"
+            )
 
 
 class MosaicSettings(CoolingSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -156,8 +156,7 @@ class Gantry:
         """Stop at once; the position is kept if the controller decelerates without losing steps."""
         self._here = None
         with self._stopping_on_error():
-            self.trusted &= self._controller.abort()
-            self._controller.read_position()  # an abort raises nothing
+            self.trusted &= self._controller.stop()
 
     def recover(self) -> None:
         """Make the controller accept commands again after an error, without moving, and read its settings again."""

@@ -47,7 +47,7 @@ class GrblController:
         self._offset_mm: tuple[float, ...] | None = None
         self._alarm: int | None = None
         self._count_lost = False  # since the stage was homed
-        self._homing = False
+        self._homing = False  # by the last command
 
     def connect(self, wait_s: float = 0.0) -> None:
         """Open the connection, waiting up to `wait_s` for its port, and wait for the banner, as most boards restart."""
@@ -112,8 +112,14 @@ class GrblController:
         pins = self._poll().pins
         return frozenset(index for index in (0, 1) if self._axes[index] in pins)
 
+    def stop(self) -> bool:
+        """Cancel the jog: GRBL slows down within its acceleration and keeps its count."""
+        self._line.send(_CANCEL_JOG)
+        self._wait_until_still(self._braking_s)
+        return True
+
     def abort(self) -> bool:
-        """Cancel the jog, which keeps the count; reset what does not end, and homing, which nothing else stops."""
+        """Cancel the jog, or reset while homing, which nothing else interrupts; reset what does not end."""
         with suppress(StageError):  # a stage that cannot be reached cannot be stopped
             self._line.send(_RESET if self._homing else _CANCEL_JOG)
             if not self._homing:

@@ -28,7 +28,10 @@ _ALARMS = {
     12: ("a limit switch is closed", "move the carriage off its switch by hand, then recover and home it"),
     15: ("homing failed: the second motor's switch was not found", _LOOK),
     16: ("the controller failed its test of itself", "switch the controller off and on, then recover and home it"),
-    17: ("a motor driver reports a fault", "switch it off, look at motors and drivers, then recover and home it"),
+    17: (
+        "a motor driver reports a fault",
+        "switch the controller off, look at motors and drivers, then recover and home it",
+    ),
     18: ("homing failed: it is not set up", "correct $22 and $44 to $46, then recover and home it"),
 }
 

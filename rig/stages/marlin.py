@@ -94,8 +94,14 @@ class MarlinController:
         closed = {switch.name[0].upper() for switch in switches if switch.closed}
         return frozenset(index for index in (0, 1) if self._axes[index] in closed)
 
+    def stop(self) -> bool:
+        """Stop dead: Marlin does not slow down, so steps may be lost."""
+        self.abort()
+        self._command("M400")
+        return False
+
     def abort(self) -> bool:
-        """Send the emergency stop, which firmware with an emergency parser obeys at once, perhaps losing steps."""
+        """Send the emergency stop, which firmware with an emergency parser obeys at once."""
         with suppress(StageLost):  # a stage that cannot be reached cannot be stopped
             self._line.send(b"M410\n")
             self._discard_input()  # its ok belongs to no numbered line and must not be taken for the next answer
@@ -199,7 +205,9 @@ class MarlinController:
                     raise StageRejected(f"the controller refused {command!r}: {refusals[0].text}; home the stage first")
                 return messages
         problem = f"no answer to {command!r} within {self._clock.now_s() - started_s:.1f} s{why}"
-        raise StageTimeout(f"{problem}; look whether the stage still moves, check cable and power, then home it")
+        raise StageTimeout(
+            f"{problem}; look whether the stage still moves, check cable and power, then recover and home it"
+        )
 
     def _check(self, message: marlin.Message, command: str) -> None:
         if isinstance(message, marlin.Start):

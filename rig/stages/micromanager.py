@@ -162,8 +162,14 @@ class MicroManagerController:
             raise StageLost("the stage is not connected; connect it first")
         return frozenset()
 
+    def stop(self) -> bool:
+        """Stop and wait for rest. The position counts as lost, since adapters differ in how abruptly they stop."""
+        self._run(lambda: self._core.stop(self._label), "stopping")
+        self.read_position()
+        return False
+
     def abort(self) -> bool:
-        """Tell the stage to stop; the position counts as lost, since adapters differ in how abruptly they stop."""
+        """Tell the stage to stop; the position counts as lost."""
         with suppress(StageError):
             self._run(lambda: self._core.stop(self._label), "stopping", answer_s=min(_ABORT_S, self._options.answer_s))
         return False
@@ -192,7 +198,7 @@ class MicroManagerController:
         label = self._options.device or core.getXYStageDevice()
         stages = core.getLoadedDevicesOfType(_XY_STAGE)
         if label not in stages:
-            choices = ", ".join(stages) or "those of another configuration"
+            choices = ", ".join(stages) or "those of another stage.configuration"
             raise NotOffered(f"the configuration has no XY stage {label!r}; choose from {choices}")
         set_properties(core, label, self._options.properties)
         return core, label
@@ -264,7 +270,9 @@ class MicroManagerController:
             reason = in_one_line(failure)
             if waits_s and self._clock.now_s() - begun_s >= waits_s:
                 problem = f"the stage did not finish {what} within {waits_s:.1f} s ({reason})"
-                raise StageTimeout(f"{problem}; look for an obstacle, or lower stage.rate_mm_per_s") from failure
+                raise StageTimeout(
+                    f"{problem}; look for an obstacle, or lower stage.rate_mm_per_s, then home it"
+                ) from failure
             problem = f"the stage failed at {what}: {reason}"
             raise StageLost(f"{problem}; check its cable, its power and the configuration, then home it") from failure
 

@@ -66,11 +66,15 @@ class StageWorkspace(Struct, frozen=True):
         """Raise `OutsideTravel` or `KeepOutCrossed` for the first bad position or straight segment of a path."""
         for point in path:
             if not self.travel_mm.holds(point, _ROUNDING_MM):
-                raise OutsideTravel(f"position {point} is outside the travel {self.travel_mm}; choose one inside")
+                raise OutsideTravel(
+                    f"position {point} is outside the travel {self.travel_mm}; choose one inside, or move the grid"
+                )
         for start, end in pairwise(path):
             for box in self.keep_out:
                 if segment_meets(box, start, end):
-                    raise KeepOutCrossed(f"the way from {start} to {end} meets the keep-out box {box}; go around it")
+                    raise KeepOutCrossed(
+                        f"the way from {start} to {end} meets the keep-out box {box}; change path or box"
+                    )
 
 
 def segment_meets(box: Box, start: Point, end: Point) -> bool:

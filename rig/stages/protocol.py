@@ -155,6 +155,9 @@ class Controller(Protocol):
     def switches(self) -> frozenset[AxisIndex]:
         """Return the axes whose switch is closed."""
 
+    def stop(self) -> bool:
+        """Stop the motion, wait until it has ended, and return whether the position is kept."""
+
     def abort(self) -> bool:
         """Stop the stage and leave no motion that could go on, without raising; return whether the position is kept."""
 

@@ -150,9 +150,3 @@ def test_settings_that_change_while_read_are_refused(
     filter_once(bench.wire.filters_to_host, lambda data: data.replace(old, new), lambda data: data.startswith(start))
     with pytest.raises(StageLost, match="read differently"):
         bench.stage().connect()
-
-
-def test_hold_after_homing_keeps_the_position(stage: Gantry) -> None:
-    stage.hold()
-    assert stage.trusted
-    assert stage.move_to(-50.0, -50.0).trusted
