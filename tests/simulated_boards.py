@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from faintfield.calib.board import Board, black_rectangles_mm
 from faintfield.pipelines.formats.image_files import write_frame
-from faintfield.pipelines.formats.sets.board_set import FILE_NAME, BoardSetFile, ImageEntry
+from faintfield.pipelines.formats.sets.board_set import FILE_NAME, BoardEntry, BoardSetFile, ImageEntry
 from faintfield.pipelines.formats.toml_files import write_toml
 from faintfield.rig.plan import grid_nodes
-from faintfield.rig.settings import BoardSettings
 from faintfield.rig.simulation.boards import SimulatedBoard, printed_board, six_boards
 from faintfield.rig.simulation.experiment import SimulatedExperiment
 from faintfield.rig.simulation.scene import TexturedPlane, render
@@ -75,9 +74,7 @@ def simulate_board_set(
             photons = view.light * (white_e / _WHITE / experiment.sensor.quantum_efficiency)
             write_frame(out / name, experiment.sensor.expose(photons, experiment.exposure_s, generator))
             images.append(ImageEntry(name, node, boards.index(board)))
-    entries = [
-        BoardSettings(**{name: getattr(board, name) for name in BoardSettings.__struct_fields__}) for board in boards
-    ]
+    entries = [BoardEntry(**{name: getattr(board, name) for name in BoardEntry.__struct_fields__}) for board in boards]
     write_toml(out / FILE_NAME, BoardSetFile(1, entries, images, experiment.pitch_mm))
 
 

@@ -200,8 +200,9 @@ def _indices(target_of: NDArray[np.int32], node_of: NDArray[np.int32]) -> NDArra
 
 def _optimize(inputs: dict[str, Any]) -> None:
     """Move the inputs to the optimum, in place."""
+    optimize = load_mrcal().optimize
     with _c_library_silenced():
-        load_mrcal().optimize(**inputs)
+        optimize(**inputs)
 
 
 @contextmanager

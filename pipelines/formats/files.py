@@ -203,7 +203,7 @@ def require_room(path: Path, needed_bytes: int) -> None:
 
 def sha256(path: Path) -> str:
     """Return the SHA-256 of a file, in hexadecimal; raise MissingFile if it cannot be read."""
-    with naming_unreadable(path):
+    with naming_unreadable(path, "allow it to be read"):
         return rig_files.sha256(path)
 
 
@@ -258,7 +258,7 @@ class Hashes:
     def of(self, name: str) -> str:
         """Return the SHA-256 of a file, by its name within the folder."""
         path = self._folder / name
-        with naming_unreadable(path):
+        with naming_unreadable(path, "allow it to be read"):
             state = path.stat()
         begun_ns = time.time_ns()
         known = self._known.get(name)

@@ -53,13 +53,13 @@ def _is_there(path: Path, test: Callable[[Path], bool]) -> bool:
 
 
 @contextmanager
-def naming_unreadable(path: Path) -> Iterator[None]:
+def naming_unreadable(path: Path, remedy: str = "name a file of the kind that is read here") -> Iterator[None]:
     """Turn the failures of a file that cannot be opened or read into MissingFile with the path."""
     try:
         yield
     except (OSError, ValueError) as failure:  # a ValueError is a name with a NUL
         reason = failure.strerror if isinstance(failure, OSError) else failure
-        raise MissingFile(f"{path}: cannot be read ({reason}); name a file of the kind that is read here") from failure
+        raise MissingFile(f"{path}: cannot be read ({reason}); {remedy}") from failure
 
 
 @contextmanager
@@ -128,7 +128,8 @@ def _member(archive: zipfile.ZipFile, name: str, max_bytes: int, shape: tuple[in
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise ValueError(f"{name} is compressed by method {entry.compress_type}, which numpy does not use")
     with archive.open(entry) as member:
-        np.lib.format.read_magic(member)
+        if (version := np.lib.format.read_magic(member)) != (1, 0):
+            raise ValueError(f"{name} is of .npy format {version[0]}.{version[1]}, only 1.0 is read")
         found, column_major, dtype = np.lib.format.read_array_header_1_0(member)
         if dtype.kind not in _NUMBERS:
             raise ValueError(f"{name} is {dtype}, which are no numbers")

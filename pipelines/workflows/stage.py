@@ -1,7 +1,7 @@
 """A stage brought up by hand, with the driver that captures use: `faintfield stage`."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 
 import msgspec
 from rich.table import Table
@@ -83,9 +83,8 @@ def check_stage(connection: StageConnection) -> list[Check]:
 
 def serve_simulated_stage(protocol: str, speed: float) -> None:
     """Serve a simulated controller on a port until Ctrl-C, with `speed` simulated seconds per real second."""
-    server = Server(SIMULATED_FIRMWARE[protocol])
-    inform(f"a simulated {protocol} stage is at {server.port}; Ctrl-C ends it")
-    with suppress(KeyboardInterrupt):
+    with closing(Server(SIMULATED_FIRMWARE[protocol])) as server, suppress(KeyboardInterrupt):
+        inform(f"a simulated {protocol} stage is at {server.port}; Ctrl-C ends it")
         server.run(speed)
 
 

@@ -108,6 +108,10 @@ def export_data(folder: Path, out: Path, *, overwrite: bool = False) -> Exported
     order = sorted(noise_set.series, key=lambda series: (series.kind != "flat", series.level, series.exposure_s))
     sources = [(path, conditions) for conditions in order for path in noise_set.series[conditions]]
     first = read_frame(sources[0][0])
+    if first.pixels_dn.ndim != 2:
+        raise BadValue(
+            f"{sources[0][0]}: is a colour picture, and EMVA 1288 data have one channel; give raw or grey frames"
+        )
     bits = _bits(settings, first)
     region = (slice(*settings.region.rows), slice(*settings.region.columns)) if settings.region else np.s_[:, :]
     height, width = first.pixels_dn[region].shape
@@ -167,6 +171,8 @@ def read_descriptor(path: Path) -> Descriptor:
                     read.frames.append(msgspec.structs.replace(current, file=rest.strip()))
                 case ["i", _]:
                     raise ValueError("an image before any 'b' or 'd' line")
+                case ["v" | "n" | "b" | "d" | "i"]:
+                    raise ValueError("no value follows it")
                 case [keyword, *_]:
                     raise ValueError(f"'{keyword}' is none of v, n, b, d, i")
         except ValueError as failure:

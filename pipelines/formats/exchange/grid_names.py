@@ -77,7 +77,9 @@ def pictures_in(folder: Path, *, every: bool = False) -> tuple[list[Path], list[
     files = [path for path in entries if not path.name.startswith(".") and is_file(path)]
     pictures = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES]
     if not pictures:
-        kinds_held = _count_kinds(files) or ("folders only" if any(map(is_folder, entries)) else "nothing")
+        if not files and (folders := [path.name for path in entries if is_folder(path)]):
+            raise MissingFile(f"{folder}: holds folders only, such as {folders[0]}; name the one with the pictures")
+        kinds_held = _count_kinds(files) or "nothing"
         raise MissingFile(
             f"{folder}: holds {kinds_held}; convert pictures to PNG or TIFF (read are "
             f"{', '.join(sorted(IMAGE_SUFFIXES))}), or name the folder that holds them"

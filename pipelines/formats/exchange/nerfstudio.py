@@ -135,7 +135,8 @@ def _lens(content: _Transforms, frame: _Frame, image: Path, sizes: dict[Path, tu
     own = {name: value for name, value in msgspec.structs.asdict(frame).items() if value is not None}
     stated = msgspec.structs.asdict(content) | own
     model = stated["camera_model"]
-    if model not in _MODELS or stated["is_fisheye"] or stated["k4"]:
+    fisheye = frame.is_fisheye or content.is_fisheye
+    if model not in _MODELS or fisheye or stated["k4"]:
         kind = "k4" if stated["k4"] else model if model not in _MODELS else "is_fisheye"
         raise ValueError(f"its lens has no counterpart here ({kind}); undistort the images to a pinhole camera")
     width, height = stated["w"], stated["h"]

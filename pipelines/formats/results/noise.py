@@ -273,7 +273,9 @@ def read_fitted_noise(path: Path, size_px: tuple[int, int]) -> FittedNoise:
     shape = size_px[::-1]
     for row, column in record.hot_pixels:
         if not (0 <= row < shape[0] and 0 <= column < shape[1]):
-            raise BadValue(f"{path}: hot pixel [{row}, {column}] is not one of {shape}; measure this camera")
+            raise BadValue(
+                f"{path}: hot pixel [{row}, {column}] is not one of {shape}, as of another camera; measure this one"
+            )
     if record.mosaic and not sound_mosaic(record.mosaic, "RGB"):
         raise BadValue(f"{path}: mosaic = {list(record.mosaic)} is no colour filter; run `faintfield noise` again")
     unusable = np.zeros(shape, bool)

@@ -31,6 +31,12 @@ _QUANTILE_PX = 4_000_000
 type _Index = Annotated[int, Meta(ge=0, le=MAX_NODE)]
 
 
+class BoardEntry(BoardSettings, frozen=True, kw_only=True):
+    """One `[[board]]`, which states its dictionary: another one than that printed would be found nowhere."""
+
+    dictionary: str
+
+
 class ImageEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One `[[image]]`; images of the same node and sweep are repeated frames, which are averaged.
 
@@ -47,7 +53,7 @@ class BoardSetFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
     """`charuco.toml`; `pitch_mm`, the commanded distance of nodes, is needed for the scale of the stage only."""
 
     format: Literal[1]
-    board: list[BoardSettings]
+    board: list[BoardEntry]
     image: Annotated[list[ImageEntry], Meta(min_length=1)]
     pitch_mm: Annotated[float, Meta(gt=0)] | None = None
 

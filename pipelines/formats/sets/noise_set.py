@@ -98,7 +98,7 @@ def load_noise_set(folder: Path) -> FrameSeries:
     path = folder / PLAN if session else folder if is_file(folder) else folder / FILE_NAME
     settings, scene_c = _of_session(folder) if session else (_read_settings(path), [])
     warnings = [*_temperature_warnings(settings), *_scene_warnings(settings, scene_c)]
-    return FrameSeries(path.parent, settings, group_frames(path.parent, settings), warnings, path.name)
+    return FrameSeries(path.parent, settings, group_frames(path, settings), warnings, path.name)
 
 
 def _read_settings(path: Path) -> NoiseSet:
@@ -164,7 +164,7 @@ def write_noise_set(folder: Path, settings: NoiseSet) -> None:
     write_toml(folder / FILE_NAME, settings)
 
 
-def group_frames(folder: Path, settings: NoiseSet) -> dict[Conditions, list[Path]]:
+def group_frames(source: Path, settings: NoiseSet) -> dict[Conditions, list[Path]]:
     """Return the frames by what they have in common, darks first, each kind by exposure.
 
     Raises
@@ -174,14 +174,14 @@ def group_frames(folder: Path, settings: NoiseSet) -> dict[Conditions, list[Path
     """
     groups: dict[Conditions, list[tuple[Path, float | None]]] = {}
     for frame in settings.frame:
-        path = folder / frame.file
+        path = source.parent / frame.file
         exposure_s = frame.exposure_s
         if exposure_s is None and path.suffix.lower() in RAW_SUFFIXES:
             exposure_s = exif_exposure_s(path)
         if exposure_s is None:
             raise BadValue(
                 f"{path}: its exposure is neither stated nor in its EXIF, and is never guessed; add exposure_s to its "
-                f"entry in {folder / FILE_NAME}"
+                f"entry in {source}"
             )
         # EXIF states exposures as ratios; the same setting must not differ in its last digit.
         level, photons = (frame.level, frame.photons) if frame.kind == "flat" else (0, None)

@@ -104,7 +104,8 @@ def in_processes[Job, Result](
 
             def begin() -> None:
                 while left and len(running) < count:
-                    running[pool.submit(_result_of, work, jobs[left[0]])] = left[0]
+                    with _starting_processes():
+                        running[pool.submit(_result_of, work, jobs[left[0]])] = left[0]
                     left.popleft()
 
             begin()
@@ -112,7 +113,7 @@ def in_processes[Job, Result](
                 done, _ = wait(running, _POLL_S, FIRST_COMPLETED)
                 while compiles.value and announcements:
                     announcements.pop(0)()
-                for future in done:
+                for future in sorted(done, key=lambda future: future.exception() is not None):  # results first
                     result = future.result()
                     index = running.pop(future)
                     with suppress(BrokenProcessPool):  # which the others say, too
@@ -127,8 +128,8 @@ def in_processes[Job, Result](
         left.extendleft(sorted(running.values(), reverse=True))
         if max(deaths.values(), default=0) == _MOST_DEATHS:
             raise ClusterFailed(
-                f"{_MOST_DEATHS} processes died of the same plane, perhaps of short memory; give fewer --workers: what "
-                "is done is kept"
+                f"processes died {_MOST_DEATHS} times while the same plane was made, perhaps of short memory; give "
+                "fewer --workers: what is done is kept"
             )
 
 
@@ -136,8 +137,11 @@ def in_processes[Job, Result](
 def _processes(count: int) -> Iterator[tuple[ProcessPoolExecutor, Any]]:
     """Provide processes, copies of one that has loaded all modules, and a flag that they set when they compile."""
     context = multiprocessing.get_context("forkserver")
-    compiles, before = context.RawValue("b"), set(multiprocessing.active_children())
-    _start_server()
+    before = set(multiprocessing.active_children())
+    forkserver.set_forkserver_preload([__name__])
+    with _starting_processes():
+        compiles = context.RawValue("b")
+        forkserver.ensure_running()
     pool = ProcessPoolExecutor(count, context, _prepare, (compiles,))
     try:
         yield pool, compiles
@@ -147,14 +151,17 @@ def _processes(count: int) -> Iterator[tuple[ProcessPoolExecutor, Any]]:
         pool.shutdown(cancel_futures=True)
 
 
-def _start_server() -> None:
-    """Start the process that others are copied from. They ignore Ctrl-C, which is for the command: it ends them."""
-    forkserver.set_forkserver_preload([__name__])
+@contextmanager
+def _starting_processes() -> Iterator[None]:
+    """Give processes that are started within their environment, and name the failure if they cannot be.
+
+    They ignore Ctrl-C, which is for the command: it ends them.
+    """
     environment = {name: os.environ.get(name) for name in _ENVIRONMENT}
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN) if current_thread() is main_thread() else None
     os.environ.update(_ENVIRONMENT)
     try:
-        forkserver.ensure_running()
+        yield
     except (OSError, EOFError) as failure:
         raise ClusterFailed(
             f"processes cannot be started ({failure or 'the first one ended'}); set TMPDIR to a folder with a short "

@@ -153,6 +153,7 @@ IMAGE = 'image = [{ file = "no.tiff", node = [0, 0], sweep = 0 }]'
     [
         (f"{{ {BOARD} }}", "no.tiff is named but missing"),
         ("{ colums = 9 }", "did you mean 'columns'"),
+        (f"{{ {BOARD.rpartition(',')[0]} }}", "missing required field `dictionary`"),
         (f"{{ {BOARD} }}, {{ {BOARD.replace('"a"', '"b"')} }}", "share markers 0 to 30"),
     ],
 )

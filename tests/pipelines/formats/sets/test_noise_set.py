@@ -88,7 +88,7 @@ def grouped(warmth: list[float | None], doubling_k: float | None = None) -> list
     """Return the indices of the frames of each series of darks, its temperature and its factor."""
     frames = [NoiseFrame(f"{k}.tiff", "dark", 1.0, temperature_c=degrees) for k, degrees in enumerate(warmth)]
     flat = NoiseFrame("flat.tiff", "flat", 0.1, temperature_c=20.0)
-    groups = group_frames(Path(), NoiseSet(1, [*frames, flat], dark_current_doubling_k=doubling_k))
+    groups = group_frames(Path("noise.toml"), NoiseSet(1, [*frames, flat], dark_current_doubling_k=doubling_k))
     return [
         ([int(path.stem) for path in paths], series.temperature_c, series.dark_factor)
         for series, paths in groups.items()
