@@ -10,7 +10,7 @@ from faintfield.calib.noise.flats import Saturation
 from faintfield.calib.noise.likelihood.gaussian import NoiseFit, level_variances_dn2
 from faintfield.calib.noise.likelihood.moments import Moments
 from faintfield.calib.noise.likelihood.response import UNKNOWN_BEND_SE, charge_dn, charge_slope
-from faintfield.calib.noise.scatter import flat_variances_of_nodes, light_signal, noise_freedom
+from faintfield.calib.noise.scatter import flat_variances_of_nodes, light_signal
 from faintfield.calib.noise.series import Series
 from faintfield.calib.noise.series_fit import NoiseLikelihood, SeriesFit
 from faintfield.calib.noise.strips import Array
@@ -94,8 +94,7 @@ def series_goodness(fitted: SeriesFit) -> tuple[SeriesGoodness, ...]:
     residuals: list[float | None] = [float(x) for x in moments.darks.mean_dn - line]
     residuals += _light_residuals(fit, moments)
     noise = [*fitted.dark_noise_dn2, *fitted.flat_noise_dn2]
-    freedom = noise_freedom(moments)
-    within = np.concatenate([moments.darks.within_dn2, moments.flats.within_dn2])
+    freedom, within = moments.noise_freedom, moments.series.within_dn2
     goodness = []
     for j, item in enumerate((*fitted.darks, *fitted.flats)):
         if item.frames < 2:
@@ -117,7 +116,7 @@ def series_goodness(fitted: SeriesFit) -> tuple[SeriesGoodness, ...]:
 
 def _light_residuals(fit: NoiseFit, moments: Moments) -> list[float | None]:
     """Return the level of each flat minus that of the response; None where the light is not known."""
-    light, signal = moments.flats.light, light_signal(fit, moments)
+    light, signal = moments.light, light_signal(fit, moments)
     residuals: list[float | None] = [None] * signal.size
     slope = charge_slope(fit.values, signal)
     for group in light.groups:
@@ -163,23 +162,25 @@ def scatter_warnings(fitted: SeriesFit) -> list[str]:
 
     Each series of flats whose level does not match its light is named with the light that does.
     """
-    excess, values, flats, warnings = fitted.moments.excess, fitted.fit.values, fitted.moments.flats, list[str]()
+    excess, values, light, warnings = fitted.moments.excess, fitted.fit.values, fitted.moments.light, list[str]()
     signal = light_signal(fitted.fit, fitted.moments)
-    for index, group in flats.light.odd:
-        members = (flats.light.group == group) & (signal > 0)
+    for index, group in light.odd:
+        members = (light.group == group) & (signal > 0)
         if not members.any():
             continue
-        factor = float(np.median(charge_dn(values, signal[members]) / flats.light.amount[members]))
+        factor = float(np.median(charge_dn(values, signal[members]) / light.amount[members]))
         conditions = fitted.flats[index].conditions
-        by_photons = conditions.photons == flats.light.amount[index]
+        by_photons = conditions.photons == light.amount[index]
         kind, key = ("photons", "photons") if by_photons else ("s", "exposure_s")
         warnings.append(
-            f"the {conditions}: {flats.light.amount[index]:.5g} {kind} are stated, their level is that of "
+            f"the {conditions}: {light.amount[index]:.5g} {kind} are stated, their level is that of "
             f"{float(charge_dn(values, signal[index])) / factor:.5g} {kind} by the other levels; they are left out of "
             f"the response: correct {key} of {fitted.flats[index].names[0]} and its like, or record the level again"
         )
     read_dn = float(np.exp(0.5 * values["log_read_dn2"]))
-    noise, drift, light = (float(np.sqrt(variance)) for variance in (excess.variance2, excess.drift_dn2, excess.light2))
+    noise, drift, flicker = (
+        float(np.sqrt(variance)) for variance in (excess.variance2, excess.drift_dn2, excess.light2)
+    )
     if noise > _NOTABLE_FRACTION:
         warnings.append(
             f"the noise of the series scatters by {noise:.1%} in variance about the model beyond chance; the intervals "
@@ -190,12 +191,12 @@ def scatter_warnings(fitted: SeriesFit) -> list[str]:
             f"the dark level drifts by {drift:.2g} DN from series to series; the intervals have grown by it: let the "
             "camera settle and record the exposures in turn"
         )
-    if light > _NOTABLE_FRACTION:
+    if flicker > _NOTABLE_FRACTION:
         warnings.append(
-            f"the levels of the flats scatter by {light:.1%} about the response; the intervals have grown by it: let "
+            f"the levels of the flats scatter by {flicker:.1%} about the response; the intervals have grown by it: let "
             "the lamp settle, or measure its light with each flat"
         )
-    if fitted.flats and flats.bend_se == UNKNOWN_BEND_SE:
+    if fitted.flats and fitted.moments.bend_se == UNKNOWN_BEND_SE:
         warnings.append(
             f"the light of the flats is not known well enough to tell a bend of the response from the gain; the "
             f"intervals allow for {2 * UNKNOWN_BEND_SE:.1%} at the end of the range: state the photons of at least 3 "
@@ -232,7 +233,7 @@ def noise_warning(fitted: SeriesFit, points: Sequence[TransferPoint]) -> str | N
     """Return a warning if a series is noisier or quieter than eq. (1) allows."""
     if fitted.likelihood is NoiseLikelihood.CENSORED:
         return None
-    rounding2 = np.concatenate([fitted.moments.darks.rounding2, fitted.moments.flats.rounding2])
+    rounding2 = fitted.moments.series.rounding2
     several = [(point, error2) for point, error2 in zip(points, rounding2, strict=True) if point.frames > 1]
     excess = [point.variance_dn2 / point.model_variance_dn2 - 1 for point, _ in several]
     # What rounding may make of the noise is no contradiction.

@@ -53,13 +53,6 @@ _MAX_ROUNDS, _SETTLED = 5, 0.02
 type Known = tuple[int, float]
 
 
-def noise_freedom(moments: Moments) -> Array:
-    """Return the degrees of freedom of the noise of each series, darks first."""
-    darks, flats = moments.darks, moments.flats
-    of_flats = (flats.frames - 1) * moments.freedom * flats.evenness
-    return np.concatenate([(darks.frames - 1) * moments.freedom, of_flats])
-
-
 def _dispersion(noise: Sequence[SeriesNoise], variances_dn2: Iterable[Array | float]) -> float:
     """Return how much wider than χ² the noise of blocks scatters, at least 1.
 
@@ -93,7 +86,7 @@ def measure_excess(fit: NoiseFit, moments: Moments, darks: Sequence[Series]) -> 
     )
     variance2, noise_known = _noise_scatter(fit, moments, excess)
     drift_dn2, drift_known = _drift(fit, moments, trend_dn2(darks))
-    light = moments.flats.light
+    light = moments.light
     bends = sum(name.startswith("nonlinearity") for name in fit.values)
     light2, light_known = 0.0, (0, 1.0)
     if light.groups.size:
@@ -133,12 +126,11 @@ def _noise_scatter(fit: NoiseFit, moments: Moments, excess: Excess) -> tuple[flo
         np.stack([np.ones_like(dark), dark], axis=1),
         np.stack([1 / slope**2, charge_dn(values, signal) / slope**2], axis=1),
     ])  # fmt: skip
-    frames = np.concatenate([darks.frames, flats.frames])
-    measured = np.concatenate([darks.within_dn2, flats.within_dn2]) / np.maximum(frames - 1, 1) / moments.freedom
-    freedom = noise_freedom(moments)
+    series, freedom = moments.series, moments.noise_freedom
+    measured = series.within_dn2 / np.maximum(series.frames - 1, 1) / moments.freedom
     wider = np.concatenate([np.full(darks.frames.size, excess.darks), np.full(flats.frames.size, excess.flats)])
     use = freedom > 0
-    chance = 2 * wider[use] / freedom[use] + np.concatenate([darks.rounding2, flats.rounding2])[use]
+    chance = 2 * wider[use] / freedom[use] + series.rounding2[use]
     target, columns = (measured - ROUNDING_DN2)[use] / noise[use], design[use] / noise[use][:, None]
     left = target.size - int(np.linalg.matrix_rank(columns / np.maximum(np.abs(columns).max(0), 1e-300)))
     variance2, _ = scatter_of_line(columns, target, chance, np.ones_like(chance), left)
@@ -212,14 +204,14 @@ def _first_light2(moments: Moments, bends: int) -> float:
     A fit without it would take unsteady light for jitter.
     """
     darks, flats = moments.darks, moments.flats
-    if not bends or not flats.light.groups.size:
+    if not bends or not moments.light.groups.size:
         return 0.0
     freedom = float(np.maximum(darks.frames - 1, 0).sum())
     noise = flats.within_dn2 / np.maximum(flats.frames - 1, 1) / moments.freedom
     dark_noise = float(darks.within_dn2.sum()) / max(freedom * moments.freedom, 1.0)
     jitter = max(float(darks.level_scatter_dn2.sum()) / max(freedom, 1.0) - dark_noise / moments.pixels, 0.0)
     variance = (jitter + noise / moments.pixels) / flats.frames
-    return scatter_of_levels(flats.light, flats.mean_dn - float(darks.mean_dn.min()), variance, bends)[0]
+    return scatter_of_levels(moments.light, flats.mean_dn - float(darks.mean_dn.min()), variance, bends)[0]
 
 
 def without_odd(light: Light, signal_dn: Array, variance_dn2: Array, bends: int) -> Light:

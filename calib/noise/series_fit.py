@@ -138,26 +138,24 @@ def _fit_gaussian(
     signal = moments.flats.mean_dn - offset_dn
     # The end of the range, near the brightest flat at most.
     range_dn = min(saturation_dn - offset_dn, max(_RANGE_OVER_BRIGHTEST * float(signal.max()), _MIN_RANGE_DN))
-    light = moments.flats.light
+    light = moments.light
     chance = moments.flats.within_dn2 / np.maximum(moments.flats.frames - 1, 1) / moments.freedom
     level_dn2 = (chance / moments.pixels + moments.darks.level_scatter_dn2.mean()) / moments.flats.frames
     light = without_odd(light, signal, level_dn2, choose_bends(light, signal, level_dn2))
-    moments = replace(moments, flats=replace(moments.flats, light=light))
+    moments = replace(moments, light=light)
     bends = choose_bends(light, signal, level_dn2)
-    measured = replace(moments, flats=replace(moments.flats, range_dn=range_dn, bend_se=MEASURED_BEND_SE))
+    measured = replace(moments, range_dn=range_dn, bend_se=MEASURED_BEND_SE)
     if bends:
         fit, grown = fit_with_excess(measured, darks, bends)
         if grown.excess.light2 < MAX_LIGHT_ERROR**2:
             return fit, fit, grown
-    dark = replace(light, group=np.full(light.group.shape, -1), odd=())
-    unknown = replace(measured.flats, light=dark)
+    unknown = replace(measured, light=replace(light, group=np.full(light.group.shape, -1), odd=()))
     free = None
     if np.unique(np.round(moments.flats.mean_dn, -1)).size >= 3:
-        free, grown = fit_with_excess(replace(measured, flats=unknown), darks, 1)
+        free, grown = fit_with_excess(unknown, darks, 1)
         if abs(free.values["nonlinearity_per_dn"]) > 3 * free.standard_error("nonlinearity_per_dn"):
             return free, free, grown
-    usual = replace(moments, flats=replace(unknown, bend_se=UNKNOWN_BEND_SE))
-    fit, grown = fit_with_excess(usual, darks, 1)
+    fit, grown = fit_with_excess(replace(unknown, bend_se=UNKNOWN_BEND_SE), darks, 1)
     return fit, free, grown
 
 

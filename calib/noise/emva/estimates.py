@@ -89,7 +89,7 @@ def estimate_all(
     spreads = nonuniformity(map_of(dark.mean_of, used.shape, np.float64), used, temporal_noise(dark, used))
     estimates |= {"dsnu_row_dn": spreads.row, "dsnu_column_dn": spreads.column} | _shared_noise(fitted)
     estimates |= _from_flats(fitted, gain, response)
-    excess, knows_light = moments.excess, fitted.bend is not None and bool(moments.flats.light.groups.size)
+    excess, knows_light = moments.excess, fitted.bend is not None and bool(moments.light.groups.size)
     estimates |= {
         "linearity_error": _linearity(fitted.bend, moments, saturation)
         if fitted.bend is not None and knows_light
@@ -256,7 +256,7 @@ def _from_flats(fitted: SeriesFit, gain: Estimate, response: Response | None) ->
         nonlinearity = _parameter(fitted.bend, "nonlinearity_per_dn", NORMAL_QUANTILE)
     efficiency = Estimate(None, why=gain.why if fitted.flats and gain.value is None else _NO_PHOTONS)
     photons = [flat.conditions.photons for flat in fitted.flats]
-    odd = {index for index, _ in fitted.moments.flats.light.odd}
+    odd = {index for index, _ in fitted.moments.light.odd}
     usable = [index for index, number in enumerate(photons) if number and index not in odd]
     if gain.value is not None and usable:
         values, means = fitted.fit.values, fitted.moments.flats.mean_dn
@@ -294,7 +294,7 @@ def _linearity(fit: NoiseFit, moments: Moments, saturation: Saturation) -> Estim
     signal = moments.flats.mean_dn - offset - dark
     full = float(signal.max()) if saturation.level_dn is None else saturation.level_dn - offset
     variance = np.array(level_variances_dn2(fit.values, moments), float)
-    levels = FittedLevels(moments.flats.light, signal, variance, full)
+    levels = FittedLevels(moments.light, signal, variance, full)
     value = levels.linearity(fit.values)
     if value is None and levels.linearity({}) is not None:
         return Estimate(None, why=_POOR_RESPONSE)

@@ -150,14 +150,14 @@ def _flat_part(x: Array, moments: Moments, bend: Bend) -> tuple[float, Array, Ar
     Its normal law times a likelihood that is normal near its coefficients leaves ½ gᵀ M g, with the gradient g by the
     coefficients, and M the inverse of both their informations (Laplace).
     """
-    size, flats = len(PARAMETERS), moments.flats
-    if not flats.frames.size:
+    size = len(PARAMETERS)
+    if not moments.flats.frames.size:
         return 0.0, np.zeros(size), np.zeros((size, size))
     s, b = ca.SX.sym("s", size), ca.SX.sym("b", len(bend.values))
     values = {"log_gain": s[0], "log_read_dn2": 2 * (s[0] + s[1]), "offset_dn": s[4]}
     units = np.sqrt(np.diag(bend.covariance))
     values |= {name: bend.values[name] + b[k] * units[k] for k, name in enumerate(bend.values)}
-    log_likelihood, log_variances, half_freedom = flat_log_likelihood(values, flats, moments.freedom, moments.excess)
+    log_likelihood, log_variances, half_freedom = flat_log_likelihood(values, moments)
     logs = ca.vertcat(*log_variances)
     by_bend, weight = ca.jacobian(logs, b), ca.diag(ca.DM(half_freedom))
     if bend.values:

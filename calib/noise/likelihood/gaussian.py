@@ -11,7 +11,7 @@ every pixel and series, and bias the noise by (n − 1)/n. The likelihood depend
 only; `calib.noise.likelihood.moments` gives the distribution of each.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import astuple, dataclass, field, fields, replace
 from typing import Any
 
@@ -21,7 +21,7 @@ from scipy import stats
 
 from faintfield.calib.errors import PoorFit
 from faintfield.calib.estimate import NORMAL_QUANTILE
-from faintfield.calib.noise.likelihood.moments import NO_EXCESS, Excess, FlatMoments, Moments
+from faintfield.calib.noise.likelihood.moments import Excess, Moments, SeriesMoments
 from faintfield.calib.noise.likelihood.response import (
     BENDS,
     bend_log_prior,
@@ -81,19 +81,24 @@ def flat_variances_dn2(values: Mapping[str, Any], mean_dn: Array) -> list[Any]:
     return [(gain * charge_dn(values, s) + read) / charge_slope(values, s) ** 2 + ROUNDING_DN2 for s in signals]
 
 
-def flat_log_likelihood(
-    values: Mapping[str, Any], flats: FlatMoments, freedom: float, excess: Excess = NO_EXCESS
-) -> tuple[Any, list[Any], list[float]]:
+def flat_log_likelihood(values: Mapping[str, Any], moments: Moments) -> tuple[Any, list[Any], list[float]]:
     """Return ln L of the flats' noise up to a constant, and ln v and half the degrees of freedom of each series."""
-    total, log_variances, half_freedom = 0.0, [], []
-    for index, v in enumerate(flat_variances_dn2(values, flats.mean_dn)):
-        weight = flats.evenness[index]
-        degrees = (flats.frames[index] - 1) * freedom * weight
-        grown = excess.dispersion(degrees, flats.rounding2[index], flat=True)
-        total -= _chi_squared(degrees / grown, flats.within_dn2[index] * weight / grown, v)
-        log_variances.append(ca.log(v))
-        half_freedom.append(0.5 * degrees / grown)
-    return total, log_variances, half_freedom
+    total, variances = 0.0, flat_variances_dn2(values, moments.flats.mean_dn)
+    costs = list(_noise_costs(variances, moments.flats, moments, moments.excess.flats))
+    for cost, _ in costs:
+        total -= cost
+    return total, [ca.log(v) for v in variances], [half for _, half in costs]
+
+
+def _noise_costs(
+    variances_dn2: Iterable[Any], series: SeriesMoments, moments: Moments, dispersion: float
+) -> Iterator[tuple[Any, float]]:
+    """Yield −ln L of the noise of each series up to a constant, and half its degrees of freedom."""
+    columns = (series.frames, series.within_dn2, series.evenness, series.rounding2)
+    for v, n, within, evenness, rounding2 in zip(variances_dn2, *columns, strict=True):
+        degrees = (n - 1) * moments.freedom * evenness
+        grown = dispersion + 0.5 * degrees * (moments.excess.variance2 + rounding2)
+        yield _chi_squared(degrees / grown, within * evenness / grown, v), 0.5 * degrees / grown
 
 
 def level_variances_dn2(values: Mapping[str, Any], moments: Moments) -> list[Any]:
@@ -118,25 +123,23 @@ def negative_log_likelihood(values: Mapping[str, Any], moments: Moments) -> Any:
     darks = moments.darks
     dark_v = dark_variances_dn2(values, darks.exposure_s)
     total = _wishart_cost(values, dark_v, moments) + _dark_level_cost(values, dark_v, moments)
-    for j, v in enumerate(dark_v):
-        freedom = (darks.frames[j] - 1) * moments.freedom
-        grown = moments.excess.dispersion(freedom, darks.rounding2[j], flat=False)
-        total += _chi_squared(freedom / grown, darks.within_dn2[j] / grown, v)
+    for cost, _ in _noise_costs(dark_v, darks, moments, moments.excess.darks):
+        total += cost
     return total - _flat_log_likelihood(values, moments)
 
 
 def _flat_log_likelihood(values: Mapping[str, Any], moments: Moments) -> Any:
     """Return ln L of the flats: of their noise, and of their levels where these tell the bend of the response."""
     flats = moments.flats
-    total = flat_log_likelihood(values, flats, moments.freedom, moments.excess)[0]
+    total = flat_log_likelihood(values, moments)[0]
     if not any(name in values for name in BENDS):
         return total
-    if np.isfinite(flats.bend_se):
-        total = total + bend_log_prior(values, flats.range_dn, flats.bend_se)
-    if not flats.light.groups.size:
+    if np.isfinite(moments.bend_se):
+        total = total + bend_log_prior(values, moments.range_dn, moments.bend_se)
+    if not moments.light.groups.size:
         return total
     variances = level_variances_dn2(values, moments)
-    return total + level_log_likelihood(values, flats.light, flats.mean_dn, flats.exposure_s, variances)
+    return total + level_log_likelihood(values, moments.light, flats.mean_dn, flats.exposure_s, variances)
 
 
 def _dark_level_cost(values: Mapping[str, Any], dark_v: list[Any], moments: Moments) -> Any:
@@ -169,7 +172,7 @@ def _wishart_cost(values: Mapping[str, Any], dark_v: list[Any], moments: Moments
     of one frame are left out, since they cannot separate noise from pattern.
     """
     several = moments.darks.frames > 1
-    scatter = moments.darks.scatter_dn2[np.ix_(several, several)]
+    scatter = moments.scatter_dn2[np.ix_(several, several)]
     weight = [n / v for n, v in zip(moments.darks.frames, dark_v, strict=True) if n > 1]
     t = moments.darks.exposure_s[several]
     s2, q2 = values["dsnu_dn2"], values.get("dcnu_dn2_per_s2", 0.0)

@@ -12,7 +12,7 @@ Sums over blocks, rows and columns of pixels, from one pass, show how far the no
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 
@@ -67,24 +67,25 @@ class SeriesNoise:
 
 
 @dataclass(frozen=True)
-class DarkMoments:
-    """Statistics of the J dark series over the P pixels in use.
+class SeriesMoments:
+    """Statistics of several series over the P pixels in use, arrays (series,).
 
     Attributes
     ----------
-    exposure_s, frames : array (series,)
+    exposure_s, frames : array
         Exposure time t_j at the temperature of reference, and number of frames n_j.
-    mean_dn : array (series,)
+    mean_dn : array
         Mean over frames and pixels.
-    within_dn2 : array (series,)
+    within_dn2 : array
         W_j, the squared deviations of pixels from their means, summed over frames and pixels, as if rounding had
         added 1/12 DN² to each value's variance.
-    level_scatter_dn2 : array (series,)
+    level_scatter_dn2 : array
         Squared deviations of the frames' mean levels from the series' level, summed over frames.
-    scatter_dn2 : array (series, series)
-        S, the products of the pixels' patterns in two series, summed over pixels.
-    rounding2 : array (series,)
+    rounding2 : array
         Square of the relative error of the noise that rounding may make; see `calib.noise.likelihood.rounding`.
+    evenness : array
+        ⟨s⟩²/⟨s²⟩ of the signal s of a flat over the pixels: the factor on the degrees of freedom where brighter pixels
+        are noisier than others. 1 for darks.
     """
 
     exposure_s: Array
@@ -92,35 +93,12 @@ class DarkMoments:
     mean_dn: Array
     within_dn2: Array
     level_scatter_dn2: Array
-    scatter_dn2: Array
     rounding2: Array
-
-
-@dataclass(frozen=True)
-class FlatMoments:
-    """Statistics of the flat series, possibly none; those not named here are as for the darks.
-
-    Attributes
-    ----------
-    evenness : array (series,)
-        ⟨s⟩²/⟨s²⟩ of the signal s over the pixels: the factor on the degrees of freedom where brighter pixels are
-        noisier than others.
-    light : Light
-        Light of the flats, as far as it is known.
-    range_dn, bend_se : float
-        Signal at the end of the range, and the standard error of the bend there before it is measured.
-    """
-
-    frames: Array
-    mean_dn: Array
-    within_dn2: Array
     evenness: Array
-    rounding2: Array
-    exposure_s: Array = field(default_factory=lambda: np.zeros(0))
-    light: Light = field(default_factory=lambda: known_light([]))
-    level_scatter_dn2: Array = field(default_factory=lambda: np.zeros(0))
-    range_dn: float = np.inf
-    bend_se: float = np.inf
+
+    def part(self, which: slice) -> "SeriesMoments":
+        """Return the statistics of some of the series."""
+        return SeriesMoments(*(getattr(self, item.name)[which] for item in fields(self)))
 
 
 @dataclass(frozen=True)
@@ -143,73 +121,78 @@ class Excess:
     drift_dn2: float = 0.0
     light2: float = 0.0
 
-    def dispersion(self, freedom: float, rounding2: float, *, flat: bool) -> float:
-        """Return the variance of a sum of squares over that of χ² with `freedom` degrees of freedom."""
-        return (self.flats if flat else self.darks) + 0.5 * freedom * (self.variance2 + rounding2)
-
 
 NO_EXCESS = Excess()
 
 
 @dataclass(frozen=True)
 class Moments:
-    """Sufficient statistics of all series, from `pixels` pixels in use with `freedom` degrees of freedom.
+    """Sufficient statistics of all series, darks first, from `pixels` pixels in use with `freedom` degrees of freedom.
 
-    `noise` are the sums of the noise of each series over groups of pixels, darks first.
+    Attributes
+    ----------
+    scatter_dn2 : array (dark, dark)
+        S, the products of the pixels' patterns in two series of darks, summed over pixels.
+    light : Light
+        Light of the flats, as far as it is known.
+    range_dn, bend_se : float
+        Signal at the end of the range, and the standard error of the bend there before it is measured.
+    noise : tuple of SeriesNoise
+        Sums of the noise of each series over groups of pixels.
     """
 
     pixels: float
     freedom: float
-    darks: DarkMoments
-    flats: FlatMoments
+    series: SeriesMoments
+    scatter_dn2: Array
+    light: Light = field(default_factory=lambda: known_light([]))
+    range_dn: float = np.inf
+    bend_se: float = np.inf
     excess: Excess = NO_EXCESS
     noise: tuple[SeriesNoise, ...] = ()
+
+    @property
+    def darks(self) -> SeriesMoments:
+        """Statistics of the darks."""
+        return self.series.part(slice(len(self.scatter_dn2)))
+
+    @property
+    def flats(self) -> SeriesMoments:
+        """Statistics of the flats, possibly none."""
+        return self.series.part(slice(len(self.scatter_dn2), None))
+
+    @property
+    def noise_freedom(self) -> Array:
+        """Degrees of freedom of the noise of each series."""
+        return (self.series.frames - 1) * self.freedom * self.series.evenness
 
 
 def gather_moments(darks: Sequence[Series], flats: Sequence[Series], used: Mask) -> Moments:
     """Sum the statistics of the series, at least one of darks, over pixels that are neither defective nor suspect."""
     pixels = float(used.sum())
     freedom = max(pixels - sum(used.shape) + 1.0, 1.0)
-    both, first_flat = (*darks, *flats), len(darks)
+    both = (*darks, *flats)
     mean_dn = np.array([mean_over(item.mean_of, used) for item in both])
     frames = np.array([item.frames for item in both], np.float64)
-    exposure_s = np.array([item.conditions.dark_time_s for item in both])
-    level_scatter_dn2 = np.array([item.levels_dn.var() * item.frames for item in both])
-    floor_dn = min(mean_dn[:first_flat])
-    noise = tuple(group_noise(item, used, floor_dn, (BLOCKS, BLOCKS)) for item in both)
-    within_dn2 = np.array([float(item.rows[:, 1].sum()) for item in noise])
-    roundings = dark_roundings(darks, used)
+    noise = tuple(group_noise(item, used, min(mean_dn[: len(darks)]), (BLOCKS, BLOCKS)) for item in both)
+    roundings = [*dark_roundings(darks, used), *(flat_rounding(flat, used) for flat in flats)]
     excess_dn2 = np.array([rounding.excess_dn2 for rounding in roundings])
 
     def work(strip: slice) -> Array:
-        at = used[strip]
-        patterns = np.array([dark.pattern_dn[strip][at] for dark in darks], np.float64)
+        patterns = np.array([dark.pattern_dn[strip][used[strip]] for dark in darks], np.float64)
         return patterns @ patterns.T
 
-    return Moments(
-        pixels=pixels,
-        freedom=freedom,
-        darks=DarkMoments(
-            exposure_s=exposure_s[:first_flat],
-            frames=frames[:first_flat],
-            mean_dn=mean_dn[:first_flat],
-            within_dn2=within_dn2[:first_flat] - excess_dn2 * (frames[:first_flat] - 1) * freedom,
-            level_scatter_dn2=level_scatter_dn2[:first_flat],
-            scatter_dn2=total_of(work, used.shape),
-            rounding2=np.array([rounding.error**2 for rounding in roundings]),
-        ),
-        flats=FlatMoments(
-            frames=frames[first_flat:],
-            mean_dn=mean_dn[first_flat:],
-            within_dn2=within_dn2[first_flat:],
-            evenness=np.array([_evenness(flat, darks[0], used) for flat in flats]),
-            exposure_s=exposure_s[first_flat:],
-            light=known_light(flats),
-            level_scatter_dn2=level_scatter_dn2[first_flat:],
-            rounding2=np.array([flat_rounding(flat, used).error ** 2 for flat in flats]),
-        ),
-        noise=noise,
+    series = SeriesMoments(
+        exposure_s=np.array([item.conditions.dark_time_s for item in both]),
+        frames=frames,
+        mean_dn=mean_dn,
+        within_dn2=np.array([item.rows[:, 1].sum() for item in noise]) - excess_dn2 * (frames - 1) * freedom,
+        level_scatter_dn2=np.array([item.levels_dn.var() * item.frames for item in both]),
+        rounding2=np.array([rounding.error**2 for rounding in roundings]),
+        evenness=np.array([1.0] * len(darks) + [_evenness(flat, darks[0], used) for flat in flats]),
     )
+    scatter_dn2 = total_of(work, used.shape)
+    return Moments(pixels, freedom, series, scatter_dn2, light=known_light(flats), noise=noise)
 
 
 def _evenness(flat: Series, dark: Series, used: Mask) -> float:

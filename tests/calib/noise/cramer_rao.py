@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.noise.likelihood.gaussian import main_quantities, negative_log_likelihood
-from faintfield.calib.noise.likelihood.moments import DarkMoments, FlatMoments, Moments
+from faintfield.calib.noise.likelihood.moments import Moments, SeriesMoments
 from faintfield.calib.noise.likelihood.rounding import ROUNDING_DN2
 
 
@@ -86,19 +86,16 @@ def _expected_moments(
     scatter = scatter + (gain * sensor.dcnu_e_per_s) ** 2 * np.outer(exposures_s, exposures_s)
     level_dn2 = sensor.jitter_dn**2 + noise_dn2 / pixels
     signals = np.asarray(flat_signals_dn, float)
-    flat_n = np.full(signals.shape, float(flat_frames))
+    flat_n, none = np.full(signals.shape, float(flat_frames)), np.zeros(signals.shape)
     line = sensor.offset_dn + gain * sensor.dark_current_e_per_s * exposures_s
-    return Moments(
-        pixels=float(pixels),
-        freedom=float(pixels),
-        darks=DarkMoments(
-            exposures_s, n, line, (n - 1) * pixels * noise_dn2, (n - 1) * level_dn2, pixels * scatter, np.zeros_like(n)
-        ),
-        flats=FlatMoments(
-            flat_n,
-            sensor.offset_dn + signals,
-            (flat_n - 1) * pixels * (read_dn2 + gain * signals),
-            np.ones_like(signals),
-            np.zeros_like(signals),
-        ),
+    flat_within = (flat_n - 1) * pixels * (read_dn2 + gain * signals)
+    series = SeriesMoments(
+        exposure_s=np.append(exposures_s, none),
+        frames=np.append(n, flat_n),
+        mean_dn=np.append(line, sensor.offset_dn + signals),
+        within_dn2=np.append((n - 1) * pixels * noise_dn2, flat_within),
+        level_scatter_dn2=np.append((n - 1) * level_dn2, none),
+        rounding2=np.zeros(n.size + flat_n.size),
+        evenness=np.ones(n.size + flat_n.size),
     )
+    return Moments(float(pixels), float(pixels), series, pixels * scatter)

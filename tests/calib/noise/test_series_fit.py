@@ -9,7 +9,7 @@ from faintfield.calib.noise import Conditions, calibrate, measure_series
 from faintfield.calib.noise.emva.estimates import _in_electrons, _levels_quantile, _why_no_current, _why_no_gain
 from faintfield.calib.noise.likelihood.gaussian import NoiseFit
 from faintfield.calib.noise.likelihood.marginal import Counts
-from faintfield.calib.noise.likelihood.moments import DarkMoments, FlatMoments, Moments
+from faintfield.calib.noise.likelihood.moments import Moments, SeriesMoments
 from faintfield.calib.noise.series_fit import NoiseLikelihood, _shared_noise_dn2, choose_likelihood
 from tests.calib.noise.darkroom import dark_series, darks, flat_series, specimen
 
@@ -26,10 +26,8 @@ def fit(errors: dict[str, float] | None = None, **changes: float) -> NoiseFit:
 def moments(*frames: float, exposure_s: tuple[float, ...] = (0.1, 10.0, 60.0)) -> Moments:
     several = np.array(frames or (10.0, 10.0, 10.0), float)
     zeros = np.zeros(len(several))
-    darks = DarkMoments(
-        np.array(exposure_s), several, zeros, zeros, zeros, np.zeros((len(several), len(several))), zeros
-    )
-    return Moments(3600.0, 3500.0, darks, FlatMoments(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0)))
+    darks = SeriesMoments(np.array(exposure_s), several, zeros, zeros, zeros, zeros, np.ones(len(several)))
+    return Moments(3600.0, 3500.0, darks, np.zeros((len(several), len(several))))
 
 
 def test_positive_quantities_have_logarithmic_intervals() -> None:

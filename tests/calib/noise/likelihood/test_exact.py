@@ -18,7 +18,7 @@ from faintfield.calib.noise.likelihood.marginal import (
     MarginalLikelihood,
     mass_function,
 )
-from faintfield.calib.noise.likelihood.moments import DarkMoments, FlatMoments, Moments
+from faintfield.calib.noise.likelihood.moments import Moments, SeriesMoments
 from faintfield.calib.noise.series_fit import NoiseLikelihood
 from tests.calib.noise.darkroom import EXPOSURES_S, TRUTH, dark_series, expose, specimen
 from tests.calib.noise.likelihood.slopes import slopes
@@ -129,15 +129,15 @@ def test_covariance_passes_on_by_slopes_of_parameters() -> None:
 def test_likelihood_of_flats_has_slopes_and_information() -> None:
     at, straight = np.array([np.log(2.0), np.log(1.4), np.log(0.2), 0.0, 100.0, np.log(3.0)]), Bend({}, np.eye(0))
     frames, mean_dn, within_dn2 = np.array([4.0, 3.0]), np.array([2100.0, 9100.0]), np.array([9e6, 3e7])
-    evenness, no_darks = np.array([0.95, 0.9]), DarkMoments(*[np.zeros(0)] * 7)
-    flats = FlatMoments(frames, mean_dn, within_dn2, evenness, np.zeros(2))
+    evenness, zeros = np.array([0.95, 0.9]), np.zeros(2)
+    flats = SeriesMoments(zeros, frames, mean_dn, within_dn2, zeros, zeros, evenness)
     degrees = (frames - 1) * 1000.0 * evenness
 
     def by_hand(x: NDArray[np.float64]) -> NDArray[np.float64]:
         v = np.exp(x[0]) * (mean_dn - x[4]) + np.exp(2 * (x[0] + x[1])) + 1 / 12
         return np.array([-0.5 * np.sum(degrees * np.log(v) + within_dn2 * evenness / v), *np.log(v)])
 
-    value, gradient, information = _flat_part(at, Moments(1100.0, 1000.0, no_darks, flats), straight)
+    value, gradient, information = _flat_part(at, Moments(1100.0, 1000.0, flats, np.zeros((0, 0))), straight)
     derivative = slopes(by_hand, at)
     assert value == pytest.approx(by_hand(at)[0], rel=1e-12)
     np.testing.assert_allclose(gradient, derivative[0], rtol=1e-5, atol=1e-4)
