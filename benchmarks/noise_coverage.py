@@ -115,7 +115,7 @@ def record(camera: Camera, session: Session, rng: np.random.Generator) -> list[S
 
 def true_linearity(camera: Camera, result: NoiseCalibration) -> float:
     """Return EMVA 1288's linearity error of the true response at the levels that were used."""
-    used = [entry.series for entry in result.goodness if entry.series.conditions.kind == "flat"]
+    used = result.saturation.kept
     charge = np.array([0.5 * (flat.conditions.photons or 0.0) for flat in used])
     signal = camera.mean_dn(charge)
     full = signal.max() if result.saturation.level_dn is None else result.saturation.level_dn - camera.offset_dn

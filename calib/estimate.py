@@ -1,4 +1,6 @@
-"""A measured value with its standard error and interval, or the reason why there is none."""
+"""A measured value with its standard error and interval, and the goodness of fit of a series, as records have them."""
+
+from typing import Literal
 
 import numpy as np
 from msgspec import Struct
@@ -32,6 +34,34 @@ class Estimate(Struct, frozen=True, omit_defaults=True):
     se: float | None = None
     ci95: tuple[float, float] | None = None
     why: str | None = None
+
+
+class SeriesGoodness(Struct, frozen=True, omit_defaults=True):
+    """Goodness of fit of one series, or the reason why it was left out.
+
+    Attributes
+    ----------
+    noise_excess, noise_se : float, optional
+        Variance over that of the model, minus 1, with its standard error under Gaussian noise; None for one frame.
+    level_residual_dn : float, optional
+        Level minus that of the model; None where the light of a flat is not known.
+    blocks, rows, columns, by_frame : float, optional
+        Deviance of the noise over blocks of pixels, rows, columns and frames, per degree of freedom: 1 where the noise
+        is Gaussian.
+    """
+
+    kind: Literal["dark", "flat"]
+    exposure_s: float
+    level: int
+    frames: int
+    left_out: str | None = None
+    noise_excess: float | None = None
+    noise_se: float | None = None
+    level_residual_dn: float | None = None
+    blocks: float | None = None
+    rows: float | None = None
+    columns: float | None = None
+    by_frame: float | None = None
 
 
 def interval(value: float, se: float, quantile: float = NORMAL_QUANTILE, *, positive: bool = False) -> Estimate:

@@ -9,16 +9,16 @@ from scipy import stats
 from scipy.signal import fftconvolve
 
 from faintfield.calib.errors import CopiedFrame, NotIdentifiable, TooFewFrames
-from faintfield.calib.estimate import Estimate
+from faintfield.calib.estimate import Estimate, SeriesGoodness
 from faintfield.calib.noise.emva.estimates import estimate_all
 from faintfield.calib.noise.flats import Saturation, check_flat_levels, find_saturation
 from faintfield.calib.noise.likelihood.marginal import Counts, mass_function
 from faintfield.calib.noise.maps.defects import hot_pixels, outlying_pixels, variance_ratio
 from faintfield.calib.noise.maps.measure import NoiseMaps, measure_pixels, noise_maps
 from faintfield.calib.noise.misfit import (
-    SeriesGoodness,
     TransferPoint,
     frame_warnings,
+    goodness_of,
     level_warning,
     noise_warning,
     scatter_warnings,
@@ -81,7 +81,7 @@ class NoiseCalibration:
     variance_ratio : array (row, column)
         Variance of each pixel over the frames, divided by that of the model.
     points, goodness : tuple of TransferPoint, tuple of SeriesGoodness
-        Photon transfer and dark signal of each series that was used, and its goodness of fit.
+        Photon transfer and dark signal of each series that was used; goodness of fit of all.
     histograms : tuple of Histogram
         Values of the shortest and the longest darks with their prediction; empty if the gain is unknown.
     saturation_dn : float
@@ -201,7 +201,10 @@ def calibrate(series: Sequence[Series], saturation_dn: float = np.inf) -> NoiseC
         saturation_dn=end_dn,
         saturation=saturation,
         response=_bent_response(fitted),
-        goodness=series_goodness(fitted),
+        goodness=(
+            *series_goodness(fitted),
+            *(goodness_of(flat, why) for flat, why in saturation.left_out),
+        ),
         warnings=(
             *warmth.warnings,
             *frame_warnings(fitted, saturation),

@@ -2,10 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import stats
 
+from faintfield.calib.estimate import SeriesGoodness
 from faintfield.calib.noise.flats import Saturation
 from faintfield.calib.noise.likelihood.gaussian import NoiseFit, level_variances_dn2
 from faintfield.calib.noise.likelihood.moments import Moments
@@ -21,35 +23,6 @@ _MAX_PROBABILITY, _MIN_SIGMAS, _NEGLIGIBLE_FRACTION = 1e-4, 6.0, 0.02
 
 # Scatter between series that is named in a warning: of noise and light as a fraction, of levels over the read noise.
 _NOTABLE_FRACTION, _NOTABLE_DRIFT = 0.005, 0.1
-
-
-@dataclass(frozen=True)
-class SeriesGoodness:
-    """Goodness of fit of one series.
-
-    Attributes
-    ----------
-    series : Series
-        The series.
-    left_out : str, optional
-        Why it was left out.
-    noise_excess, noise_se : float, optional
-        Variance over that of the model, minus 1, with its standard error under Gaussian noise; None for one frame.
-    level_residual_dn : float, optional
-        Level minus that of the model; None where the light of a flat is not known.
-    blocks, rows, columns, by_frame : float, optional
-        Deviance of the noise over blocks of pixels, rows, columns and frames, per degree of freedom.
-    """
-
-    series: Series
-    left_out: str | None = None
-    noise_excess: float | None = None
-    noise_se: float | None = None
-    level_residual_dn: float | None = None
-    blocks: float | None = None
-    rows: float | None = None
-    columns: float | None = None
-    by_frame: float | None = None
 
 
 @dataclass(frozen=True)
@@ -87,6 +60,12 @@ def transfer_points(fitted: SeriesFit) -> tuple[TransferPoint, ...]:
     return tuple(points)
 
 
+def goodness_of(series: Series, *numbers: Any) -> SeriesGoodness:
+    """Return a goodness of fit with the conditions of its series."""
+    conditions = series.conditions
+    return SeriesGoodness(conditions.kind, conditions.exposure_s, conditions.level, series.frames, *numbers)
+
+
 def series_goodness(fitted: SeriesFit) -> tuple[SeriesGoodness, ...]:
     """Return the goodness of fit of each series, darks first."""
     fit, moments = fitted.fit, fitted.moments
@@ -98,7 +77,7 @@ def series_goodness(fitted: SeriesFit) -> tuple[SeriesGoodness, ...]:
     goodness = []
     for j, item in enumerate((*fitted.darks, *fitted.flats)):
         if item.frames < 2:
-            goodness.append(SeriesGoodness(item, level_residual_dn=residuals[j]))
+            goodness.append(goodness_of(item, None, None, None, residuals[j]))
             continue
         excess = float(within[j] / ((item.frames - 1) * moments.freedom * noise[j])) - 1
         sums = moments.noise[j]
@@ -110,7 +89,7 @@ def series_goodness(fitted: SeriesFit) -> tuple[SeriesGoodness, ...]:
         chance = (2 * noise_dn2**2 + 4 * noise_dn2 * pattern_dn2) / float((~item.suspect).sum())
         scatter.append(float(item.spreads_dn2.var() * item.frames / chance) / (item.frames - 1))
         se = float(np.sqrt(2 / max(freedom[j], 1.0)))
-        goodness.append(SeriesGoodness(item, None, excess, se, residuals[j], *scatter))
+        goodness.append(goodness_of(item, None, excess, se, residuals[j], *scatter))
     return tuple(goodness)
 
 

@@ -1,6 +1,6 @@
 """Two measurements of a camera's noise compared: which quantities, pixels and maps have changed since."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -51,6 +51,11 @@ class Change(Struct, frozen=True, omit_defaults=True):
     plane: str = ""
     why: str | None = None
 
+    @property
+    def label(self) -> str:
+        """Name with that of the plane."""
+        return f"{self.plane}: {self.name}" if self.plane else self.name
+
 
 class PixelChange(Struct, frozen=True):
     """Numbers of pixels that only the first, only the second, or both measurements call unusable, of one kind."""
@@ -71,6 +76,11 @@ class MapChange(Struct, frozen=True, omit_defaults=True):
     verdict: Verdict
     plane: str = ""
     why: str | None = None
+
+    @property
+    def label(self) -> str:
+        """Name with that of the plane."""
+        return f"{self.plane}: {self.name} map" if self.plane else f"{self.name} map"
 
 
 class NoiseComparison(Struct, frozen=True):
@@ -100,54 +110,43 @@ def compare_noise(first: Path, second: Path) -> NoiseComparison:
     WrongSize, BadValue
         The sensors differ in size or in colour filters.
     """
-    paths = tuple(path / NOISE_FILE if path.is_dir() else path for path in (first, second))
+    paths = [path / NOISE_FILE if path.is_dir() else path for path in (first, second)]
     records = read_noise(paths[0]), read_noise(paths[1])
-    _check_alike(paths[0], records[0], paths[1], records[1])
-    quantities = [(change, _chance_of(change)) for change in _quantities(*records)]
-    maps = list(_maps(paths[0], records[0], paths[1], records[1]))
-    count = sum(probability is not None for _, probability in (*quantities, *maps))
+    _check_alike(paths, *records)
+    rows: list[tuple[Change | MapChange, float | None]] = [*_quantities(*records), *_maps(paths, *records)]
+    count = sum(probability is not None for _, probability in rows)
     level = CHANCE / max(count, 1)
-    judged = [_judged(*pair, level) for pair in quantities]
-    judged_maps = [_judged(*pair, level) for pair in maps]
-    changed = [(row.plane, row.name) for row in judged if row.verdict == "changed"]
-    changed += [(row.plane, f"{row.name} map") for row in judged_maps if row.verdict == "changed"]
+    judged = [
+        row if probability is None or probability >= level else msgspec.structs.replace(row, verdict="changed")
+        for row, probability in rows
+    ]
     return NoiseComparison(
         first=str(paths[0]),
         second=str(paths[1]),
         comparisons=count,
         limit_sigma=float(stats.norm.isf(level / 2)),
-        quantities=judged,
+        quantities=[row for row in judged if isinstance(row, Change)],
         pixels=[_pixel_change(kind, *records) for kind in _KINDS],
-        maps=judged_maps,
-        changed=[f"{plane}: {name}" if plane else name for plane, name in changed],
+        maps=[row for row in judged if isinstance(row, MapChange)],
+        changed=[row.label for row in judged if row.verdict == "changed"],
         notes=list(_notes(*records)),
     )
 
 
-def _judged[AnyChange: (Change, MapChange)](change: AnyChange, probability: float | None, level: float) -> AnyChange:
-    if probability is None or probability >= level:
-        return change
-    return msgspec.structs.replace(change, verdict="changed")
-
-
-def _chance_of(change: Change) -> float | None:
-    return None if change.sigma is None else chance(change.sigma)
-
-
-def _check_alike(first_path: Path, first: NoiseRecord, second_path: Path, second: NoiseRecord) -> None:
+def _check_alike(paths: Sequence[Path], first: NoiseRecord, second: NoiseRecord) -> None:
     if first.size_px != second.size_px:
         sizes = [
             " x ".join(map(str, record.size_px)) + " px" if record.size_px else "of no stated size"
             for record in (first, second)
         ]
         raise WrongSize(
-            f"{second_path}: is {sizes[1]}, {first_path} is {sizes[0]}: they are not of one camera in one mode; name "
+            f"{paths[1]}: is {sizes[1]}, {paths[0]} is {sizes[0]}: they are not of one camera in one mode; name "
             "two measurements of the same"
         )
     if (first.mosaic or None) != (second.mosaic or None):
         filters = ["/".join(record.mosaic) if record.mosaic else "none" for record in (first, second)]
         raise BadValue(
-            f"{second_path}: has the colour filters {filters[1]}, {first_path} has {filters[0]}: they are not of one "
+            f"{paths[1]}: has the colour filters {filters[1]}, {paths[0]} has {filters[0]}: they are not of one "
             "camera; name two measurements of the same"
         )
 
@@ -166,11 +165,13 @@ def _name(plane: PhaseRecord) -> str:
     return f"{plane.colour}_r{plane.phase[0]}c{plane.phase[1]}"
 
 
-def _quantities(first: NoiseRecord, second: NoiseRecord) -> Iterator[Change]:
+def _quantities(first: NoiseRecord, second: NoiseRecord) -> Iterator[tuple[Change, float | None]]:
+    """Yield the comparison of each quantity, and the probability of its difference; None without."""
     for plane, of_first, of_second in _phases(first, second):
         known = _measured(of_first), _measured(of_second)
         for name in known[0]:
-            yield _change(name, plane, known[0][name], known[1][name])
+            change = _change(name, plane, known[0][name], known[1][name])
+            yield change, None if change.sigma is None else chance(change.sigma)
 
 
 def _measured(quantities: Quantities) -> dict[str, Estimate]:
@@ -224,17 +225,15 @@ def _pixel_change(kind: str, first: NoiseRecord, second: NoiseRecord) -> PixelCh
     return PixelChange(kind, len(before - after), len(after - before), len(before & after))
 
 
-def _maps(
-    first_path: Path, first: NoiseRecord, second_path: Path, second: NoiseRecord
-) -> Iterator[tuple[MapChange, float | None]]:
-    """Yield the comparison of the offset maps of each phase, and the probability of its difference; None without."""
+def _maps(paths: Sequence[Path], first: NoiseRecord, second: NoiseRecord) -> Iterator[tuple[MapChange, float | None]]:
+    """Yield the comparison of the offset maps of each phase, likewise."""
     name, names = "offset_dn", ("offset_dn", "offset_variance_dn2", "mask")
     if first.size_px is None:
         return
     shape = first.size_px[::-1]
     maps = [
         read_maps(path.with_name(NOISE_MAPS), record, shape, names)
-        for path, record in ((first_path, first), (second_path, second))
+        for path, record in zip(paths, (first, second), strict=True)
     ]
     lacking = [which for which, names_of_maps in zip("AB", maps, strict=True) if set(names_of_maps) != set(names)]
     if lacking:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from faintfield.calib.estimate import Estimate
 from faintfield.calib.noise import NoiseCalibration
-from faintfield.calib.noise.misfit import SeriesGoodness
 from faintfield.calib.noise.strips import release
 from faintfield.pipelines.calibration.noise import Readout, SensorCalibration
 from faintfield.pipelines.formats.files import sha256
@@ -18,7 +17,6 @@ from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.results.noise import (
     CovarianceRecord,
     FitRecord,
-    GoodnessRecord,
     NoiseRecord,
     PhaseRecord,
     Quantities,
@@ -28,6 +26,7 @@ from faintfield.pipelines.formats.results.noise import (
 
 # Maps by their name in the file, with the fill for pixels that were not calibrated; these are masked anyway.
 _MAPS = {
+    "mask": True,
     "offset_dn": 0.0,
     "offset_variance_dn2": 0.0,
     "dark_current_e_per_s": 0.0,
@@ -37,8 +36,9 @@ _MAPS = {
     "relative_response": 1.0,
     "relative_response_se": 0.0,
     "vignetting": 1.0,
+    "gain_dn_per_e": 1.0,
+    "gain_se_dn_per_e": 0.0,
 }
-_GAIN_MAPS = {"gain_dn_per_e": 1.0, "gain_se_dn_per_e": 0.0}
 
 
 def noise_record(sensor: SensorCalibration) -> NoiseRecord:
@@ -114,56 +114,35 @@ def _covariance(phases: Sequence[NoiseCalibration]) -> CovarianceRecord:
 
 
 def _fit_record(calibration: NoiseCalibration) -> FitRecord:
-    estimates, saturation, response = calibration.estimates, calibration.saturation, calibration.response
-    bends = None
-    if response is not None:
-        bends = ResponseRecord([float(bend) for bend in response.bends_per_dn], float(response.up_to_dn))
     names = ("saturation_e", "linearity_error", "noise_error", "drift_dn", "light_error", "lamp_flicker")
-    unused = (SeriesGoodness(series, why) for series, why in saturation.left_out)
     return FitRecord(
-        saturation=msgspec.convert(saturation, SaturationRecord, from_attributes=True),
-        response=bends,
-        series=[_goodness_record(goodness) for goodness in (*calibration.goodness, *unused)],
+        saturation=msgspec.convert(calibration.saturation, SaturationRecord, from_attributes=True),
+        response=msgspec.convert(calibration.response, ResponseRecord | None, from_attributes=True),
+        series=list(calibration.goodness),
         telegraph_pixels=int(calibration.telegraph.sum()),
         maps_absent=calibration.maps.absent,
-        **{name: estimates[name] for name in names},
+        **{name: calibration.estimates[name] for name in names},
     )
-
-
-def _goodness_record(goodness: SeriesGoodness) -> GoodnessRecord:
-    numbers = {name: getattr(goodness, name) for name in GoodnessRecord.__struct_fields__[4:]}
-    conditions = goodness.series.conditions
-    return GoodnessRecord(conditions.kind, conditions.exposure_s, conditions.level, goodness.series.frames, **numbers)
 
 
 def noise_maps(sensor: SensorCalibration) -> Iterator[tuple[str, NDArray[Any]]]:
     """Yield name and array of the maps of `noise_maps.npz` (row, column): float32, but the bool `mask`."""
-    for name, parts, fill in _parts_of_maps(sensor.phases):
-        yield name, _interleave(sensor.readout, parts, fill)
-        release()
-
-
-def _parts_of_maps(phases: Sequence[NoiseCalibration]) -> Iterator[tuple[str, list[NDArray[Any]], float]]:
-    """Yield the name of each map, its part of each phase, and the value of pixels that were not calibrated."""
-    yield "mask", [c.maps.unusable for c in phases], True
     for name, fill in _MAPS.items():
-        parts = [getattr(c.maps, name) for c in phases]
-        if all(part is not None for part in parts):
-            yield name, parts, fill
-    if len(phases) > 1 or phases[0].maps.gain_dn_per_e is not None:
-        gains = [_gain_map(c) for c in phases]
-        for (name, fill), kept in zip(_GAIN_MAPS.items(), zip(*gains, strict=True), strict=True):
-            whole = [part for part in kept if part is not None]
-            if len(whole) == len(phases):
-                yield name, whole, fill
+        parts = [
+            part for c in sensor.phases if (part := _part_of_map(c, name, several=len(sensor.phases) > 1)) is not None
+        ]
+        if len(parts) == len(sensor.phases):
+            yield name, _interleave(sensor.readout, parts, fill)
+            release()
 
 
-def _gain_map(calibration: NoiseCalibration) -> tuple[NDArray[np.float32] | None, NDArray[np.float32] | None]:
-    """Return the gain of each pixel of a phase, its gain for all where pixels have none of their own; and its error."""
+def _part_of_map(calibration: NoiseCalibration, name: str, *, several: bool) -> NDArray[Any] | None:
+    """Return the map of a phase; of several, one whose pixels have no gain of their own has that of all."""
     maps, gain = calibration.maps, calibration.estimates["gain_dn_per_e"].value
-    if gain is None or maps.gain_dn_per_e is not None:
-        return maps.gain_dn_per_e, maps.gain_se_dn_per_e
-    return np.broadcast_to(np.float32(gain), maps.offset_dn.shape), None
+    if several and name == "gain_dn_per_e" and maps.gain_dn_per_e is None and gain is not None:
+        return np.broadcast_to(np.float32(gain), maps.offset_dn.shape)
+    part: NDArray[Any] | None = maps.unusable if name == "mask" else getattr(maps, name)
+    return part
 
 
 def _interleave(readout: Readout, parts: Sequence[NDArray[Any]], fill: float | bool) -> NDArray[Any]:

@@ -90,15 +90,16 @@ def compare_sensors(first: Path, second: Path) -> NoiseComparison:
     inform(f"A: {comparison.first}")
     inform(f"B: {comparison.second}")
     quantities = comparison.quantities
-    names = [f"{quantity.plane}: {quantity.name}" if quantity.plane else quantity.name for quantity in quantities]
-    wide = max(map(len, names))
+    wide = max(len(change.label) for change in quantities)
     inform(f"{'':{wide}}  {'A':>12} {'B':>12} {'B - A':>12} {'in sigma':>9}  verdict")
-    for name, change in zip(names, quantities, strict=True):
+    for change in quantities:
         numbers = " ".join(
             "-".rjust(12) if n is None else f"{n:12.5g}" for n in (change.first, change.second, change.difference)
         )
         sigma = "-" if change.sigma is None else f"{change.sigma:+.1f}"
-        inform(f"{name:{wide}}  {numbers} {sigma:>9}  {change.verdict}{f': {change.why}' if change.why else ''}")
+        inform(
+            f"{change.label:{wide}}  {numbers} {sigma:>9}  {change.verdict}{f': {change.why}' if change.why else ''}"
+        )
     for count in comparison.pixels:
         inform(
             f"{count.kind} pixels: {count.both} in both, {count.only_first} in A only, {count.only_second} in B only"
@@ -116,10 +117,8 @@ def compare_sensors(first: Path, second: Path) -> NoiseComparison:
 
 
 def _inform_of_map(change: MapChange) -> None:
-    label = f"{change.plane}: {change.name} map" if change.plane else f"{change.name} map"
     if change.rms_dn is None or change.expected_dn is None:
-        inform(f"{label}: {change.verdict}: {change.why}")
+        inform(f"{change.label}: {change.verdict}: {change.why}")
     else:
-        inform(
-            f"{label}: differs by {change.rms_dn:.4g} DN rms, expected {change.expected_dn:.4g} DN: {change.verdict}"
-        )
+        differs = f"differs by {change.rms_dn:.4g} DN rms, expected {change.expected_dn:.4g} DN"
+        inform(f"{change.label}: {differs}: {change.verdict}")

@@ -144,11 +144,11 @@ def _why_noise_denies(fitted: SeriesFit) -> str | None:
     """Return why the noise of the series denies the model; only flats can, since pickup may move noise of darks."""
     if not fitted.flats:
         return None
-    for item in series_goodness(fitted)[len(fitted.darks) :]:
+    for flat, item in zip(fitted.flats, series_goodness(fitted)[len(fitted.darks) :], strict=True):
         excess, se = item.noise_excess or 0.0, item.noise_se or np.inf
         if abs(excess) > max(_MAX_DEPARTURE, _MIN_SIGMAS * se):
             return (
-                f"the noise of the {item.series.conditions} is {excess:+.1%} off the model's in variance "
+                f"the noise of the {flat.conditions} is {excess:+.1%} off the model's in variance "
                 f"({abs(excess) / se:.0f} standard errors); record it again or leave it out"
             )
     scatter = float(np.sqrt(fitted.moments.excess.variance2))

@@ -12,7 +12,7 @@ from msgspec import UNSET, Struct, UnsetType
 from numpy.lib.format import write_array
 from numpy.typing import NDArray
 
-from faintfield.calib.estimate import Estimate
+from faintfield.calib.estimate import Estimate, SeriesGoodness
 from faintfield.calib.noise_model import BentResponse, NoiseModel
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue
@@ -47,27 +47,6 @@ class SaturationRecord(Struct, frozen=True):
     interval_dn: tuple[float, float] | None
 
 
-class GoodnessRecord(Struct, frozen=True, omit_defaults=True):
-    """Goodness of fit of one series, or the reason why it was left out.
-
-    `noise_excess` is its variance over the model's, minus 1, with the error `noise_se` of Gaussian noise; the deviances
-    of blocks of pixels, rows, columns and frames are per degree of freedom, 1 where the noise is Gaussian.
-    """
-
-    kind: Literal["dark", "flat"]
-    exposure_s: float
-    level: int
-    frames: int
-    left_out: str | None = None
-    noise_excess: float | None = None
-    noise_se: float | None = None
-    level_residual_dn: float | None = None
-    blocks: float | None = None
-    rows: float | None = None
-    columns: float | None = None
-    by_frame: float | None = None
-
-
 class FitRecord(Struct, frozen=True):
     """Saturation and response from the flats, how far series scatter about the model, and how well each fits.
 
@@ -83,7 +62,7 @@ class FitRecord(Struct, frozen=True):
     drift_dn: Estimate
     light_error: Estimate
     lamp_flicker: Estimate
-    series: list[GoodnessRecord]
+    series: list[SeriesGoodness]
     telegraph_pixels: int = 0
     maps_absent: dict[str, str] = {}
 
