@@ -101,8 +101,8 @@ def hot(repeats: int) -> None:
         taken = darks(chip, EXPOSURES_S, 10, rng)
         result = calibrate([measure_series(series, Conditions("dark", t)) for t, series in taken.items()])
         true += int(chip.hot.sum())
-        found += int(result.hot.sum())
-        both += int((chip.hot & result.hot).sum())
+        found += int(result.pixels.hot.sum())
+        both += int((chip.hot & result.pixels.hot).sum())
     print(f"hot pixels: {true} true, recall {both / true:.4f}, precision {both / found:.4f}")
 
 

@@ -14,7 +14,7 @@ from faintfield.calib.noise.emva.estimates import estimate_all
 from faintfield.calib.noise.flats import Saturation, check_flat_levels, find_saturation
 from faintfield.calib.noise.likelihood.marginal import Counts, mass_function
 from faintfield.calib.noise.maps.defects import hot_pixels, outlying_pixels, variance_ratio
-from faintfield.calib.noise.maps.measure import NoiseMaps, measure_pixels, noise_maps
+from faintfield.calib.noise.maps.measure import NoiseMaps, Pixels, measure_pixels, noise_maps
 from faintfield.calib.noise.misfit import (
     TransferPoint,
     frame_warnings,
@@ -59,7 +59,7 @@ class Histogram:
 
 @dataclass(frozen=True)
 class NoiseCalibration:
-    """Result of `calib.noise.calibrate`; masks are bool arrays (row, column).
+    """Result of `calib.noise.calibrate`.
 
     Attributes
     ----------
@@ -74,12 +74,8 @@ class NoiseCalibration:
         Name of the likelihood that was used.
     maps : NoiseMaps
         Maps per pixel.
-    hot, noisy, dead : mask
-        The kinds of unusable pixels.
-    telegraph : mask
-        Pixels that jump between two levels; those that are not among the noisy ones are used.
-    variance_ratio : array (row, column)
-        Variance of each pixel over the frames, divided by that of the model.
+    pixels : Pixels
+        Measurements of the pixels, with the masks of unusable ones.
     points, goodness : tuple of TransferPoint, tuple of SeriesGoodness
         Photon transfer and dark signal of each series that was used; goodness of fit of all.
     histograms : tuple of Histogram
@@ -98,11 +94,7 @@ class NoiseCalibration:
     covariance: tuple[tuple[str, ...], Array]
     likelihood: str
     maps: NoiseMaps
-    hot: Mask
-    noisy: Mask
-    dead: Mask
-    telegraph: Mask
-    variance_ratio: NDArray[np.float32]
+    pixels: Pixels
     points: tuple[TransferPoint, ...]
     histograms: tuple[Histogram, ...]
     saturation_dn: float
@@ -185,17 +177,12 @@ def calibrate(series: Sequence[Series], saturation_dn: float = np.inf) -> NoiseC
     estimates, covariance = estimate_all(
         fitted, pixels.response, saturation, levels_hold=level is None, noise_holds=noise is None
     )
-    dead = pixels.response.dead if pixels.response else np.zeros_like(hot)
     return NoiseCalibration(
         estimates=estimates,
         covariance=covariance,
         likelihood=fitted.likelihood,
-        maps=noise_maps(fitted, estimates, pixels, hot | pixels.noisy | dead),
-        hot=hot,
-        noisy=pixels.noisy,
-        telegraph=pixels.telegraph,
-        dead=dead,
-        variance_ratio=pixels.variance_ratio,
+        maps=noise_maps(fitted, estimates, pixels),
+        pixels=pixels,
         points=points,
         histograms=_histograms(fitted, ~hot & ~outlying),
         saturation_dn=end_dn,

@@ -119,13 +119,12 @@ def _ceiling_dn(flats: Sequence[Series], saturation_dn: float) -> float:
 
 
 def _converter_end(flats: Sequence[Series], clipped: Array, ceiling: float) -> Saturation:
-    shares = list(zip(flats, clipped, strict=True))
-    kept = tuple(flat for flat, share in shares if share <= _MAX_CLIPPED_SHARE)
     left_out = tuple(
         (flat, f"{share:.2%} of the flat's pixels stand at {ceiling:g} DN, the end of the range")
-        for flat, share in shares
+        for flat, share in zip(flats, clipped, strict=True)
         if share > _MAX_CLIPPED_SHARE
     )
+    kept = tuple(flat for flat, share in zip(flats, clipped, strict=True) if share <= _MAX_CLIPPED_SHARE)
     if not left_out:
         return Saturation("not reached", None, None, kept, left_out)
     return Saturation("ADC", ceiling, (ceiling, ceiling), kept, left_out)

@@ -8,10 +8,11 @@ import operator
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import reduce
+from itertools import islice
 from typing import Any
 from weakref import WeakSet
 
@@ -85,17 +86,14 @@ def read_ahead[Item, Content](
     items: Iterable[Item], read: Callable[[Item], Content], workers: int = 2
 ) -> Iterator[tuple[Item, Content]]:
     """Yield each item with what `read` makes of it in a thread, in order; at most `workers` wait to be taken."""
-    waiting: deque[tuple[Item, Future[Content]]] = deque()
+    queue = iter(items)
     with ThreadPoolExecutor(workers) as pool:
+        waiting = deque((item, pool.submit(read, item)) for item in islice(queue, workers))
         try:
-            for item in items:
-                if len(waiting) == workers:
-                    first, content = waiting.popleft()
-                    yield first, content.result()
-                waiting.append((item, pool.submit(read, item)))
             while waiting:
-                first, content = waiting.popleft()
-                yield first, content.result()
+                item, content = waiting.popleft()
+                yield item, content.result()
+                waiting.extend((item, pool.submit(read, item)) for item in islice(queue, 1))
         finally:
             for _, content in waiting:
                 content.cancel()

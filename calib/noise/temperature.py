@@ -10,7 +10,7 @@ from scipy.optimize import minimize_scalar
 from faintfield.calib.estimate import Estimate, interval
 from faintfield.calib.noise.likelihood.gaussian import NoiseFit
 from faintfield.calib.noise.likelihood.moments import Moments
-from faintfield.calib.noise.series import Conditions, Series
+from faintfield.calib.noise.series import Series
 from faintfield.calib.noise.strips import Array
 
 # Smallest range of temperatures that shows the growth, and limits of the kelvins over which dark current may double.
@@ -51,30 +51,35 @@ def settle_temperature(series: Sequence[Series]) -> tuple[Sequence[Series], Warm
     levels, frames = np.concatenate([dark.levels_dn for dark in darks]), [dark.frames for dark in darks]
     times_s = np.repeat([dark.conditions.exposure_s for dark in darks], frames)
     range_k, doubling = float(np.ptp(warmth)), dark_current_doubling(levels, times_s, np.repeat(warmth, frames))
-    stated_k = _stated_doubling_k(darks)
+    stated_k, value, se = _stated_doubling_k(darks), doubling.value, doubling.se
     if stated_k is not None:
-        return series, Warmth(range_k=range_k, warnings=_contradiction(stated_k, doubling))
-    if doubling.value is None:
+        if value is None or se is None or abs(value - stated_k) <= _MAX_SIGMAS * se:
+            return series, Warmth(range_k=range_k)
+        contradiction = (
+            f"dark_current_doubling_k = {stated_k:.3g} is stated, but the dark current of these darks doubles every "
+            f"{value:.3g} ± {se:.2g} K ({abs(value - stated_k) / se:.0f} standard errors): correct it, or leave it out "
+            "to have it measured"
+        )
+        return series, Warmth(range_k=range_k, warnings=(contradiction,))
+    if value is None:
         why = (
             f"the darks have {warmth.min():g} to {warmth.max():g} °C and nothing tells how their dark current grows: "
             f"its interval allows for {_USUAL_PER_K:.0%} per kelvin; state dark_current_doubling_k, or record all "
             f"darks at one temperature ({doubling.why})"
         )
         return series, Warmth(doubling, range_k, (why,))
-    doubling_k, reference_c = doubling.value, float(np.average(warmth, weights=frames))
+    reference_c = float(np.average(warmth, weights=frames))
     note = (
-        f"dark_current_doubling_k is not stated: the dark current of these darks doubles every {doubling.value:.3g} ± "
-        f"{doubling.se:.2g} K, by which it is taken to that at {reference_c:.1f} °C"
+        f"dark_current_doubling_k is not stated: the dark current of these darks doubles every {value:.3g} ± "
+        f"{se:.2g} K, by which it is taken to that at {reference_c:.1f} °C"
     )
 
-    def at_reference(conditions: Conditions) -> Conditions:
-        if conditions.temperature_c is None:
-            return conditions
-        factor = dark_factor(conditions.temperature_c, reference_c, doubling_k)
-        return replace(conditions, dark_factor=factor)
-
-    series = [replace(item, conditions=at_reference(item.conditions)) for item in series]
-    return series, Warmth(doubling, range_k, (note,))
+    settled = []
+    for item in series:
+        warmth_c = item.conditions.temperature_c
+        factor = item.conditions.dark_factor if warmth_c is None else dark_factor(warmth_c, reference_c, value)
+        settled.append(replace(item, conditions=replace(item.conditions, dark_factor=factor)))
+    return settled, Warmth(doubling, range_k, (note,))
 
 
 def with_doubling_error(fit: NoiseFit, moments: Moments, darks: Sequence[Series], warmth: Warmth) -> NoiseFit:
@@ -101,17 +106,6 @@ def _stated_doubling_k(darks: Sequence[Series]) -> float | None:
     if low.dark_factor == high.dark_factor or low.temperature_c is None or high.temperature_c is None:
         return None
     return float((high.temperature_c - low.temperature_c) / np.log2(high.dark_factor / low.dark_factor))
-
-
-def _contradiction(stated_k: float, doubling: Estimate) -> tuple[str, ...]:
-    value, se = doubling.value, doubling.se
-    if value is None or se is None or abs(value - stated_k) <= _MAX_SIGMAS * se:
-        return ()
-    return (
-        f"dark_current_doubling_k = {stated_k:.3g} is stated, but the dark current of these darks doubles every "
-        f"{value:.3g} ± {se:.2g} K ({abs(value - stated_k) / se:.0f} standard errors): correct it, or leave it out to "
-        "have it measured",
-    )
 
 
 def dark_factor(temperature_c: float, reference_c: float, doubling_k: float) -> float:

@@ -14,6 +14,7 @@ Blocks of little texture come nearest to this, so the flattest of each brightnes
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -51,13 +52,15 @@ _USUAL_DEPARTURE = 0.05
 _DRAWS = 40
 
 
-@dataclass(frozen=True)
-class ViewBlocks:
+class ViewBlocks(NamedTuple):
     """Blocks seen in three views each: mean in DN above the offset, variance of one view in DN², and texture."""
 
     mean_dn: Array
     variance_dn2: Array
     texture: Array
+
+
+_NO_BLOCKS = ViewBlocks(*[np.zeros(0)] * 3)
 
 
 @dataclass(frozen=True)
@@ -103,7 +106,7 @@ def compared_blocks(
     """
     corners, moves = _located(views, generator)
     if not len(corners):
-        return ViewBlocks(*(np.zeros(0),) * 3)
+        return _NO_BLOCKS
     colours = [
         _residuals(views, colour, corners, moves, saturation_dn, floor_dn) for colour in range(views[0].shape[2])
     ]
@@ -215,8 +218,7 @@ def estimate_view_noise(
     NotIdentifiable
         Too few blocks, or blocks of too few brightnesses, show the noise.
     """
-    parts = [(block.mean_dn, block.variance_dn2, block.texture) for block in blocks] or [(np.zeros(0),) * 3]
-    joined = ViewBlocks(*map(np.concatenate, zip(*parts, strict=True)))
+    joined = ViewBlocks(*map(np.concatenate, zip(*blocks, strict=True))) if blocks else _NO_BLOCKS
     groups = _groups(joined, flattest)
     if len(groups) < _MIN_POINTS:
         raise NotIdentifiable(

@@ -13,7 +13,7 @@ from faintfield.calib.noise import NoiseCalibration, Series, SeriesSums, calibra
 from faintfield.calib.noise.strips import read_ahead
 from faintfield.pipelines.calibration.noise_emva import EmvaMeasurement, measure_emva
 from faintfield.pipelines.console import progress, working
-from faintfield.pipelines.errors import BadValue, UnreadableImage, WrongBitDepth, WrongSize
+from faintfield.pipelines.errors import BadValue, UnreadableImage
 from faintfield.pipelines.formats.frames import Frame, at_phase, mosaic_period, read_frame
 from faintfield.pipelines.formats.sets.noise_set import FrameSeries, NoiseSet, Region
 
@@ -62,12 +62,11 @@ class Readout:
 
 @dataclass(frozen=True)
 class SensorCalibration:
-    """A sensor's frames, and for each phase of its mosaic the calibration and what the report by EMVA 1288 shows."""
+    """A sensor's frames, and for each phase of its mosaic the calibration with the quantities of EMVA 1288."""
 
     frames: FrameSeries
     readout: Readout
-    phases: list[NoiseCalibration]
-    emva: list[EmvaMeasurement]
+    phases: list[EmvaMeasurement]
 
 
 def calibrate_sensor(frames: FrameSeries) -> SensorCalibration:
@@ -80,12 +79,12 @@ def calibrate_sensor(frames: FrameSeries) -> SensorCalibration:
     """
     readout = _read_frames(frames)
     with working("fitting noise and response"):
-        phases = [_calibrate_phase(phase, readout.saturation_dn) for phase in readout.phases]
-    emva = [
+        calibrations = [_calibrate_phase(phase, readout.saturation_dn) for phase in readout.phases]
+    phases = [
         measure_emva(phase.name, phase.series, calibration, frames.temperature_c)
-        for phase, calibration in zip(readout.phases, phases, strict=True)
+        for phase, calibration in zip(readout.phases, calibrations, strict=True)
     ]
-    return SensorCalibration(frames, readout, phases, emva)
+    return SensorCalibration(frames, readout, phases)
 
 
 def _read_frames(frames: FrameSeries) -> Readout:
@@ -97,7 +96,7 @@ def _read_frames(frames: FrameSeries) -> Readout:
     for index, ((conditions, path), frame) in enumerate(progress(read, "reading frames", len(queue))):
         if index == 0 or conditions != queue[index - 1][0]:
             sums = [SeriesSums(conditions, readout.saturation_dn) for _ in readout.phases]
-        pixels = _check_frame(frame, path, readout)[readout.rows, readout.columns]
+        pixels = _pixels_of(frame, path)[readout.rows, readout.columns]
         for phase, phase_sums in zip(readout.phases, sums, strict=True):
             phase_sums.add(str(path), phase.of(pixels))
             if conditions.kind == "dark" and frame.black_dn is not None:
@@ -109,12 +108,7 @@ def _read_frames(frames: FrameSeries) -> Readout:
 
 def _layout(first: Path, settings: NoiseSet) -> Readout:
     frame = read_frame(first)
-    if frame.pixels_dn.ndim != 2 or not np.issubdtype(frame.pixels_dn.dtype, np.integer):
-        raise UnreadableImage(
-            f"{first}: holds {frame.pixels_dn.dtype} of shape {frame.pixels_dn.shape}; the noise of a sensor shows "
-            "only in whole digital numbers, one per pixel: give raw files or grey frames, not photographs"
-        )
-    height, width = frame.pixels_dn.shape
+    height, width = _pixels_of(frame, first).shape
     mosaic = settings.mosaic or frame.mosaic
     period = mosaic_period(mosaic)
     rows, columns = _slices(settings.region, (height, width), period)
@@ -142,20 +136,14 @@ def _slices(region: Region | None, shape: tuple[int, int], period: tuple[int, in
     return slice(*region.rows), slice(*region.columns)
 
 
-def _check_frame(frame: Frame, path: Path, readout: Readout) -> NDArray[Any]:
-    pixels = frame.pixels_dn
-    width, height = readout.size_px
-    if pixels.shape != (height, width):
-        shape = " x ".join(str(length) for length in pixels.shape[1::-1] + pixels.shape[2:])
-        raise WrongSize(
-            f"{path}: is {shape} px, the other frames {width} x {height} px; record it again with the same region of "
-            "interest and binning, or leave it out"
+def _pixels_of(frame: Frame, path: Path) -> NDArray[np.integer]:
+    """Return the values of a frame, which are whole numbers, (row, column)."""
+    if frame.pixels_dn.ndim != 2 or not np.issubdtype(frame.pixels_dn.dtype, np.integer):
+        raise UnreadableImage(
+            f"{path}: holds {frame.pixels_dn.dtype} of shape {frame.pixels_dn.shape}; the noise of a sensor shows "
+            "only in whole digital numbers, one per pixel: give raw files or grey frames, not photographs"
         )
-    if not np.issubdtype(pixels.dtype, np.integer):
-        raise WrongBitDepth(
-            f"{path}: holds {pixels.dtype} pixels; noise is measured in whole digital numbers; record raw files"
-        )
-    return pixels
+    return frame.pixels_dn
 
 
 def _calibrate_phase(phase: MosaicPhase, saturation_dn: float) -> NoiseCalibration:

@@ -128,10 +128,12 @@ def _dark_image(
 def _bright_image(darks: list[Series], calibration: NoiseCalibration) -> MeanImage | None:
     """Return the mean of the flats nearest to half of saturation, over its mean; dark and vignetting are taken out."""
     used, offset = ~calibration.maps.unusable, calibration.estimates["offset_dn"].value or 0.0
-    several = [flat for flat in calibration.saturation.kept if flat.frames > 1]
+    kept, end_dn = calibration.saturation.kept, calibration.saturation_dn
+    several = [flat for flat in kept if flat.frames > 1]
     if not several or not used.any():
         return None
-    span = _end_dn(calibration) - offset
+    brightest = max(float(flat.levels_dn.mean()) for flat in kept)
+    span = (end_dn if np.isfinite(end_dn) else brightest) - offset
 
     def distance(flat: Series) -> float:
         return abs((float(flat.levels_dn.mean()) - offset) / span - _BRIGHT_SHARE)
@@ -164,14 +166,6 @@ def _bright_image(darks: list[Series], calibration: NoiseCalibration) -> MeanIma
     noise = temporal_noise(flat, used) + dark.noise
     weight = mean_over(lambda rows: 1 / smooth(rows) ** 2, used) * (slope / mean) ** 2
     return MeanImage(flat, image, noise.scaled(weight), signal_dn)
-
-
-def _end_dn(calibration: NoiseCalibration) -> float:
-    level = calibration.saturation.level_dn
-    if level is not None:
-        return level
-    brightest = max(float(flat.levels_dn.mean()) for flat in calibration.saturation.kept)
-    return calibration.saturation_dn if np.isfinite(calibration.saturation_dn) else brightest
 
 
 def _spreads(

@@ -43,9 +43,11 @@ _MAPS = {
 
 def noise_record(sensor: SensorCalibration) -> NoiseRecord:
     """Return the record of a calibration, without the hash of its maps."""
-    frames, readout, phases = sensor.frames, sensor.readout, sensor.phases
+    frames, readout, phases = sensor.frames, sensor.readout, [phase.calibration for phase in sensor.phases]
     bad_pixels: dict[str, Any] = {
-        f"{kind}_pixels": np.argwhere(_interleave(readout, [getattr(c, kind) for c in phases], fill=False)).tolist()
+        f"{kind}_pixels": np.argwhere(
+            _interleave(readout, [getattr(c.pixels, kind) for c in phases], fill=False)
+        ).tolist()
         for kind in ("hot", "noisy", "dead")
     }
     warnings = [*frames.warnings, *(warning for calibration in phases for warning in calibration.warnings)]
@@ -68,7 +70,7 @@ def noise_record(sensor: SensorCalibration) -> NoiseRecord:
         warnings=list(dict.fromkeys(warnings)),
         provenance=provenance("noise", {}, {name: sha256(frames.folder / name) for name in frames.file_names}),
         fit=UNSET if readout.mosaic else _fit_record(phases[0]),
-        emva1288=UNSET if readout.mosaic else sensor.emva[0].record(),
+        emva1288=UNSET if readout.mosaic else sensor.phases[0].record(),
     )
 
 
@@ -77,13 +79,13 @@ def _phase_records(sensor: SensorCalibration) -> list[PhaseRecord]:
         PhaseRecord(
             phase=phase.phase,
             colour=phase.colour,
-            likelihood=str(calibration.likelihood),
+            likelihood=str(measured.calibration.likelihood),
             masked_black_dn=float(np.mean(phase.black_dn)) if phase.black_dn else None,
-            fit=_fit_record(calibration),
-            emva1288=emva.record(),
-            **_quantities(calibration),
+            fit=_fit_record(measured.calibration),
+            emva1288=measured.record(),
+            **_quantities(measured.calibration),
         )
-        for phase, calibration, emva in zip(sensor.readout.phases, sensor.phases, sensor.emva, strict=True)
+        for phase, measured in zip(sensor.readout.phases, sensor.phases, strict=True)
     ]
 
 
@@ -119,7 +121,7 @@ def _fit_record(calibration: NoiseCalibration) -> FitRecord:
         saturation=msgspec.convert(calibration.saturation, SaturationRecord, from_attributes=True),
         response=msgspec.convert(calibration.response, ResponseRecord | None, from_attributes=True),
         series=list(calibration.goodness),
-        telegraph_pixels=int(calibration.telegraph.sum()),
+        telegraph_pixels=int(calibration.pixels.telegraph.sum()),
         maps_absent=calibration.maps.absent,
         **{name: calibration.estimates[name] for name in names},
     )
@@ -127,12 +129,12 @@ def _fit_record(calibration: NoiseCalibration) -> FitRecord:
 
 def noise_maps(sensor: SensorCalibration) -> Iterator[tuple[str, NDArray[Any]]]:
     """Yield name and array of the maps of `noise_maps.npz` (row, column): float32, but the bool `mask`."""
+    several = len(sensor.phases) > 1
     for name, fill in _MAPS.items():
-        parts = [
-            part for c in sensor.phases if (part := _part_of_map(c, name, several=len(sensor.phases) > 1)) is not None
-        ]
-        if len(parts) == len(sensor.phases):
-            yield name, _interleave(sensor.readout, parts, fill)
+        parts = [_part_of_map(phase.calibration, name, several=several) for phase in sensor.phases]
+        whole = [part for part in parts if part is not None]
+        if len(whole) == len(parts):
+            yield name, _interleave(sensor.readout, whole, fill)
             release()
 
 

@@ -83,7 +83,7 @@ def _plots(calibration: NoiseCalibration) -> tuple[_Plot, ...]:
         _map("Offset less its mean (DSNU) [DN]", maps.offset_dn, maps.unusable, offset),
         _map("Dark current [e⁻/s]", maps.dark_current_e_per_s, maps.unusable),
         # Uniform if the model is complete.
-        _map("Temporal variance, measured / model", calibration.variance_ratio, maps.unusable),
+        _map("Temporal variance, measured / model", calibration.pixels.variance_ratio, maps.unusable),
         _Plot("Dark values and the fitted mass function", _histograms, no_mass),
         _Plot("Spectrogram of the offset (DSNU)", _spectrogram, _why_empty(maps.offset_dn, maps.unusable)),
         _map("Relative response to light", maps.relative_response, maps.unusable),
@@ -137,7 +137,7 @@ def _table(axes: Axes, calibration: NoiseCalibration) -> None:
     table.auto_set_font_size(False)
     table.set_fontsize(8.5)
     table.scale(1, 1.35)
-    counts = {kind: int(getattr(calibration, kind).sum()) for kind in ("hot", "noisy", "dead")}
+    counts = {kind: int(getattr(calibration.pixels, kind).sum()) for kind in ("hot", "noisy", "dead")}
     summary = ", ".join(f"{count} {kind}" for kind, count in counts.items())
     axes.text(0.5, 0.0, f"{summary} pixels", ha="center", fontsize=9, transform=axes.transAxes)
 

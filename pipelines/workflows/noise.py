@@ -37,13 +37,13 @@ def measure_sensor(folder: Path, out: Path | None = None) -> NoiseRecord:
         sensor = calibrate_sensor(frames)
         with working("drawing the pages"):
             pages = {
-                f"noise_page{f'_{phase.name}' if phase.name else ''}.png": draw_page(
-                    calibration, f"{title} {phase.name}"
+                f"noise_page{phase.name and f'_{phase.name}'}.png": draw_page(
+                    phase.calibration, f"{title} {phase.name}"
                 )
-                for phase, calibration in zip(sensor.readout.phases, sensor.phases, strict=True)
+                for phase in sensor.phases
             }
             record = noise_record(sensor)
-            pages[EMVA_PAGE] = emva_page(title, record, sensor.emva).encode()
+            pages[EMVA_PAGE] = emva_page(title, record, sensor.phases).encode()
         record = write_noise(out, record, noise_maps(sensor), pages)
     _inform_of(record)
     inform(f"{out / NOISE_FILE}")
@@ -75,9 +75,8 @@ def _inform_of_fit(fit: FitRecord) -> None:
     saturation, error = fit.saturation, fit.linearity_error
     if saturation.level_dn is not None:
         full, capacity = fit.saturation_e, ""
-        if full.value is not None:
-            ends = "" if full.ci95 is None else f" (95 %: {full.ci95[0]:.5g} to {full.ci95[1]:.5g})"
-            capacity = f", mu_e.sat {full.value:.5g} e⁻{ends}"
+        if full.value is not None and full.ci95 is not None:
+            capacity = f", mu_e.sat {full.value:.5g} e⁻ (95 %: {full.ci95[0]:.5g} to {full.ci95[1]:.5g})"
         inform(f"  saturation: {saturation.level_dn:.5g} DN ({saturation.limit}){capacity}")
     if error.value is not None and error.ci95 is not None:
         low, high = error.ci95

@@ -4,7 +4,7 @@ A fit always returns numbers. A quantity has a value only if the frames determin
 known to 10 %, the dark current if its error does not matter in comparison with the noise.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy import stats
@@ -19,7 +19,7 @@ from faintfield.calib.noise.likelihood.gaussian import (
     main_quantities,
 )
 from faintfield.calib.noise.likelihood.moments import Moments
-from faintfield.calib.noise.likelihood.response import FittedLevels, charge_dn, quantum_efficiency
+from faintfield.calib.noise.likelihood.response import charge_dn, fitted_linearity, quantum_efficiency
 from faintfield.calib.noise.maps.photo_response import Response
 from faintfield.calib.noise.misfit import series_goodness
 from faintfield.calib.noise.series_fit import NoiseLikelihood, SeriesFit
@@ -294,26 +294,27 @@ def _linearity(fit: NoiseFit, moments: Moments, saturation: Saturation) -> Estim
     signal = moments.flats.mean_dn - offset - dark
     full = float(signal.max()) if saturation.level_dn is None else saturation.level_dn - offset
     variance = np.array(level_variances_dn2(fit.values, moments), float)
-    levels = FittedLevels(moments.light, signal, variance, full)
-    value = levels.linearity(fit.values)
-    if value is None and levels.linearity({}) is not None:
+
+    def error_of(values: Mapping[str, float]) -> float | None:
+        return fitted_linearity(values, moments.light, signal, variance, full)
+
+    value = error_of(fit.values)
+    if value is None and error_of({}) is not None:
         return Estimate(None, why=_POOR_RESPONSE)
     if value is None:
         return Estimate(None, why="fewer than 3 levels are within 5 to 95 % of saturation; record more light levels")
     names, covariance = list(fit.bend.values), fit.bend.covariance
     bends = np.array([*fit.bend.values.values()])
-
-    def error_of(draw: Array) -> float | None:
-        return levels.linearity(dict(zip(names, draw.tolist(), strict=True)))
-
     draws = np.random.default_rng(1288).multivariate_normal(bends, covariance, _DRAWS, method="svd")
-    errors = np.array([error for error in map(error_of, draws) if error is not None])
+    drawn = (error_of(dict(zip(names, draw.tolist(), strict=True))) for draw in draws)
+    errors = np.array([error for error in drawn if error is not None])
     if errors.size < (1 - _MAX_IMPOSSIBLE) * _DRAWS:
         return Estimate(None, why=_POOR_RESPONSE)
     se = float(np.sqrt(np.mean((errors - value) ** 2)))
     gradient = dict.fromkeys(fit.values, 0.0)
-    for name, direction, step in zip(names, np.eye(len(names)), 0.1 * np.sqrt(np.diag(covariance)), strict=True):
-        low, high = (error_of(bends + sign * step * direction) or 0.0 for sign in (-1, 1))
+    for name, step in zip(names, (0.1 * np.sqrt(np.diag(covariance))).tolist(), strict=True):
+        ends = (fit.bend.values | {name: fit.values[name] + sign * step} for sign in (-1, 1))
+        low, high = (error_of(end) or 0.0 for end in ends)
         gradient[name] = (high - low) / max(2 * step, 1e-300)
     half = fit.quantile(np.array([*gradient.values()])) * se
     straight = stats.chi2.sf(float(bends @ np.linalg.pinv(covariance) @ bends), len(names)) > 0.05

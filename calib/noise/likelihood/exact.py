@@ -7,7 +7,6 @@ s_i = ∇ ln L_i; Berndt, Hall, Hall and Hausman, Annals of Economic and Social 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
@@ -75,51 +74,43 @@ def fit_exact(
     maximum = _maximize(objective(spread=False), np.array([start[name] for name in PARAMETERS]), ~_IS_DCNU)
     if try_spread:
         spread = objective(spread=True)
-        starts = [np.where(_IS_DCNU, dcnu, maximum.x) for dcnu in _TRIED_DCNU]
+        starts = [np.where(_IS_DCNU, dcnu, [*maximum.values.values()]) for dcnu in _TRIED_DCNU]
         rises = [spread(x)[0] - maximum.log_likelihood for x in starts]
         if max(rises) >= _MIN_RISE:
             maximum = _maximize(spread, starts[int(np.argmax(rises))], np.ones_like(_IS_DCNU))
-    size, fit = len(PARAMETERS), maximum.fit()
+    size, fit = len(PARAMETERS), _in_gaussian_terms(maximum)
     covariance = np.zeros((size + len(bend.values),) * 2)
     covariance[:size, :size], covariance[size:, size:] = fit.covariance, bend.covariance
     return NoiseFit(fit.values | bend.values, covariance, fit.log_likelihood)
 
 
-@dataclass(frozen=True)
-class _Maximum:
-    """Maximum of the likelihood, in the order of `PARAMETERS`."""
-
-    x: Array
-    covariance: Array
-    log_likelihood: float
-
-    def fit(self) -> NoiseFit:
-        """Return the maximum in the parameters of the Gaussian fit."""
-        log_gain, log_read_e, log_dark, dcnu, offset, log_dsnu = self.x.tolist()
-        slope, dsnu2 = float(np.exp(log_gain + log_dark)), float(np.exp(2 * log_dsnu))
-        spread2 = (dcnu * slope) ** 2
-        values = {
-            "offset_dn": offset,
-            "log_read_dn2": 2 * (log_gain + log_read_e),
-            "dsnu_dn2": dsnu2,
-            "dark_signal_dn_per_s": slope,
-            "dcnu_dn2_per_s2": spread2,
-            "log_gain": log_gain,
-        }
-        jacobian = np.array(
-            [
-                [0, 0, 0, 0, 1, 0],
-                [2, 2, 0, 0, 0, 0],
-                [0, 0, 0, 0, 0, 2 * dsnu2],
-                [slope, 0, slope, 0, 0, 0],
-                [2 * spread2, 0, 2 * spread2, 2 * dcnu * slope**2, 0, 0],
-                [1, 0, 0, 0, 0, 0],
-            ]
-        )
-        return NoiseFit(values, jacobian @ self.covariance @ jacobian.T, self.log_likelihood)
+def _in_gaussian_terms(maximum: NoiseFit) -> NoiseFit:
+    """Return a maximum over `PARAMETERS` in the parameters of the Gaussian fit."""
+    log_gain, log_read_e, log_dark, dcnu, offset, log_dsnu = maximum.values.values()
+    slope, dsnu2 = float(np.exp(log_gain + log_dark)), float(np.exp(2 * log_dsnu))
+    spread2 = (dcnu * slope) ** 2
+    values = {
+        "offset_dn": offset,
+        "log_read_dn2": 2 * (log_gain + log_read_e),
+        "dsnu_dn2": dsnu2,
+        "dark_signal_dn_per_s": slope,
+        "dcnu_dn2_per_s2": spread2,
+        "log_gain": log_gain,
+    }
+    jacobian = np.array(
+        [
+            [0, 0, 0, 0, 1, 0],
+            [2, 2, 0, 0, 0, 0],
+            [0, 0, 0, 0, 0, 2 * dsnu2],
+            [slope, 0, slope, 0, 0, 0],
+            [2 * spread2, 0, 2 * spread2, 2 * dcnu * slope**2, 0, 0],
+            [1, 0, 0, 0, 0, 0],
+        ]
+    )
+    return NoiseFit(values, jacobian @ maximum.covariance @ jacobian.T, maximum.log_likelihood)
 
 
-def _maximize(objective: _Objective, begin: Array, free: Mask) -> _Maximum:
+def _maximize(objective: _Objective, begin: Array, free: Mask) -> NoiseFit:
     """Climb over the free parameters by scoring steps, halved where they overshoot; the others are zero."""
     x = np.where(free, begin, 0.0)
     best = objective(x)
@@ -133,7 +124,7 @@ def _maximize(objective: _Objective, begin: Array, free: Mask) -> _Maximum:
             root = np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
             scale = np.outer(root, root)
             covariance[np.ix_(free, free)] = np.linalg.pinv(information / scale) / scale
-            return _Maximum(x, covariance, best[0])
+            return NoiseFit(dict(zip(PARAMETERS, x.tolist(), strict=True)), covariance, best[0])
         length = 1.0
         while (trial := objective(x + length * step))[0] < best[0] and length > _MIN_STEP_LENGTH:
             length /= 2

@@ -234,35 +234,31 @@ def quantum_efficiency(photons: Array, charge_e: Array, gain_relative_se: float)
     return slope, float(np.hypot(slope * gain_relative_se, np.sqrt(scatter)))
 
 
-@dataclass(frozen=True)
-class FittedLevels:
-    """Light and mean signal of all flats (series,), dark signal removed, with its variance, for the linearity error.
+def fitted_linearity(
+    values: Mapping[str, float], light: Light, signal_dn: Array, variance_dn2: Array, full_dn: float
+) -> float | None:
+    """Return the linearity error of the response with these bends.
 
-    `full_dn` is the signal at saturation, or of the brightest level.
+    None with too few levels, or if so bent a response falls or makes no signal of their light.
+
+    Parameters
+    ----------
+    light, signal_dn, variance_dn2 : Light, array (series,)
+        Light and mean signal of all flats, dark signal removed, with its variance.
+    full_dn : float
+        Signal at saturation, or of the brightest level.
     """
-
-    light: Light
-    signal_dn: Array
-    variance_dn2: Array
-    full_dn: float
-
-    def linearity(self, values: Mapping[str, float]) -> float | None:
-        """Return the linearity error of the response with these bends.
-
-        None with too few levels, or if so bent a response falls or makes no signal of their light.
-        """
-        low, high = (share * self.full_dn for share in LINEARITY_RANGE)
-        errors, sizes = [], []
-        for group in self.light.groups:
-            members = self.light.group == group
-            charge, weight = charge_dn(values, self.signal_dn[members]), 1 / self.variance_dn2[members]
-            amount = self.light.amount[members]
-            factor = float(weight * amount @ charge / (weight * amount @ amount))
-            inside = (self.signal_dn[members] >= low) & (self.signal_dn[members] <= high)
-            if inside.sum() >= _MIN_LINEARITY_LEVELS:
-                signal = signal_of_charge(values, factor * amount[inside], self.full_dn)
-                if not np.all(signal > 0) or np.any(charge_slope(values, self.signal_dn[members]) <= 0):
-                    return None
-                errors.append(linearity_error(signal, amount[inside]))
-                sizes.append(int(inside.sum()))
-        return float(np.average(errors, weights=sizes)) if errors else None
+    low, high = (share * full_dn for share in LINEARITY_RANGE)
+    errors, sizes = [], []
+    for group in light.groups:
+        members = light.group == group
+        signal, amount, weight = signal_dn[members], light.amount[members], 1 / variance_dn2[members]
+        factor = float(weight * amount @ charge_dn(values, signal) / (weight * amount @ amount))
+        inside = (signal >= low) & (signal <= high)
+        if inside.sum() >= _MIN_LINEARITY_LEVELS:
+            straight = signal_of_charge(values, factor * amount[inside], full_dn)
+            if not np.all(straight > 0) or np.any(charge_slope(values, signal) <= 0):
+                return None
+            errors.append(linearity_error(straight, amount[inside]))
+            sizes.append(int(inside.sum()))
+    return float(np.average(errors, weights=sizes)) if errors else None

@@ -94,8 +94,12 @@ class Pixels:
 
     Attributes
     ----------
-    telegraph, noisy : array (row, column), bool
-        Pixels that jump between two levels; pixels that are too noisy to be of use.
+    variance_ratio : array (row, column)
+        Variance of each pixel over the frames, divided by that of the model.
+    hot, noisy, dead : array (row, column), bool
+        The kinds of unusable pixels: of large dark signal, too noisy to be of use, and without response to light.
+    telegraph : array (row, column), bool
+        Pixels that jump between two levels; those that are not among the noisy ones are used.
     response, response_e : Response, optional
         Response to light in DN, and in electrons of the pixels' own gain; None without flats.
     gain, gain_why : PixelGain, str
@@ -105,7 +109,9 @@ class Pixels:
     read: PixelReadNoise
     variance_ratio: NDArray[np.float32]
     telegraph: Mask
+    hot: Mask
     noisy: Mask
+    dead: Mask
     levels: PixelLevels
     response: Response | None
     response_e: Response | None
@@ -144,14 +150,15 @@ def measure_pixels(fitted: SeriesFit, hot: Mask, outlying: Mask) -> Pixels:
     usable = ~(hot | noisy)
     levels = _levels(fitted, read, hot)
     response = gain = response_e = None
+    dead = np.zeros_like(hot)
     why = "no flats: record 10 flats each of 3 light levels"
     if fitted.flats:
         response = response_e = _response(fitted, levels, usable, None)
         freedom = sum(dark.frames - 1.0 for dark in fitted.darks)
         transfer = photon_transfer(fitted.flats, levels.offset_dn, read.read_noise_dn, fitted.fit.values, freedom)
-        bright = usable & ~response.dead
+        dead = response.dead
         gain, why = measure_gain(
-            transfer, bright, response, lambda relative: _response(fitted, levels, usable, relative)
+            transfer, usable & ~dead, response, lambda relative: _response(fitted, levels, usable, relative)
         )
         if gain is not None:
             response_e = _response(fitted, levels, usable, gain.relative)
@@ -165,10 +172,10 @@ def measure_pixels(fitted: SeriesFit, hot: Mask, outlying: Mask) -> Pixels:
         spread_dn2 = max(fitted.fit.values["dsnu_dn2"], 0.0) + read_dn**2 / sum(dark.frames for dark in fitted.darks)
         seams = find_seams(levels.offset_dn, usable, 1 / spread_dn2)
         seams = [seam for seam in seams if seam.difference > _NOTABLE_STEP * read_dn]
-    return Pixels(read, ratio, telegraph, noisy, levels, response, response_e, gain, why, tuple(seams))
+    return Pixels(read, ratio, telegraph, hot, noisy, dead, levels, response, response_e, gain, why, tuple(seams))
 
 
-def noise_maps(fitted: SeriesFit, estimates: Mapping[str, Estimate], pixels: Pixels, unusable: Mask) -> NoiseMaps:
+def noise_maps(fitted: SeriesFit, estimates: Mapping[str, Estimate], pixels: Pixels) -> NoiseMaps:
     """Return the maps; those in electrons only where the gain is known."""
     mean_gain = estimates["gain_dn_per_e"].value
     levels, read = pixels.levels, pixels.read
@@ -202,7 +209,7 @@ def noise_maps(fitted: SeriesFit, estimates: Mapping[str, Estimate], pixels: Pix
         maps |= {"relative_response": response.relative, "vignetting": response.vignetting}
         maps["relative_response_se"] = response.relative_se
     single = {name: values.astype(np.float32, copy=False) for name, values in maps.items()}
-    return NoiseMaps(unusable=unusable, absent=absent, **single)
+    return NoiseMaps(unusable=pixels.hot | pixels.noisy | pixels.dead, absent=absent, **single)
 
 
 def _read_noise(fitted: SeriesFit, hot: Mask) -> tuple[PixelReadNoise, Mask]:

@@ -53,11 +53,9 @@ class Seam:
         return self.effect[rows, None] if self.lines == "rows" else self.effect[None, :]
 
     def __str__(self) -> str:
-        return {
-            "halves": f"the halves of the {self.lines}",
-            "quarters": f"the quarters of the {self.lines}",
-            "alternate": f"even and odd {self.lines}",
-        }[self.regions]
+        return (
+            f"even and odd {self.lines}" if self.regions == "alternate" else f"the {self.regions} of the {self.lines}"
+        )
 
 
 def find_seams(values: NDArray[Any], weight: NDArray[Any], precision: float = 1.0) -> list[Seam]:

@@ -304,14 +304,11 @@ def _numbers(path: Path, record: NoiseRecord) -> dict[str, float]:
     values: dict[str, float] = {}
     for name in _NEEDED:
         estimate: Estimate = getattr(record, name)
-        why = estimate.why or "no reason stated"
-        if estimate.value is not None:
-            values[name] = estimate.value
-        elif name == "dark_current_e_per_s":
-            inform(f"{path}: {name} is not known ({why}); 0 is taken, which is right for short exposures only")
-            values[name] = 0.0
-        else:
+        values[name], why = estimate.value or 0.0, estimate.why or "no reason stated"
+        if estimate.value is None and name != "dark_current_e_per_s":
             raise BadValue(f"{path}: {name} is not known ({why}); record what it names, or state [noise] yourself")
+        if estimate.value is None:
+            inform(f"{path}: {name} is not known ({why}); 0 is taken, which is right for short exposures only")
     # An estimate near zero may fall below it; a dark current cannot.
     values["dark_current_e_per_s"] = max(values["dark_current_e_per_s"], 0.0)
     return values

@@ -1,5 +1,6 @@
 """The noise set: a folder of dark and flat frames with `noise.toml`, or those frames of a session."""
 
+from bisect import bisect_right
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -21,11 +22,16 @@ from faintfield.rig.session.session import PLAN, has_session, taken_frames
 
 FILE_NAME = "noise.toml"
 
-# Largest number of photons per pixel; no pixel holds a thousandth of the electrons.
-_MAX_PHOTONS = 1e9
+# Least and largest numbers; no pixel holds a thousandth of so many electrons.
+_LIMITS = {
+    "exposure_s": (0.0, MAX_EXPOSURE_S),
+    "photons": (0.0, 1e9),
+    "temperature_c": (-273.15, 200.0),
+    "dark_current_doubling_k": (2.0, 30.0),
+}
 
-# Range of temperatures, in kelvins, that counts as steady, and limits of those over which dark current doubles.
-_STEADY_K, _MIN_DOUBLING_K, _MAX_DOUBLING_K = 0.5, 2.0, 30.0
+# Range of temperatures, in kelvins, that counts as steady.
+_STEADY_K = 0.5
 
 # Largest difference in kelvins between a dark frame and the scene, over which dark current changes by a fifth, and the
 # number of files that a warning names.
@@ -82,7 +88,7 @@ class FrameSeries:
     @property
     def temperature_range(self) -> TemperatureRange | None:
         """Range of the temperatures, None if none is stated."""
-        known = _known(self.settings)
+        known = _known(self.settings.frame)
         return TemperatureRange(float(np.mean(known)), min(known), max(known)) if known else None
 
 
@@ -113,20 +119,12 @@ def _read_settings(path: Path) -> NoiseSet:
         if image in seen:
             raise BadValue(f"{path}: {frame.file} is named twice; remove one of the entries")
         seen.add(image)
-        for key, value, most in (
-            ("exposure_s", frame.exposure_s, MAX_EXPOSURE_S),
-            ("photons", frame.photons, _MAX_PHOTONS),
-        ):
-            if value is not None and not 0 <= value <= most:
-                raise BadValue(f"{path}: {frame.file}: {key} = {value}; give a number from 0 to {most:g}")
-        if frame.temperature_c is not None and not -273.15 <= frame.temperature_c < 200:
-            raise BadValue(f"{path}: {frame.file}: temperature_c = {frame.temperature_c}; give degrees Celsius")
-    doubling_k = settings.dark_current_doubling_k
-    if doubling_k is not None and not _MIN_DOUBLING_K <= doubling_k <= _MAX_DOUBLING_K:
-        raise BadValue(
-            f"{path}: dark_current_doubling_k = {doubling_k}; give the kelvins over which dark current doubles, "
-            f"{_MIN_DOUBLING_K:g} to {_MAX_DOUBLING_K:g}"
-        )
+    for table in (*settings.frame, settings):
+        for key, (least, most) in _LIMITS.items():
+            value = getattr(table, key, None)
+            if value is not None and not least <= value <= most:
+                place = f"{path}: {table.file}" if isinstance(table, NoiseFrame) else path
+                raise BadValue(f"{place}: {key} = {value}; give a number from {least:g} to {most:g}")
     mosaic = settings.mosaic
     if mosaic is not None and not sound_mosaic(mosaic):
         raise BadValue(
@@ -172,7 +170,7 @@ def group_frames(source: Path, settings: NoiseSet) -> dict[Conditions, list[Path
     BadValue
         A frame's exposure is neither stated nor in its EXIF.
     """
-    groups: dict[Conditions, list[tuple[Path, float | None]]] = {}
+    groups: dict[Conditions, list[NoiseFrame]] = {}
     for frame in settings.frame:
         path = source.parent / frame.file
         exposure_s = frame.exposure_s
@@ -186,60 +184,61 @@ def group_frames(source: Path, settings: NoiseSet) -> dict[Conditions, list[Path
         # EXIF states exposures as ratios; the same setting must not differ in its last digit.
         level, photons = (frame.level, frame.photons) if frame.kind == "flat" else (0, None)
         conditions = Conditions(frame.kind, float(f"{exposure_s:.6g}"), level, photons)
-        groups.setdefault(conditions, []).append((path, frame.temperature_c))
+        groups.setdefault(conditions, []).append(frame)
     series = _by_temperature(groups, settings)
 
     def order(conditions: Conditions) -> tuple[str, float, int, float]:
         return conditions.kind, conditions.exposure_s, conditions.level, conditions.temperature_c or 0.0
 
-    return {conditions: series[conditions] for conditions in sorted(series, key=order)}
+    return {
+        conditions: [source.parent / file for file in series[conditions]] for conditions in sorted(series, key=order)
+    }
 
 
-def _by_temperature(
-    groups: dict[Conditions, list[tuple[Path, float | None]]], settings: NoiseSet
-) -> dict[Conditions, list[Path]]:
-    """Return the series, darks of different temperatures apart, with what their dark current was."""
-    known, of_darks = _known(settings), _known(settings, "dark")
+def _by_temperature(groups: dict[Conditions, list[NoiseFrame]], settings: NoiseSet) -> dict[Conditions, list[str]]:
+    """Return the files of each series, darks of different temperatures apart, with what their dark current was."""
+    known, of_darks = _known(settings.frame), _known(settings.frame, "dark")
     several, doubling_k = bool(of_darks) and np.ptp(of_darks) > _STEADY_K, settings.dark_current_doubling_k
-    series: dict[Conditions, list[Path]] = {}
+    series: dict[Conditions, list[str]] = {}
     for conditions, frames in groups.items():
         for part in _split_by_temperature(frames) if several and conditions.kind == "dark" else [frames]:
-            stated, own = [temperature_c for _, temperature_c in part if temperature_c is not None], conditions
+            stated, own = _known(part), conditions
             if stated and several:
                 own = replace(own, temperature_c=float(np.mean(stated)))
             if stated and doubling_k is not None:
                 factor = dark_factor(float(np.mean(stated)), float(np.mean(known)), doubling_k)
                 own = replace(own, dark_factor=factor)
-            series.setdefault(own, []).extend(path for path, _ in part)
+            series.setdefault(own, []).extend(frame.file for frame in part)
     return series
 
 
-def _split_by_temperature(frames: list[tuple[Path, float | None]]) -> list[list[tuple[Path, float | None]]]:
+def _split_by_temperature(frames: list[NoiseFrame]) -> list[list[NoiseFrame]]:
     """Return darks of one exposure, those of different temperatures apart, each part in the order of the frames.
 
     A part ends at a gap, or where a slow drift would make its dark current differ. Frames without a temperature are one
     part.
     """
-    known = sorted({temperature_c for _, temperature_c in frames if temperature_c is not None})
+    known = sorted(set(_known(frames)))
     firsts = known[:1]
     for before, after in pairwise(known):
         if after - before > _STEADY_K or after - firsts[-1] > _NEAR_SCENE_K:
             firsts.append(after)
-    parts: dict[float | None, list[tuple[Path, float | None]]] = {}
-    for path, temperature_c in frames:
-        first = None if temperature_c is None else max(first for first in firsts if first <= temperature_c)
-        parts.setdefault(first, []).append((path, temperature_c))
+    parts: dict[int, list[NoiseFrame]] = {}
+    for frame in frames:
+        part = 0 if frame.temperature_c is None else bisect_right(firsts, frame.temperature_c)
+        parts.setdefault(part, []).append(frame)
     return list(parts.values())
 
 
-def _known(settings: NoiseSet, *kinds: str) -> list[float]:
-    frames = (frame for frame in settings.frame if not kinds or frame.kind in kinds)
-    return [frame.temperature_c for frame in frames if frame.temperature_c is not None]
+def _known(frames: list[NoiseFrame], *kinds: str) -> list[float]:
+    """Return the temperatures that are stated, of all frames or of some kinds."""
+    known = [frame for frame in frames if not kinds or frame.kind in kinds]
+    return [frame.temperature_c for frame in known if frame.temperature_c is not None]
 
 
 def _temperature_warnings(settings: NoiseSet) -> list[str]:
     missing = [frame.file for frame in settings.frame if frame.temperature_c is None]
-    known, warnings = _known(settings), list[str]()
+    known, warnings = _known(settings.frame), list[str]()
     if missing:
         warnings.append(
             f"{missing[0]}: no temperature is stated (nor for {len(missing) - 1} others); dark current changes by "
@@ -269,9 +268,10 @@ def _scene_warnings(settings: NoiseSet, scene_c: list[float]) -> list[str]:
         return []
     files, temperatures_c = zip(*away, strict=True)
     names = ", ".join(files[:_MAX_NAMED]) + (", …" if len(files) > _MAX_NAMED else "")
+    darks = len(_known(settings.frame, "dark"))
     return [
-        f"{len(away)} of {len(_known(settings, 'dark'))} dark frames are more than {_NEAR_SCENE_K:g} K away from the "
-        f"scene ({names}): they have {min(temperatures_c):.1f} to {max(temperatures_c):.1f} °C, the {len(scene_c)} "
-        f"frames of the scene {min(scene_c):.1f} to {max(scene_c):.1f} °C; "
+        f"{len(away)} of {darks} dark frames are more than {_NEAR_SCENE_K:g} K away from the scene ({names}): they "
+        f"have {min(temperatures_c):.1f} to {max(temperatures_c):.1f} °C, the {len(scene_c)} frames of the scene "
+        f"{min(scene_c):.1f} to {max(scene_c):.1f} °C; "
         "take them again at the scene's temperature, as camera.settle_temperature_c makes sure of"
     ]

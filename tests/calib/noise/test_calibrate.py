@@ -85,18 +85,18 @@ def test_invisible_spread_is_not_certainly_zero(read_noise_e: float, dsnu_e: flo
 def test_hot_pixels_are_kept_out() -> None:
     chip, rng = specimen(3, shape=(256, 256), hot_fraction=0.005, dcnu=0.1)
     result = calibrate(dark_series(chip, EXPOSURES_S, 10, rng))
-    right = (result.hot & chip.hot).sum()
+    right = (result.pixels.hot & chip.hot).sum()
     assert right / chip.hot.sum() >= 0.99
-    assert right / result.hot.sum() >= 0.95
+    assert right / result.pixels.hot.sum() >= 0.95
     assert value(result, "dark_current_e_per_s") == pytest.approx(0.2, rel=0.02)
-    np.testing.assert_array_equal(result.maps.unusable, result.hot | result.noisy | result.dead)
+    np.testing.assert_array_equal(result.maps.unusable, result.pixels.hot | result.pixels.noisy | result.pixels.dead)
 
 
 def test_flats_give_response_and_efficiency() -> None:
     chip, rng = specimen(5, shape=(96, 96), prnu=0.02)
     chip.response[40, 50] = 0.1
     result = calibrate(with_flats(chip, rng, (500.0, 5000.0, 20000.0), frames=8))
-    assert np.argwhere(result.dead).tolist() == [[40, 50]]
+    assert np.argwhere(result.pixels.dead).tolist() == [[40, 50]]
     assert value(result, "prnu") == pytest.approx(0.02, rel=0.05)
     efficiency, bend = result.estimates["quantum_efficiency"], result.estimates["nonlinearity_per_dn"]
     assert efficiency.ci95 is not None

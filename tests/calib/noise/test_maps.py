@@ -175,9 +175,9 @@ def test_telegraph_pixels_are_marked() -> None:
     rng = np.random.default_rng(17)
     jump_e = np.where(rng.random(SHAPE) < 0.02, rng.uniform(8.0, 12.0, SHAPE), 0.0)
     result = calibrated(18, jump_e=jump_e)
-    for marked in (result.telegraph, result.noisy):
+    for marked in (result.pixels.telegraph, result.pixels.noisy):
         assert (marked & (jump_e > 0)).sum() > 0.9 * (jump_e > 0).sum()
-    assert (result.telegraph & (jump_e == 0)).sum() <= 2
+    assert (result.pixels.telegraph & (jump_e == 0)).sum() <= 2
     assert any("jump between two levels" in warning for warning in result.warnings)
 
 
@@ -185,8 +185,8 @@ def test_strong_normal_noise_is_no_telegraph_noise() -> None:
     rng = np.random.default_rng(19)
     sigma_dn = np.where(rng.random(SHAPE) < 0.03, 12.0, 3.0)
     result = calibrate([dark_series(sigma_dn, 40, rng)])
-    assert result.telegraph.sum() <= 2
-    assert result.noisy.sum() <= 2
+    assert result.pixels.telegraph.sum() <= 2
+    assert result.pixels.noisy.sum() <= 2
 
 
 @pytest.mark.parametrize(("freedom", "spread", "jump"), [(20, 0.0, 4.5), (42, 0.6, 30.0)], ids=["alike", "sCMOS"])

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from faintfield.calib.noise import calibrate
-from faintfield.calib.noise.likelihood.exact import _flat_part, _Maximum
-from faintfield.calib.noise.likelihood.gaussian import Bend
+from faintfield.calib.noise.likelihood.exact import _flat_part, _in_gaussian_terms
+from faintfield.calib.noise.likelihood.gaussian import Bend, NoiseFit
 from faintfield.calib.noise.likelihood.marginal import (
     DARK_LOG_WEIGHTS,
     DARK_NODES,
@@ -108,22 +108,22 @@ def test_single_repeated_exposure_gives_an_offset() -> None:
     assert result.estimates["offset_dn"].value == pytest.approx(100, abs=0.5)
 
 
-def in_gaussian_terms(x: NDArray[np.float64]) -> dict[str, float]:
-    return _Maximum(x, np.zeros((len(PARAMETERS),) * 2), 0.0).fit().values
+def in_gaussian_terms(x: NDArray[np.float64], covariance: NDArray[np.float64]) -> NoiseFit:
+    return _in_gaussian_terms(NoiseFit(dict(zip(PARAMETERS, x.tolist(), strict=True)), covariance, 0.0))
 
 
 def test_covariance_passes_on_by_slopes_of_parameters() -> None:
     at = np.array([np.log(2.0), np.log(0.5), np.log(0.2), 0.15, 100.0, np.log(3.0)])
-    gaussian = in_gaussian_terms(at)
+    gaussian = in_gaussian_terms(at, np.eye(6)).values
     gain, dark = 2.0, 0.2
     assert gaussian["log_read_dn2"] == pytest.approx(np.log((gain * 0.5) ** 2))
     assert gaussian["dsnu_dn2"] == pytest.approx(9.0)
     assert gaussian["dark_signal_dn_per_s"] == pytest.approx(gain * dark)
     assert gaussian["dcnu_dn2_per_s2"] == pytest.approx((0.15 * gain * dark) ** 2)
-    by_difference = slopes(lambda x: np.array(list(in_gaussian_terms(x).values())), at)
+    by_difference = slopes(lambda x: np.array(list(in_gaussian_terms(x, np.eye(6)).values.values())), at)
     root = np.random.default_rng(1).normal(size=(6, 6))
     expected = by_difference @ root @ root.T @ by_difference.T
-    np.testing.assert_allclose(_Maximum(at, root @ root.T, 0.0).fit().covariance, expected, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(in_gaussian_terms(at, root @ root.T).covariance, expected, rtol=1e-6, atol=1e-6)
 
 
 def test_likelihood_of_flats_has_slopes_and_information() -> None:

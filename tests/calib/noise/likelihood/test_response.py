@@ -5,11 +5,11 @@ import pytest
 from scipy import stats
 
 from faintfield.calib.noise.likelihood.response import (
-    FittedLevels,
     Light,
     charge_dn,
     charge_slope,
     choose_bends,
+    fitted_linearity,
     known_light,
     level_log_likelihood,
     linearity_error,
@@ -97,10 +97,10 @@ def test_linearity_error_is_that_of_a_weighted_line() -> None:
     assert linearity_error(3.0 + 7.0 * light, light) == pytest.approx(0.0, abs=1e-12), "an offset is no bend"
     values, amount = {"nonlinearity_per_dn": 2e-5}, np.linspace(1.0, 20.0, 20)
     bent = signal_of_charge(values, 50.0 * amount, 1000.0)
-    levels = FittedLevels(in_one_group(amount), bent, np.ones(20), float(bent.max()))
+    levels = in_one_group(amount), bent, np.ones(20), float(bent.max())
     inside = (bent >= 0.05 * bent.max()) & (bent <= 0.95 * bent.max())
-    assert levels.linearity(values) == pytest.approx(linearity_error(bent[inside], amount[inside]), rel=1e-6)
-    assert levels.linearity({}) == pytest.approx(0.0, abs=1e-9)
+    assert fitted_linearity(values, *levels) == pytest.approx(linearity_error(bent[inside], amount[inside]), rel=1e-6)
+    assert fitted_linearity({}, *levels) == pytest.approx(0.0, abs=1e-9)
     # Bends of twice their standard errors may be drawn that turn the charge of every level negative
-    falling = FittedLevels(in_one_group(np.linspace(0.1, 1.5, 16)), np.linspace(100, 1500, 16), np.ones(16), 1500.0)
-    assert falling.linearity({"nonlinearity_per_dn": -8e-4, "nonlinearity_per_dn2": 1e-8}) is None
+    falling = in_one_group(np.linspace(0.1, 1.5, 16)), np.linspace(100, 1500, 16), np.ones(16), 1500.0
+    assert fitted_linearity({"nonlinearity_per_dn": -8e-4, "nonlinearity_per_dn2": 1e-8}, *falling) is None
