@@ -70,8 +70,7 @@ def series_goodness(fitted: SeriesFit) -> tuple[SeriesGoodness, ...]:
     """Return the goodness of fit of each series, darks first."""
     fit, moments = fitted.fit, fitted.moments
     line = fit.values["offset_dn"] + fit.values.get("dark_signal_dn_per_s", 0.0) * moments.darks.exposure_s
-    residuals: list[float | None] = [float(x) for x in moments.darks.mean_dn - line]
-    residuals += _light_residuals(fit, moments)
+    residuals = [*(moments.darks.mean_dn - line).tolist(), *_light_residuals(fit, moments)]
     noise = [*fitted.dark_noise_dn2, *fitted.flat_noise_dn2]
     freedom, within = moments.noise_freedom, moments.series.within_dn2
     goodness = []

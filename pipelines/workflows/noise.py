@@ -5,7 +5,7 @@ from pathlib import Path
 from faintfield.calib.estimate import Estimate
 from faintfield.calib.noise.strips import maps_by
 from faintfield.pipelines.calibration.noise import calibrate_sensor
-from faintfield.pipelines.calibration.noise_comparison import CHANCE, MapChange, NoiseComparison, compare_noise
+from faintfield.pipelines.calibration.noise_comparison import CHANCE, NoiseComparison, compare_noise
 from faintfield.pipelines.calibration.noise_record import noise_maps, noise_record
 from faintfield.pipelines.console import inform, working
 from faintfield.pipelines.errors import MissingFile
@@ -104,7 +104,11 @@ def compare_sensors(first: Path, second: Path) -> NoiseComparison:
             f"{count.kind} pixels: {count.both} in both, {count.only_first} in A only, {count.only_second} in B only"
         )
     for difference in comparison.maps:
-        _inform_of_map(difference)
+        if difference.rms_dn is None or difference.expected_dn is None:
+            inform(f"{difference.label}: {difference.verdict}: {difference.why}")
+        else:
+            differs = f"differs by {difference.rms_dn:.4g} DN rms, expected {difference.expected_dn:.4g} DN"
+            inform(f"{difference.label}: {differs}: {difference.verdict}")
     for note in comparison.notes:
         inform(f"note: {note}")
     changed = ", ".join(comparison.changed) or "nothing"
@@ -113,11 +117,3 @@ def compare_sensors(first: Path, second: Path) -> NoiseComparison:
         f"{comparison.comparisons} comparisons together are false alarms)"
     )
     return comparison
-
-
-def _inform_of_map(change: MapChange) -> None:
-    if change.rms_dn is None or change.expected_dn is None:
-        inform(f"{change.label}: {change.verdict}: {change.why}")
-    else:
-        differs = f"differs by {change.rms_dn:.4g} DN rms, expected {change.expected_dn:.4g} DN"
-        inform(f"{change.label}: {differs}: {change.verdict}")

@@ -217,15 +217,13 @@ def _parameter(fit: NoiseFit, name: str, quantile: float) -> Estimate:
 
 def _spreads(fitted: SeriesFit, gain: Estimate) -> dict[str, Estimate]:
     fit = fitted.fit
-    dsnu2, se = fit.values["dsnu_dn2"], fit.standard_error("dsnu_dn2")
-    spreads = {"dsnu_dn": root(dsnu2, se)}
+    dsnu2, se, dcnu2 = fit.values["dsnu_dn2"], fit.standard_error("dsnu_dn2"), fit.values.get("dcnu_dn2_per_s2")
     if gain.value is None:
-        return spreads | dict.fromkeys(("dsnu_e", "dcnu_e_per_s"), Estimate(None, why=gain.why))
-    spreads["dsnu_e"] = root(dsnu2, se, 1 / gain.value)
-    spreads["dcnu_e_per_s"] = Estimate(None, why=_why_no_growth(fitted.moments))
-    if (dcnu2 := fit.values.get("dcnu_dn2_per_s2")) is not None:
-        spreads["dcnu_e_per_s"] = root(dcnu2, fit.standard_error("dcnu_dn2_per_s2"), 1 / gain.value)
-    return spreads
+        return {"dsnu_dn": root(dsnu2, se)} | dict.fromkeys(("dsnu_e", "dcnu_e_per_s"), Estimate(None, why=gain.why))
+    dcnu = Estimate(None, why=_why_no_growth(fitted.moments))
+    if dcnu2 is not None:
+        dcnu = root(dcnu2, fit.standard_error("dcnu_dn2_per_s2"), 1 / gain.value)
+    return {"dsnu_dn": root(dsnu2, se), "dsnu_e": root(dsnu2, se, 1 / gain.value), "dcnu_e_per_s": dcnu}
 
 
 def _shared_noise(fitted: SeriesFit) -> dict[str, Estimate]:

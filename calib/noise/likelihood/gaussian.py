@@ -125,21 +125,14 @@ def negative_log_likelihood(values: Mapping[str, Any], moments: Moments) -> Any:
     total = _wishart_cost(values, dark_v, moments) + _dark_level_cost(values, dark_v, moments)
     for cost, _ in _noise_costs(dark_v, darks, moments, moments.excess.darks):
         total += cost
-    return total - _flat_log_likelihood(values, moments)
-
-
-def _flat_log_likelihood(values: Mapping[str, Any], moments: Moments) -> Any:
-    """Return ln L of the flats: of their noise, and of their levels where these tell the bend of the response."""
-    flats = moments.flats
-    total = flat_log_likelihood(values, moments)[0]
-    if not any(name in values for name in BENDS):
-        return total
-    if np.isfinite(moments.bend_se):
-        total = total + bend_log_prior(values, moments.range_dn, moments.bend_se)
-    if not moments.light.groups.size:
-        return total
-    variances = level_variances_dn2(values, moments)
-    return total + level_log_likelihood(values, moments.light, flats.mean_dn, flats.exposure_s, variances)
+    of_flats = flat_log_likelihood(values, moments)[0]
+    if any(name in values for name in BENDS):
+        if np.isfinite(moments.bend_se):
+            of_flats = of_flats + bend_log_prior(values, moments.range_dn, moments.bend_se)
+        if moments.light.groups.size:
+            levels = moments.flats.mean_dn, moments.flats.exposure_s, level_variances_dn2(values, moments)
+            of_flats = of_flats + level_log_likelihood(values, moments.light, *levels)
+    return total - of_flats
 
 
 def _dark_level_cost(values: Mapping[str, Any], dark_v: list[Any], moments: Moments) -> Any:

@@ -201,7 +201,7 @@ def _gain_seams(
         if share > _MIN_SIGMA * se:
             whole = abs(share - 1) < _ONE_SIGMA * se
             measured = replace(seam, effect=share * seam.effect, se=se * seam.difference)
-            seams[seam.lines] = replace(seam, of_response=True) if whole else measured
+            seams[seam.lines] = seam if whole else measured
     return tuple(seam for seam in seams.values() if seam.difference > _MIN_SEAM)
 
 

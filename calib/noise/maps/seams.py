@@ -33,15 +33,12 @@ class Seam:
         By how much the region of each line differs from the mean.
     se : float
         Standard error of the largest difference between regions.
-    of_response : bool
-        The response to light has told its size.
     """
 
     lines: str
     regions: str
     effect: Array
     se: float
-    of_response: bool = False
 
     @property
     def difference(self) -> float:
