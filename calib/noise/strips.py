@@ -6,13 +6,11 @@ Maps of large sensors may lie in files, so that memory holds only the strips tha
 import mmap
 import operator
 import os
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import reduce
-from itertools import islice
 from typing import Any
 from weakref import WeakSet
 
@@ -80,23 +78,6 @@ def release() -> None:
 def usable_cores() -> int:
     """Return the number of processor cores that this process may use."""
     return len(os.sched_getaffinity(0))
-
-
-def read_ahead[Item, Content](
-    items: Iterable[Item], read: Callable[[Item], Content], workers: int = 2
-) -> Iterator[tuple[Item, Content]]:
-    """Yield each item with what `read` makes of it in a thread, in order; at most `workers` wait to be taken."""
-    queue = iter(items)
-    with ThreadPoolExecutor(workers) as pool:
-        waiting = deque((item, pool.submit(read, item)) for item in islice(queue, workers))
-        try:
-            while waiting:
-                item, content = waiting.popleft()
-                yield item, content.result()
-                waiting.extend((item, pool.submit(read, item)) for item in islice(queue, 1))
-        finally:
-            for _, content in waiting:
-                content.cancel()
 
 
 def over_strips[T](work: Callable[[slice], T], shape: tuple[int, ...], parts: int | None = None) -> list[T]:

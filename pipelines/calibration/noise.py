@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 from faintfield.calib.errors import CalibrationError
 from faintfield.calib.estimate import Estimate
 from faintfield.calib.noise import NoiseCalibration, Series, SeriesSums, calibrate
-from faintfield.calib.noise.strips import read_ahead
 from faintfield.pipelines.calibration.noise_emva import EmvaMeasurement, measure_emva
 from faintfield.pipelines.console import progress, working
 from faintfield.pipelines.errors import BadValue, UnreadableImage
-from faintfield.pipelines.formats.frames import Frame, at_phase, mosaic_period, read_frame
+from faintfield.pipelines.formats.frames import Frame, at_phase, mosaic_period, read_ahead, read_frame
 from faintfield.pipelines.formats.sets.noise_set import FrameSeries, NoiseSet, Region
 
 # Black levels of masked pixels and of covered ones differ by less in a sound camera.

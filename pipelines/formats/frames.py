@@ -2,9 +2,12 @@
 
 import contextlib
 import logging
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from io import BufferedReader
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -150,6 +153,23 @@ def read_frame(
             "it as such"
         )
     return frame
+
+
+def read_ahead[Item, Content](
+    items: Iterable[Item], read: Callable[[Item], Content], workers: int = 2
+) -> Iterator[tuple[Item, Content]]:
+    """Yield each item with what `read` makes of it in a thread, in order; at most `workers` wait to be taken."""
+    queue = iter(items)
+    with ThreadPoolExecutor(workers) as pool:
+        waiting = deque((item, pool.submit(read, item)) for item in islice(queue, workers))
+        try:
+            while waiting:
+                item, content = waiting.popleft()
+                yield item, content.result()
+                waiting.extend((item, pool.submit(read, item)) for item in islice(queue, 1))
+        finally:
+            for _, content in waiting:
+                content.cancel()
 
 
 def pages_in(path: Path) -> int:

@@ -25,10 +25,11 @@ from faintfield.calib.geometry import (
 from faintfield.calib.geometry.bundle import load_mrcal
 from faintfield.calib.geometry.rig_geometry import HomingShift
 from faintfield.calib.geometry.stage import StageReport, approach_directions, stage_report
-from faintfield.calib.noise.strips import read_ahead, usable_cores
+from faintfield.calib.noise.strips import usable_cores
 from faintfield.pipelines.arguments import LensName
 from faintfield.pipelines.console import inform, progress, working
 from faintfield.pipelines.formats.exchange.mrcal import camera_model_text
+from faintfield.pipelines.formats.frames import read_ahead
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.results.geometry import (
     CAMERA_FILE,

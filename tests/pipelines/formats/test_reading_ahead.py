@@ -2,7 +2,7 @@
 
 import pytest
 
-from faintfield.calib.noise.strips import read_ahead
+from faintfield.pipelines.formats.frames import read_ahead
 
 
 def test_items_come_in_order_and_few_wait() -> None:
