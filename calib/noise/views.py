@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from faintfield.calib.errors import NotIdentifiable
+from faintfield.calib.estimate import Estimate
 from faintfield.calib.noise.strips import Array
 
 # Side of a block in px: small against objects, large enough for a variance within 9 %.
@@ -64,23 +65,15 @@ _NO_BLOCKS = ViewBlocks(*[np.zeros(0)] * 3)
 
 
 @dataclass(frozen=True)
-class Estimated:
-    """An estimate with its standard error and 95 % interval, by the scatter of blocks alone."""
-
-    value: float
-    se: float
-    ci95: tuple[float, float]
-
-
-@dataclass(frozen=True)
 class ViewNoise:
     """Noise of one view as its views show it: `variance = gain · mean + read_noise_dn²`, rounding included.
 
+    Both have a value; their errors are by the scatter of blocks alone.
     `mean_dn` and `variance_dn2` (point,) are the photon transfer curve, with the number of `blocks` behind it.
     """
 
-    gain_dn: Estimated
-    read_noise_dn: Estimated
+    gain_dn: Estimate
+    read_noise_dn: Estimate
     mean_dn: Array
     variance_dn2: Array
     blocks: int
@@ -277,6 +270,6 @@ def _line(mean_dn: Array, variance_dn2: Array, counts: Array, gain_dn: float | N
     return np.array([gain, np.sqrt(read2)])
 
 
-def _estimate(value: float, draws: Array) -> Estimated:
+def _estimate(value: float, draws: Array) -> Estimate:
     low, high = np.quantile(draws, [0.025, 0.975]).tolist()
-    return Estimated(value, float(np.std(draws)), (min(low, value), max(high, value)))
+    return Estimate(value, float(np.std(draws)), (min(low, value), max(high, value)))

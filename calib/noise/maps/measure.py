@@ -195,9 +195,9 @@ def noise_maps(fitted: SeriesFit, estimates: Mapping[str, Estimate], pixels: Pix
     if mean_gain is None:
         absent = dict.fromkeys(("gain_dn_per_e", "read_noise_e"), str(estimates["gain_dn_per_e"].why))
     else:
-        if pixels.gain is not None:
-            for name, values in (("gain_dn_per_e", pixels.gain.relative), ("gain_se_dn_per_e", pixels.gain.se)):
-                maps[name] = map_of(lambda rows, values=values: mean_gain * values[rows], values.shape)  # type: ignore[misc]
+        if (gain := pixels.gain) is not None:
+            maps["gain_dn_per_e"] = map_of(lambda rows: mean_gain * gain.relative[rows], gain.relative.shape)
+            maps["gain_se_dn_per_e"] = map_of(lambda rows: mean_gain * gain.se[rows], gain.se.shape)
         maps["read_noise_e"] = in_electrons(read.read_noise_dn)
         if fitted.likelihood is not _CENSORED:
             maps["read_noise_se_e"] = in_electrons(read.se_dn)

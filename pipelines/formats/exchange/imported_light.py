@@ -22,7 +22,7 @@ from faintfield.pipelines.formats.sets.elemental_file import Noise, View
 from faintfield.pipelines.formats.units import LightUnit
 
 if TYPE_CHECKING:
-    from faintfield.calib.noise.views import Estimated, ViewNoise
+    from faintfield.calib.noise.views import ViewNoise
 
 type Tone = Literal["linear", "srgb"]
 
@@ -173,7 +173,7 @@ def complete_noise(stated: GridOptions, pictures: Pictures) -> tuple[Noise, Nois
             "them"
         )
         return noise(gain, read_e, estimated=True), NoiseOrigin("assumed", str(failure))
-    gain, read_dn = estimate.gain_dn.value, estimate.read_noise_dn.value
+    gain, read_dn = estimate.gain_dn.value or 0.0, estimate.read_noise_dn.value or 0.0
     variance = _describe_variance(gain, read_dn, pictures.tone)
     inform(f"{words}; estimated from the differences of neighbouring views, {variance}")
     read_e = float(np.sqrt(max(read_dn**2 - _ROUNDING_DN2, 0.0)) / gain)
@@ -181,8 +181,8 @@ def complete_noise(stated: GridOptions, pictures: Pictures) -> tuple[Noise, Nois
         read_e = stated.read_noise_e
     return noise(gain, read_e, estimated=True), NoiseOrigin(
         "estimated",
-        gain_dn=_measured(estimate.gain_dn),
-        read_noise_dn=_measured(estimate.read_noise_dn),
+        gain_dn=estimate.gain_dn,
+        read_noise_dn=estimate.read_noise_dn,
         mean_dn=tuple(estimate.mean_dn.tolist()),
         variance_dn2=tuple(estimate.variance_dn2.tolist()),
         blocks=estimate.blocks,
@@ -260,7 +260,3 @@ def _describe_variance(gain_dn: float, read_noise_dn: float, tone: Tone) -> str:
     """Return in words how the variance follows from the light, in the unit of the pictures."""
     unit, words = (1.0, "DN") if tone == "linear" else (1.0 / WHITE_DN, "fractions of white")
     return f"the variance of a pixel is {gain_dn * unit:.3g} · light + {read_noise_dn * unit:.3g}², in {words}"
-
-
-def _measured(quantity: "Estimated") -> Estimate:
-    return Estimate(quantity.value, quantity.se, quantity.ci95)

@@ -99,18 +99,18 @@ def _linear(gain: float, gain_dn: float | None = None) -> tuple[ViewNoise, float
 def test_gain_and_read_noise_under_texture(gain: float) -> None:
     noise, read_e = _linear(gain)
     assert noise.gain_dn.value == pytest.approx(gain, rel=0.15)
-    assert np.sqrt(noise.read_noise_dn.value**2 - 1 / 12) / gain == pytest.approx(read_e, rel=0.2)
+    assert np.sqrt((noise.read_noise_dn.value or 0.0) ** 2 - 1 / 12) / gain == pytest.approx(read_e, rel=0.2)
     for estimate in (noise.gain_dn, noise.read_noise_dn):
-        low, high = estimate.ci95
-        assert low <= estimate.value <= high
-        assert 0 < high - low < estimate.value
+        value, (low, high) = estimate.value or 0.0, estimate.ci95 or (0.0, 0.0)
+        assert low <= value <= high
+        assert 0 < high - low < value
     np.testing.assert_allclose(noise.variance_dn2, gain * noise.mean_dn + (gain * read_e) ** 2, rtol=0.25)
 
 
 def test_known_gain_leaves_the_read_noise() -> None:
     noise, read_e = _linear(2.0, gain_dn=2.0)
     assert noise.gain_dn.ci95 == pytest.approx((2.0, 2.0), rel=1e-12)
-    assert noise.read_noise_dn.value / 2.0 == pytest.approx(read_e, rel=0.1)
+    assert (noise.read_noise_dn.value or 0.0) / 2.0 == pytest.approx(read_e, rel=0.1)
 
 
 def _encoded(light: Array) -> NDArray[np.uint8]:
@@ -146,9 +146,10 @@ def test_variance_of_encoded_pictures_is_predicted(full_e: float, read_e: float,
     noise = estimate_view_noise(_blocks(frames, 65535, 0), least_variance_dn2=steps_dn2, flattest=share)
     light = np.concatenate([view.ravel() for view in truth.values()])
     error_dn = np.concatenate([(frames[node] - 65535 * view).ravel() for node, view in truth.items()])
+    gain_dn, read_dn = noise.gain_dn.value or 0.0, noise.read_noise_dn.value or 0.0
     for level in (0.03, 0.1, 0.3, 0.6, 0.8):
         variance_dn2 = np.mean(error_dn[np.abs(light / level - 1) < 0.1] ** 2)
-        predicted_dn2 = noise.gain_dn.value * level * 65535 + noise.read_noise_dn.value**2
+        predicted_dn2 = gain_dn * level * 65535 + read_dn**2
         assert predicted_dn2 == pytest.approx(variance_dn2, rel=0.25), level
 
 
