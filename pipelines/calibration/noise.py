@@ -12,7 +12,7 @@ from faintfield.calib.estimate import Estimate
 from faintfield.calib.noise import NoiseCalibration, Series, SeriesSums, calibrate
 from faintfield.pipelines.calibration.noise_emva import EmvaMeasurement, measure_emva
 from faintfield.pipelines.console import progress, working
-from faintfield.pipelines.errors import BadValue, UnreadableImage
+from faintfield.pipelines.errors import BadValue, UnreadableImage, WrongSize
 from faintfield.pipelines.formats.frames import Frame, at_phase, mosaic_period, read_ahead, read_frame
 from faintfield.pipelines.formats.sets.noise_set import FrameSeries, NoiseSet, Region
 
@@ -88,14 +88,15 @@ def calibrate_sensor(frames: FrameSeries) -> SensorCalibration:
 
 def _read_frames(frames: FrameSeries) -> Readout:
     """Read every frame once, a few ahead of their turn, and reduce it."""
-    readout = _layout(next(iter(frames.series.values()))[0], frames.settings)
     queue = [(conditions, path) for conditions, paths in frames.series.items() for path in paths]
     sums: list[SeriesSums] = []
-    read = read_ahead(queue, lambda entry: read_frame(entry[1], readout.size_px, of="the other frames"))
+    read = read_ahead(queue, lambda entry: read_frame(entry[1]))
     for index, ((conditions, path), frame) in enumerate(progress(read, "reading frames", len(queue))):
+        if index == 0:
+            readout = _layout(frame, path, frames.settings)
         if index == 0 or conditions != queue[index - 1][0]:
             sums = [SeriesSums(conditions, readout.saturation_dn) for _ in readout.phases]
-        pixels = _pixels_of(frame, path)[readout.rows, readout.columns]
+        pixels = _pixels_of(frame, path, readout.size_px)[readout.rows, readout.columns]
         for phase, phase_sums in zip(readout.phases, sums, strict=True):
             phase_sums.add(str(path), phase.of(pixels))
             if conditions.kind == "dark" and frame.black_dn is not None:
@@ -105,9 +106,9 @@ def _read_frames(frames: FrameSeries) -> Readout:
     return readout
 
 
-def _layout(first: Path, settings: NoiseSet) -> Readout:
-    frame = read_frame(first)
-    height, width = _pixels_of(frame, first).shape
+def _layout(frame: Frame, path: Path, settings: NoiseSet) -> Readout:
+    """Return how the frames are read out, without their statistics, by the first of them."""
+    height, width = _pixels_of(frame, path).shape
     mosaic = settings.mosaic or frame.mosaic
     period = mosaic_period(mosaic)
     rows, columns = _slices(settings.region, (height, width), period)
@@ -115,7 +116,7 @@ def _layout(first: Path, settings: NoiseSet) -> Readout:
     last_dn = float(np.iinfo(frame.pixels_dn.dtype).max)
     if settings.saturation_dn and settings.saturation_dn > last_dn:
         raise BadValue(
-            f"saturation_dn = {settings.saturation_dn:g}; the {frame.pixels_dn.dtype} values of {first} end at "
+            f"saturation_dn = {settings.saturation_dn:g}; the {frame.pixels_dn.dtype} values of {path} end at "
             f"{last_dn:g}; state the value from which the converter saturates, or leave it out"
         )
     saturation_dn = settings.saturation_dn or frame.saturation_dn or last_dn
@@ -135,12 +136,18 @@ def _slices(region: Region | None, shape: tuple[int, int], period: tuple[int, in
     return slice(*region.rows), slice(*region.columns)
 
 
-def _pixels_of(frame: Frame, path: Path) -> NDArray[np.integer]:
-    """Return the values of a frame, which are whole numbers, (row, column)."""
+def _pixels_of(frame: Frame, path: Path, size_px: tuple[int, int] | None = None) -> NDArray[np.integer]:
+    """Return the values of a frame (row, column), which are whole numbers, and as many as in the others."""
     if frame.pixels_dn.ndim != 2 or not np.issubdtype(frame.pixels_dn.dtype, np.integer):
         raise UnreadableImage(
             f"{path}: holds {frame.pixels_dn.dtype} of shape {frame.pixels_dn.shape}; the noise of a sensor shows "
             "only in whole digital numbers, one per pixel: give raw files or grey frames, not photographs"
+        )
+    height, width = frame.pixels_dn.shape
+    if size_px not in (None, (width, height)):
+        raise WrongSize(
+            f"{path}: is {width} x {height} px, the other frames {size_px[0]} x {size_px[1]} px; record it again with "
+            "the same region of interest and binning, or leave it out"
         )
     return frame.pixels_dn
 
