@@ -8,11 +8,11 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.estimate import Estimate, root
+from faintfield.calib.noise.maps.photo_response import running_mean
 from faintfield.calib.noise.series import Series
 from faintfield.calib.noise.strips import Array, Mask, map_of, mean_over, over_strips, total_of
 
@@ -188,10 +188,5 @@ def accumulated_histogram(image: NDArray[Any], used: Mask) -> AccumulatedHistogr
 
 def high_pass(image: NDArray[Any], used: Mask) -> NDArray[Any]:
     """Return an image less its mean over 5 × 5 pixels, so that uneven light does not count as a deviation."""
-    share = cv2.blur(used.astype(image.dtype), (_BOX_PX, _BOX_PX), borderType=cv2.BORDER_REPLICATE)
-    mean = cv2.blur(np.where(used, image, 0), (_BOX_PX, _BOX_PX), borderType=cv2.BORDER_REPLICATE)
-
-    def work(rows: slice) -> NDArray[Any]:
-        return np.where(used[rows], image[rows] - mean[rows] / np.maximum(share[rows], 1e-6), 0.0)
-
-    return map_of(work, image.shape, image.dtype)
+    mean = running_mean(image, used, _BOX_PX)
+    return map_of(lambda rows: np.where(used[rows], image[rows] - mean[rows], 0.0), image.shape, image.dtype)

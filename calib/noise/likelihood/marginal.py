@@ -33,8 +33,7 @@ MASS_PARAMETERS = ("log_gain", "log_read_e", "log_dark_e_per_s", "dcnu")
 PARAMETERS = (*MASS_PARAMETERS, "offset_dn", "log_dsnu_dn")
 
 # Gauss-Hermite nodes and weights for dark currents D(1 + δ z) that differ from pixel to pixel, z ~ N(0, 1).
-_Z, _WEIGHT = np.polynomial.hermite_e.hermegauss(5)
-DARK_NODES = _Z
+DARK_NODES, _WEIGHT = np.polynomial.hermite_e.hermegauss(5)
 DARK_LOG_WEIGHTS = np.log(_WEIGHT / _WEIGHT.sum())
 
 # Smallest probability: keeps one cosmic ray from deciding the fit, and the rounding of erf out of the logarithms.

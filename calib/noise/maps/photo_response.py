@@ -89,7 +89,7 @@ def measure_response(signal_dn: Map, noise_dn2: float, usable: Mask) -> Response
     raw = map_of(lambda rows: signal_dn[rows] / mean, usable.shape, signal_dn.dtype)
     dead = _dead(raw, usable)
     usable = map_of(lambda rows: usable[rows] & ~dead[rows], dead.shape, bool)
-    vignetting = _running_mean(raw, usable, _width(raw.shape))
+    vignetting = running_mean(raw, usable, _width(raw.shape))
     why_no_prnu = _why_colour(raw, usable) or _why_uneven(vignetting, usable)
     if not why_no_prnu:
         vignetting = _smooth(raw, usable)
@@ -150,7 +150,7 @@ def _why_uneven(vignetting: Map, usable: Mask) -> str:
 def _dead(raw: Map, usable: Mask) -> Mask:
     """Return the usable pixels that respond less than half as much as the lower quartile of their neighbourhood."""
     # No quartile is above 4/3 of the mean, so that few pixels need one
-    around_mean = _running_mean(raw, usable, _WINDOW_PX)
+    around_mean = running_mean(raw, usable, _WINDOW_PX)
 
     def dim(rows: slice) -> NDArray[np.intp]:
         row, column = np.nonzero(usable[rows] & (raw[rows] < _MIN_RESPONSE / (1 - _QUARTILE) * around_mean[rows]))
@@ -182,7 +182,7 @@ def _smooth(response: Map, usable: Mask) -> Map:
     """
     surface = _surface(response, usable)
     rest = map_of(lambda rows: response[rows] / surface(rows), response.shape, response.dtype)
-    smooth = _running_mean(rest, usable, _width(response.shape))
+    smooth = running_mean(rest, usable, _width(response.shape))
     return map_of(lambda rows: smooth[rows] * surface(rows), smooth.shape, smooth.dtype)
 
 
@@ -209,7 +209,8 @@ def _surface(response: Map, usable: Mask) -> Callable[[slice], Array]:
     return lambda rows: np.maximum(of_rows[rows] @ surface @ of_columns.T, _MIN_SURFACE)
 
 
-def _running_mean(response: Map, usable: Mask, window: int) -> Map:
+def running_mean(response: Map, usable: Mask, window: int) -> Map:
+    """Return the mean of the usable pixels over a window around each (row, column)."""
     mean = _box(np.where(usable, response, response.dtype.type(0)), window)
     share = _box(usable.astype(response.dtype), window)
     return map_of(lambda rows: mean[rows] / np.maximum(share[rows], 1e-6), mean.shape, mean.dtype)

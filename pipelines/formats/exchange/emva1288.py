@@ -22,8 +22,8 @@ from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.reading import is_file, read_text
 from faintfield.pipelines.formats.results.noise import NoiseFrame
 from faintfield.pipelines.formats.sets.noise_set import FILE_NAME as NOISE_SET_FILE
-from faintfield.pipelines.formats.sets.noise_set import NoiseSet, load_noise_set, write_noise_set
-from faintfield.pipelines.formats.toml_files import inside
+from faintfield.pipelines.formats.sets.noise_set import NoiseSet, load_noise_set
+from faintfield.pipelines.formats.toml_files import inside, write_toml
 from faintfield.pipelines.formats.units import MAX_EXPOSURE_S
 
 DESCRIPTOR = "descriptor.txt"
@@ -79,7 +79,7 @@ def import_data(descriptor: Path, out: Path, *, overwrite: bool = False) -> Impo
         (folder / "frames").mkdir()
         for source, name in progress(list(zip(sources, names, strict=True)), "copying frames"):
             shutil.copyfile(source, folder / name)
-        write_noise_set(folder, NoiseSet(1, frames, saturation_dn))
+        write_toml(folder / NOISE_SET_FILE, NoiseSet(1, frames, saturation_dn))
         inputs = {frame.file: sha256(source) for frame, source in zip(read.frames, sources, strict=True)}
         inputs |= {descriptor.name: sha256(descriptor)}
         write_json(folder / "provenance.json", provenance("import emva1288", {}, inputs))

@@ -15,7 +15,7 @@ from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.frames import RAW_SUFFIXES, exif_exposure_s
 from faintfield.pipelines.formats.reading import is_file
 from faintfield.pipelines.formats.results.noise import NoiseFrame, TemperatureRange
-from faintfield.pipelines.formats.toml_files import inside, read_toml, write_toml
+from faintfield.pipelines.formats.toml_files import inside, read_toml
 from faintfield.pipelines.formats.units import MAX_EXPOSURE_S, MAX_PERIOD_PX, sound_mosaic
 from faintfield.rig.session.resume import present_settings
 from faintfield.rig.session.session import PLAN, has_session, taken_frames
@@ -155,11 +155,6 @@ def _of_session(folder: Path) -> tuple[NoiseSet, list[float]]:
     if not frames:
         raise BadValue(f"{folder}: the session has no dark frame yet; capture its dark and flat steps first")
     return NoiseSet(1, frames, saturation_dn=rig.checks.saturation_dn, mosaic=rig.mosaic), scene_c
-
-
-def write_noise_set(folder: Path, settings: NoiseSet) -> None:
-    """Write `noise.toml`; the images come first, so that a folder with this file is whole."""
-    write_toml(folder / FILE_NAME, settings)
 
 
 def group_frames(source: Path, settings: NoiseSet) -> dict[Conditions, list[Path]]:

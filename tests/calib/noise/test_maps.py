@@ -11,7 +11,7 @@ from faintfield.calib.noise import Conditions, NoiseCalibration, Series, calibra
 from faintfield.calib.noise.likelihood.response import quantum_efficiency
 from faintfield.calib.noise.maps.defects import outlying_pixels
 from faintfield.calib.noise.maps.measure import LinePattern, line_pattern, pixel_levels
-from faintfield.calib.noise.maps.photo_response import Response, _kept_share, _running_mean, measure_response
+from faintfield.calib.noise.maps.photo_response import Response, _kept_share, measure_response, running_mean
 from faintfield.calib.noise.maps.read_noise import PixelReadNoise, kept_of, measure_read_noise
 from faintfield.calib.noise.maps.seams import find_seams, share_of_seam
 from tests.calib.noise import darkroom
@@ -279,7 +279,7 @@ def test_prnu_lost_in_the_running_mean_is_restored() -> None:
 def test_kept_share_is_that_of_a_matrix() -> None:
     usable = np.ones((17, 19), bool)
     units = np.eye(usable.size).reshape(-1, *usable.shape)
-    rest = np.array([unit - _running_mean(unit, usable, 15) for unit in units])
+    rest = np.array([unit - running_mean(unit, usable, 15) for unit in units])
     np.testing.assert_allclose(_kept_share(usable)(slice(None)), np.square(rest).sum(axis=0), rtol=1e-9)
 
 
