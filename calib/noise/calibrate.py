@@ -190,7 +190,7 @@ def calibrate(series: Sequence[Series], saturation_dn: float = np.inf) -> NoiseC
         response=_bent_response(fitted),
         goodness=(
             *series_goodness(fitted),
-            *(goodness_of(flat, why) for flat, why in saturation.left_out),
+            *(goodness_of(flat, left_out=why) for flat, why in saturation.left_out),
         ),
         warnings=(
             *warmth.warnings,

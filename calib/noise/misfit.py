@@ -41,29 +41,29 @@ class TransferPoint:
 
 def transfer_points(fitted: SeriesFit) -> tuple[TransferPoint, ...]:
     """Return the photon transfer and dark signal points."""
-    values, darks, flats = fitted.fit.values, fitted.moments.darks, fitted.moments.flats
-    dark_models = values["offset_dn"] + values.get("dark_signal_dn_per_s", 0.0) * darks.exposure_s
+    values, series, moments = fitted.fit.values, fitted.moments.series, fitted.moments
+    dark_models = values["offset_dn"] + values.get("dark_signal_dn_per_s", 0.0) * moments.darks.exposure_s
     rows = zip(
         (*fitted.darks, *fitted.flats),
-        (*darks.mean_dn, *flats.mean_dn),
-        (*darks.within_dn2, *flats.within_dn2),
-        (*dark_models, *flats.mean_dn),
+        series.mean_dn,
+        series.within_dn2,
+        (*dark_models, *moments.flats.mean_dn),
         (*fitted.dark_noise_dn2, *fitted.flat_noise_dn2),
         strict=True,
     )
     points = []
     for flat, mean, within, *model in rows:
-        degrees = max((flat.frames - 1) * fitted.moments.freedom, 1.0)
+        degrees = max((flat.frames - 1) * moments.freedom, 1.0)
         measured = within / degrees if flat.frames > 1 else np.nan
         numbers = map(float, (mean, measured, measured * np.sqrt(2 / degrees), *model))
         points.append(TransferPoint(flat.conditions.kind, flat.conditions.exposure_s, flat.frames, *numbers))
     return tuple(points)
 
 
-def goodness_of(series: Series, *numbers: Any) -> SeriesGoodness:
+def goodness_of(series: Series, **numbers: Any) -> SeriesGoodness:
     """Return a goodness of fit with the conditions of its series."""
     conditions = series.conditions
-    return SeriesGoodness(conditions.kind, conditions.exposure_s, conditions.level, series.frames, *numbers)
+    return SeriesGoodness(conditions.kind, conditions.exposure_s, conditions.level, series.frames, **numbers)
 
 
 def series_goodness(fitted: SeriesFit) -> tuple[SeriesGoodness, ...]:
@@ -76,19 +76,21 @@ def series_goodness(fitted: SeriesFit) -> tuple[SeriesGoodness, ...]:
     goodness = []
     for j, item in enumerate((*fitted.darks, *fitted.flats)):
         if item.frames < 2:
-            goodness.append(goodness_of(item, None, None, None, residuals[j]))
+            goodness.append(goodness_of(item, level_residual_dn=residuals[j]))
             continue
         excess = float(within[j] / ((item.frames - 1) * moments.freedom * noise[j])) - 1
         sums = moments.noise[j]
         expected = noise[j] if item.conditions.kind == "dark" else flat_variances_of_nodes(fit, sums)
-        scatter = [_deviance(*sums.scatter(groups, expected)) for groups in (sums.blocks, sums.rows, sums.columns)]
+        groups = {"blocks": sums.blocks, "rows": sums.rows, "columns": sums.columns}
+        scatter = {name: _deviance(*sums.scatter(of_groups, expected)) for name, of_groups in groups.items()}
         # The variance of a frame over its pixels is that of noise and fixed pattern.
         noise_dn2 = float(noise[j])
         pattern_dn2 = max(float(item.spreads_dn2.mean()) - noise_dn2, 0.0)
         chance = (2 * noise_dn2**2 + 4 * noise_dn2 * pattern_dn2) / float((~item.suspect).sum())
-        scatter.append(float(item.spreads_dn2.var() * item.frames / chance) / (item.frames - 1))
+        scatter["by_frame"] = float(item.spreads_dn2.var() * item.frames / chance) / (item.frames - 1)
         se = float(np.sqrt(2 / max(freedom[j], 1.0)))
-        goodness.append(goodness_of(item, None, excess, se, residuals[j], *scatter))
+        numbers = {"noise_excess": excess, "noise_se": se, "level_residual_dn": residuals[j]}
+        goodness.append(goodness_of(item, **numbers, **scatter))
     return tuple(goodness)
 
 

@@ -51,11 +51,6 @@ class Change(Struct, frozen=True, omit_defaults=True):
     plane: str = ""
     why: str | None = None
 
-    @property
-    def label(self) -> str:
-        """Name with that of the plane."""
-        return f"{self.plane}: {self.name}" if self.plane else self.name
-
 
 class PixelChange(Struct, frozen=True):
     """Numbers of pixels that only the first, only the second, or both measurements call unusable, of one kind."""
@@ -76,11 +71,6 @@ class MapChange(Struct, frozen=True, omit_defaults=True):
     verdict: Verdict
     plane: str = ""
     why: str | None = None
-
-    @property
-    def label(self) -> str:
-        """Name with that of the plane."""
-        return f"{self.plane}: {self.name} map" if self.plane else f"{self.name} map"
 
 
 class NoiseComparison(Struct, frozen=True):
@@ -128,9 +118,15 @@ def compare_noise(first: Path, second: Path) -> NoiseComparison:
         quantities=[row for row in judged if isinstance(row, Change)],
         pixels=[_pixel_change(kind, *records) for kind in _KINDS],
         maps=[row for row in judged if isinstance(row, MapChange)],
-        changed=[row.label for row in judged if row.verdict == "changed"],
+        changed=[label(row) for row in judged if row.verdict == "changed"],
         notes=list(_notes(*records)),
     )
+
+
+def label(row: Change | MapChange) -> str:
+    """Return the name of a quantity or map with that of its plane."""
+    name = f"{row.name} map" if isinstance(row, MapChange) else row.name
+    return f"{row.plane}: {name}" if row.plane else name
 
 
 def _check_alike(paths: Sequence[Path], first: NoiseRecord, second: NoiseRecord) -> None:

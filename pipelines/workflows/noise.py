@@ -5,7 +5,7 @@ from pathlib import Path
 from faintfield.calib.estimate import Estimate
 from faintfield.calib.noise.strips import maps_by
 from faintfield.pipelines.calibration.noise import calibrate_sensor
-from faintfield.pipelines.calibration.noise_comparison import CHANCE, NoiseComparison, compare_noise
+from faintfield.pipelines.calibration.noise_comparison import CHANCE, NoiseComparison, compare_noise, label
 from faintfield.pipelines.calibration.noise_record import noise_maps, noise_record
 from faintfield.pipelines.console import inform, working
 from faintfield.pipelines.errors import MissingFile
@@ -54,15 +54,15 @@ def _inform_of(record: NoiseRecord) -> None:
     """Print the main numbers and every warning; a reason that holds for several numbers is given once."""
     inform(f"{STANDARD}; likelihood: {record.likelihood}")
     explained: dict[str, str] = {}
-    for name, label, unit in _SHOWN:
+    for name, title, unit in _SHOWN:
         measured: Estimate = getattr(record, name)
         if measured.value is None or measured.ci95 is None:
             reason = measured.why or ""
-            inform(f"  {label}: not identifiable: {'as for ' + explained[reason] if reason in explained else reason}")
-            explained.setdefault(reason, label.partition(",")[0])
+            inform(f"  {title}: not identifiable: {'as for ' + explained[reason] if reason in explained else reason}")
+            explained.setdefault(reason, title.partition(",")[0])
         else:
             low, high = measured.ci95
-            inform(f"  {label}: {measured.value:.5g} {unit} (95 %: {low:.5g} to {high:.5g})")
+            inform(f"  {title}: {measured.value:.5g} {unit} (95 %: {low:.5g} to {high:.5g})")
     if record.fit:
         _inform_of_fit(record.fit)
     counts = {kind: len(getattr(record, f"{kind}_pixels")) for kind in ("hot", "noisy", "dead")}
@@ -89,7 +89,7 @@ def compare_sensors(first: Path, second: Path) -> NoiseComparison:
     inform(f"A: {comparison.first}")
     inform(f"B: {comparison.second}")
     quantities = comparison.quantities
-    wide = max(len(change.label) for change in quantities)
+    wide = max(len(label(change)) for change in quantities)
     inform(f"{'':{wide}}  {'A':>12} {'B':>12} {'B - A':>12} {'in sigma':>9}  verdict")
     for change in quantities:
         numbers = " ".join(
@@ -97,7 +97,7 @@ def compare_sensors(first: Path, second: Path) -> NoiseComparison:
         )
         sigma = "-" if change.sigma is None else f"{change.sigma:+.1f}"
         inform(
-            f"{change.label:{wide}}  {numbers} {sigma:>9}  {change.verdict}{f': {change.why}' if change.why else ''}"
+            f"{label(change):{wide}}  {numbers} {sigma:>9}  {change.verdict}{f': {change.why}' if change.why else ''}"
         )
     for count in comparison.pixels:
         inform(
@@ -105,10 +105,10 @@ def compare_sensors(first: Path, second: Path) -> NoiseComparison:
         )
     for difference in comparison.maps:
         if difference.rms_dn is None or difference.expected_dn is None:
-            inform(f"{difference.label}: {difference.verdict}: {difference.why}")
+            inform(f"{label(difference)}: {difference.verdict}: {difference.why}")
         else:
             differs = f"differs by {difference.rms_dn:.4g} DN rms, expected {difference.expected_dn:.4g} DN"
-            inform(f"{difference.label}: {differs}: {difference.verdict}")
+            inform(f"{label(difference)}: {differs}: {difference.verdict}")
     for note in comparison.notes:
         inform(f"note: {note}")
     changed = ", ".join(comparison.changed) or "nothing"
