@@ -82,8 +82,11 @@ class FrameSeries:
     @property
     def temperature_c(self) -> dict[str, float]:
         """Temperature of each frame by its path, where it is stated."""
-        frames = self.settings.frame
-        return {str(self.folder / it.file): it.temperature_c for it in frames if it.temperature_c is not None}
+        return {
+            str(self.folder / frame.file): frame.temperature_c
+            for frame in self.settings.frame
+            if frame.temperature_c is not None
+        }
 
     @property
     def temperature_range(self) -> TemperatureRange | None:
@@ -240,8 +243,8 @@ def _temperature_warnings(settings: NoiseSet) -> list[str]:
             "10 % per kelvin, so that the result holds only at the temperature of these frames"
         )
     if known and np.ptp(known) > _STEADY_K:
-        effect, doubling_k = f"{10 * np.ptp(known):.0f} %; let the camera settle", settings.dark_current_doubling_k
-        effect = f", which moves the dark current by {effect} before recording"
+        percent, doubling_k = f"{10 * np.ptp(known):.0f} %", settings.dark_current_doubling_k
+        effect = f", which moves the dark current by {percent}; let the camera settle before recording"
         if doubling_k is not None:
             effect = f"; dark current is taken to double every {doubling_k:g} K, and is that at {np.mean(known):.1f} °C"
         warnings.append(f"the temperature ran from {min(known):g} to {max(known):g} °C{effect}")
