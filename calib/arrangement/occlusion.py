@@ -27,6 +27,10 @@ _WINDOW_PX, _ALONG_PX = 9, 5
 # Errors count no more than this, in standard deviations of the pictures: beyond it, one is as wrong as another.
 _LARGEST_ERROR = 1.5
 
+# The best disparity is clear if its error is below this share of the mean over all disparities: elsewhere no texture
+# tells them apart, and an edge would lie anywhere.
+_CLEAR_SHARE = 0.8
+
 # Share by which two surfaces must explain an edge better than one.
 _LEAST_GAIN = 0.05
 
@@ -58,10 +62,11 @@ def far_side_z(
                 ]
         if not errors:
             continue
-        best = _best_disparities(list(errors.values()))
+        best, clear = _best_disparities(list(errors.values()))
         for axis, sides in errors.items():
             before, after = (side if axis == 0 else side.transpose(0, 2, 1) for side in sides)
-            edges = _edges(before, after, best if axis == 0 else best.T, scales[axis] * shifts_px)
+            maps = (best, clear) if axis == 0 else (best.T, clear.T)
+            edges = _edges(before, after, *maps, scales[axis] * shifts_px)
             for row, column, value, gain in edges:
                 tiles.setdefault((axis, int(row) // _TILE_PX, int(column) // _TILE_PX), []).append((value, gain))
     full = [np.array(edges) for edges in tiles.values() if len(edges) >= _MIN_EDGES]
@@ -76,18 +81,24 @@ def _errors(view: Picture, other: Picture, shifts_px: Floats, axis: int) -> Erro
     return np.stack([np.minimum(np.abs(view - displace(other, shift, axis)), _LARGEST_ERROR) for shift in shifts_px])
 
 
-def _best_disparities(pairs: Sequence[list[Errors]]) -> NDArray[np.intp]:
-    """Return the index (row, column) of each pixel's best disparity, by the better of the views on either side."""
-    total = sum(np.minimum(*(_blur(errors, _WINDOW_PX, _WINDOW_PX) for errors in pair)) for pair in pairs)
-    index = np.argmin(np.asarray(total), axis=0)
-    return np.asarray(cv2.medianBlur(index.astype(np.float32), 5), np.intp)
+def _best_disparities(pairs: Sequence[list[Errors]]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Return the index of each pixel's best disparity, by the better of the views on either side, and if it is clear.
+
+    Both are (row, column). Where there is no texture, all disparities are alike, and the first one would be the best.
+    """
+    total = np.array(sum(np.minimum(*(_blur(errors, _WINDOW_PX, _WINDOW_PX) for errors in pair)) for pair in pairs))
+    index = np.argmin(total, axis=0)
+    clear = total.min(axis=0) < _CLEAR_SHARE * total.mean(axis=0)
+    return np.asarray(cv2.medianBlur(index.astype(np.float32), 5), np.intp), clear
 
 
 def _blur(errors: Errors, width: int, height: int) -> Errors:
     return np.stack([cv2.blur(layer, (width, height)) for layer in np.ascontiguousarray(errors)])
 
 
-def _edges(before: Errors, after: Errors, index: NDArray[np.intp], shifts_px: Floats) -> Array:
+def _edges(
+    before: Errors, after: Errors, index: NDArray[np.intp], clear: NDArray[np.bool_], shifts_px: Floats
+) -> Array:
     """Return row, column, value and weight (edge, 4) of the edges along the rows of a picture.
 
     The value is by how much more is hidden on the side of larger disparity. The weight is how clearly there is an edge:
@@ -102,6 +113,7 @@ def _edges(before: Errors, after: Errors, index: NDArray[np.intp], shifts_px: Fl
     change[:, reach:-reach] = np.abs(moved_px[:, 2 * reach :] - moved_px[:, : -2 * reach])
     steep = (change >= cv2.dilate(change, np.ones((1, 2 * reach + 1))) - 1e-9) & (change >= _MIN_BAND_PX)
     steep[:, : 3 * reach] = steep[:, -3 * reach :] = False
+    steep &= cv2.erode(clear.astype(np.uint8), np.ones((1, 2 * reach + 1))) > 0
     steep[np.arange(height) % _LINE_PX > 0] = False
     rows, columns = np.nonzero(steep)
     left, right = index[rows, columns - reach], index[rows, columns + reach]

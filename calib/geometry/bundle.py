@@ -134,7 +134,7 @@ def solve(problem: BundleProblem) -> Bundle:
     for stage in stages:
         inputs |= {
             "do_optimize_intrinsics_core": True,
-            "do_optimize_intrinsics_distortions": problem.lens_model != "pinhole",
+            "do_optimize_intrinsics_distortions": True,
             "do_optimize_calobject_warp": False,
             "do_apply_outlier_rejection": False,
             **stage,

@@ -66,6 +66,13 @@ def test_edge_of_brightness_is_no_edge_of_depth() -> None:
     assert abs(inspect(light_field((Layer(0.0),), grid=(4, 4), aligned_px=1.0)).side_z) < 4
 
 
+@pytest.mark.parametrize("aligned_px", [0.0, ALIGNED_PX, ALL_WITH_IT_PX])
+def test_ground_without_texture_says_nothing(aligned_px: float) -> None:
+    result = inspect(light_field(CARDS[1:], grid=(5, 5), aligned_px=aligned_px))
+    assert abs(result.side_z) < 4
+    assert result.orientation == Orientation()
+
+
 def test_pitch_ratio_is_measured() -> None:
     ratio, order = 0.6, Orientation(transpose=True)
     result = inspect(_misnamed(light_field(grid=(4, 4), ratio=ratio), order))

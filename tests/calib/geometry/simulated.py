@@ -11,6 +11,7 @@ from faintfield.calib.geometry import BoardObservation, GeometrySettings, RigGeo
 from faintfield.rig.plan import centre_node, grid_nodes, nominal_poses_rt_cam_ref
 from faintfield.rig.simulation.boards import SimulatedBoard, six_boards
 from faintfield.rig.simulation.experiment import paper_experiment
+from faintfield.rig.simulation.optics import SimulatedOptics
 
 NOISE_PX = 0.2
 LENIENT = GeometrySettings(max_transfer_sigma_px=20.0, max_holdout_ratio=10.0)
@@ -38,6 +39,7 @@ def simulated(
     standing: list[SimulatedBoard] | None = None,
     miss_mm: float = 0.0,
     noise_px: float = NOISE_PX,
+    optics: SimulatedOptics = OPTICS,
 ) -> Simulated:
     """Return corners of boards; with `miss_mm` boards are shown in turn and the stage misses each node by that."""
     generator = np.random.default_rng(seed)
@@ -50,7 +52,7 @@ def simulated(
         for node, pose in zip(grid_nodes(side, side), poses, strict=True):
             there = pose + np.append(np.zeros(3), generator.normal(size=3) * miss_mm)
             target = Target(BOARD_NAMES[index], index if miss_mm else 0)
-            observations.append(observe(board, there, node, target, generator, noise_px))
+            observations.append(observe(board, there, node, target, generator, noise_px, optics))
     return Simulated(observations, poses, side)
 
 
@@ -61,9 +63,10 @@ def observe(
     target: Target,
     generator: np.random.Generator,
     noise_px: float,
+    optics: SimulatedOptics = OPTICS,
 ) -> BoardObservation:
     """Return the corners that a camera sees, with noise."""
-    pixels = board.seen(OPTICS, pose)
+    pixels = board.seen(optics, pose)
     ids = np.flatnonzero(np.isfinite(pixels[:, 0]))
     noisy = pixels[ids] + generator.normal(size=(len(ids), 2)) * noise_px
     return BoardObservation(node, target, ids, noisy, np.full(len(ids), NOISE_PX))

@@ -186,6 +186,12 @@ def test_lens_model_with_eight_coefficients() -> None:
     assert geometry.lens.fx_px == pytest.approx(OPTICS.fx_px, abs=2.0)
 
 
+def test_lens_without_distortion() -> None:
+    geometry = calibrated(simulated(13, optics=OPTICS.ideal()), replace(LENIENT, lens_model="pinhole"))
+    assert not geometry.lens.distortion
+    assert geometry.lens.fx_px == pytest.approx(OPTICS.fx_px, abs=2.0)
+
+
 def changed(truth: Simulated, board: str, change: Callable[[BoardObservation], BoardObservation]) -> Simulated:
     """Return the observations with a change of those of one board."""
     views = [change(view) if view.target.board == board else view for view in truth.observations]
