@@ -37,7 +37,7 @@ def measure_sensor(folder: Path, out: Path | None = None) -> NoiseRecord:
         sensor = calibrate_sensor(frames)
         with working("drawing the pages"):
             pages = {
-                f"noise_page{phase.name and f'_{phase.name}'}.png": draw_page(
+                f"noise_page{f'_{phase.name}' if phase.name else ''}.png": draw_page(
                     phase.calibration, f"{title} {phase.name}"
                 )
                 for phase in sensor.phases

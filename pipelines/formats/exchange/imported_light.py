@@ -101,9 +101,9 @@ def _decoded(item_bytes: int, white: float | None) -> NDArray[np.float64]:
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4) * WHITE_DN
 
 
-def light_unit(stated: GridOptions, tone: Tone) -> LightUnit:
+def light_unit(options: GridOptions, tone: Tone) -> LightUnit:
     """Return the unit of light: electrons only if the gain is stated."""
-    if stated.gain_dn_per_e is not None:
+    if options.gain_dn_per_e is not None:
         return "electrons"
     return "relative" if tone == "srgb" else "dn"
 
@@ -151,35 +151,37 @@ class NoiseOrigin(msgspec.Struct, frozen=True, omit_defaults=True):
     blocks: int = 0
 
 
-def complete_noise(stated: GridOptions, pictures: Pictures) -> tuple[Noise, NoiseOrigin]:
+def complete_noise(options: GridOptions, pictures: Pictures) -> tuple[Noise, NoiseOrigin]:
     """Return the noise of a set whose pictures are written, and where it comes from; say what nobody stated."""
-    if stated.offset_dn is None and pictures.first.black_dn is None:
-        stated = replace(stated, offset_dn=0.0)
+    if options.offset_dn is None and pictures.first.black_dn is None:
+        options = replace(options, offset_dn=0.0)
 
     def noise(gain_dn_per_e: float, read_noise_e: float, *, estimated: bool) -> Noise:
-        rest = stated.offset_dn, stated.dark_current_e_per_s, stated.quantum_efficiency, pictures.saturation_dn
+        rest = options.offset_dn, options.dark_current_e_per_s, options.quantum_efficiency, pictures.saturation_dn
         return Noise(gain_dn_per_e, read_noise_e, *rest, estimated)
 
-    if stated.gain_dn_per_e is not None and stated.read_noise_e is not None:
-        return noise(stated.gain_dn_per_e, stated.read_noise_e, estimated=False), NoiseOrigin("stated")
-    words = "gain and noise are not stated"
+    if options.gain_dn_per_e is not None and options.read_noise_e is not None:
+        return noise(options.gain_dn_per_e, options.read_noise_e, estimated=False), NoiseOrigin("stated")
+    unknown = "gain and noise are not stated"
     try:
-        estimate = _estimate_noise(stated, pictures)
+        estimate = _estimate_noise(options, pictures)
     except NotIdentifiable as failure:
-        gain, read_e = _assumed(stated, pictures.tone)
+        gain, read_e = _assumed(options, pictures.tone)
         inform(
-            f"{words} and cannot be estimated ({failure}); it is assumed that "
+            f"{unknown} and cannot be estimated ({failure}); it is assumed that "
             f"{_describe_variance(gain, gain * read_e, pictures.tone)}; correct [noise] in elemental.toml if you know "
             "them"
         )
         return noise(gain, read_e, estimated=True), NoiseOrigin("assumed", str(failure))
-    gain, read_dn = estimate.gain_dn.value or 0.0, estimate.read_noise_dn.value or 0.0
-    variance = _describe_variance(gain, read_dn, pictures.tone)
-    inform(f"{words}; estimated from the differences of neighbouring views, {variance}")
-    read_e = float(np.sqrt(max(read_dn**2 - _ROUNDING_DN2, 0.0)) / gain)
-    if stated.read_noise_e is not None:
-        read_e = stated.read_noise_e
-    return noise(gain, read_e, estimated=True), NoiseOrigin(
+    gain_dn, read_dn = estimate.gain_dn.value, estimate.read_noise_dn.value
+    assert gain_dn is not None, "a gain that cannot be estimated is refused"
+    assert read_dn is not None, "so is a read noise"
+    variance = _describe_variance(gain_dn, read_dn, pictures.tone)
+    inform(f"{unknown}; estimated from the differences of neighbouring views, {variance}")
+    read_e = float(np.sqrt(max(read_dn**2 - _ROUNDING_DN2, 0.0)) / gain_dn)
+    if options.read_noise_e is not None:
+        read_e = options.read_noise_e
+    return noise(gain_dn, read_e, estimated=True), NoiseOrigin(
         "estimated",
         gain_dn=estimate.gain_dn,
         read_noise_dn=estimate.read_noise_dn,
@@ -189,16 +191,16 @@ def complete_noise(stated: GridOptions, pictures: Pictures) -> tuple[Noise, Nois
     )
 
 
-def _assumed(stated: GridOptions, tone: Tone) -> tuple[float, float]:
+def _assumed(options: GridOptions, tone: Tone) -> tuple[float, float]:
     """Return gain and read noise in electrons where nothing tells them: of 8-bit pictures with a curve the rounding."""
     if tone == "srgb":
         dark, bright = rounding_variance_dn2(np.array([0.0, WHITE_DN]), tone, 8)
-        gain = stated.gain_dn_per_e or float(bright - dark) / WHITE_DN
-        return gain, float(np.sqrt(dark)) / gain if stated.read_noise_e is None else stated.read_noise_e
-    return stated.gain_dn_per_e or 1.0, stated.read_noise_e or 0.0
+        gain = options.gain_dn_per_e or float(bright - dark) / WHITE_DN
+        return gain, float(np.sqrt(dark)) / gain if options.read_noise_e is None else options.read_noise_e
+    return options.gain_dn_per_e or 1.0, options.read_noise_e or 0.0
 
 
-def _estimate_noise(stated: GridOptions, pictures: Pictures) -> "ViewNoise":
+def _estimate_noise(options: GridOptions, pictures: Pictures) -> "ViewNoise":
     from faintfield.calib.noise.views import compared_blocks, estimate_view_noise  # loads much that is used here only
 
     first, saturation_dn = pictures.first, pictures.saturation_dn
@@ -207,7 +209,7 @@ def _estimate_noise(stated: GridOptions, pictures: Pictures) -> "ViewNoise":
     blocks = []
     for three in progress(neighbours, "comparing views", len(neighbours)):
         frames = [read_frame(pictures.folder / pictures.views[index].image) for index in three]
-        offset_dn = _offset_dn(frames[0], stated)
+        offset_dn = _offset_dn(frames[0], options)
         before, middle, after = (_colours(frame) - offset_dn for frame in frames)
         limits = {"saturation_dn": saturation_dn - float(np.max(offset_dn)), "floor_dn": -float(np.min(offset_dn))}
         blocks.append(compared_blocks((before, middle, after), **limits, generator=generator))
@@ -217,7 +219,7 @@ def _estimate_noise(stated: GridOptions, pictures: Pictures) -> "ViewNoise":
             mean_dn, pictures.tone, 8 * first.pixels_dn.itemsize, first.saturation_dn
         ),
         flattest=_ALL if pictures.lossy else _FLATTEST,
-        gain_dn=stated.gain_dn_per_e,
+        gain_dn=options.gain_dn_per_e,
     )
 
 
@@ -228,13 +230,13 @@ def _neighbours(views: Sequence[View]) -> list[tuple[int, int, int]]:
     poses = np.array([view.rt_cam_ref for view in views])
     centres = np.array([-rotation_matrix(pose).T @ pose[3:] for pose in poses])
     spread = np.unique(np.linspace(0, len(views) - 1, min(_COMPARED, len(views))).astype(int))
-    found = []
+    neighbours = []
     for index in spread.tolist():
         distance = np.linalg.norm(centres - centres[index], axis=1)
         distance[index] = np.inf
-        one, other = np.argsort(distance, kind="stable")[:2].tolist()
-        found.append((one, index, other))
-    return found
+        nearest, second = np.argsort(distance, kind="stable")[:2].tolist()
+        neighbours.append((nearest, index, second))
+    return neighbours
 
 
 def _colours(frame: Frame) -> NDArray[np.float32]:
@@ -250,10 +252,10 @@ def _colours(frame: Frame) -> NDArray[np.float32]:
     return np.asarray(part.reshape(*part.shape[:2], -1), np.float32)
 
 
-def _offset_dn(frame: Frame, stated: GridOptions) -> NDArray[np.float32]:
+def _offset_dn(frame: Frame, options: GridOptions) -> NDArray[np.float32]:
     """Return the offset of each colour: as stated, else the file's own black level, else 0."""
     own: Any = 0.0 if frame.black_dn is None else frame.black_dn if frame.mosaic is not None else frame.black_dn.mean()
-    return np.asarray(own if stated.offset_dn is None else stated.offset_dn, np.float32).ravel()
+    return np.asarray(own if options.offset_dn is None else options.offset_dn, np.float32).ravel()
 
 
 def _describe_variance(gain_dn: float, read_noise_dn: float, tone: Tone) -> str:
