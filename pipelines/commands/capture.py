@@ -11,9 +11,9 @@ from faintfield.pipelines.errors import OutputExists
 from faintfield.pipelines.planning.options import PlanOptions
 
 if TYPE_CHECKING:
+    from faintfield.pipelines.formats.board_pdf import BoardSheets
     from faintfield.pipelines.planning.prediction import PredictionRecord
     from faintfield.pipelines.workflows.capture import Captured, RigCheck
-    from faintfield.pipelines.workflows.preparation import BoardSheets
     from faintfield.pipelines.workflows.verify import Verified
 
 _PLAN = PlanOptions()
@@ -110,7 +110,7 @@ def board(
     dictionary
         OpenCV's dictionary of the markers.
     """
-    from faintfield.pipelines.workflows.preparation import write_boards
+    from faintfield.pipelines.formats.board_pdf import write_boards
 
     return write_boards(out, paper, boards, columns, rows, square_mm, dictionary)
 
