@@ -3,6 +3,9 @@
 Every message states what is wrong, the value found, its limit, and what to do.
 """
 
+from importlib import import_module
+from typing import Any
+
 from faintfield.calib.errors import CalibrationError
 from faintfield.recon.errors import ReconstructionError
 from faintfield.rig.errors import RigError
@@ -78,6 +81,20 @@ class OutputBusy(InputError):
 
 class MissingPackage(InputError):
     """A command needs a package that is an extra, and not installed."""
+
+
+def import_optional(name: str, extra: str, alternative: str = "") -> Any:
+    """Return a module of a package that an extra of faintfield installs.
+
+    Raises MissingPackage without the package; `alternative` is what else helps.
+    """
+    try:
+        return import_module(name)
+    except ImportError as failure:
+        package, otherwise = name.partition(".")[0], f", or {alternative}" if alternative else ""
+        raise MissingPackage(
+            f"{package} is not installed; it is an extra: pip install 'faintfield[{extra}]'{otherwise}"
+        ) from failure
 
 
 class ClusterFailed(InputError):

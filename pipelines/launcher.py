@@ -12,11 +12,13 @@ from json import dumps
 from pathlib import Path
 from typing import Annotated, Literal
 
+import msgspec
 from cyclopts import App, CycloptsError, CycloptsPanel, Group, Parameter
 
 import faintfield
 from faintfield.pipelines.console import framed_console, inform, visible
 from faintfield.pipelines.errors import NAMED_FAILURES, FileFailed, MemoryShort, WrongUsage
+from faintfield.pipelines.formats.units import json_of
 from faintfield.pipelines.log_file import logged
 
 DONE, FAILED, WRONG_USAGE = 0, 1, 2
@@ -181,10 +183,6 @@ def _launch(
 
 
 def _json(result: object) -> bytes:
-    import msgspec
-
-    from faintfield.pipelines.formats.units import json_of
-
     try:
         return json_of(result)
     except UnicodeEncodeError:  # the name of a file is not UTF-8

@@ -9,7 +9,7 @@ import numpy as np
 from msgspec import UNSET
 from numpy.typing import NDArray
 
-from faintfield.pipelines.errors import MissingPackage
+from faintfield.pipelines.errors import import_optional
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import white_level
 from faintfield.pipelines.formats.results.records import PlaneRecord, ReconstructionRecord
@@ -43,12 +43,7 @@ def show_planes(directory: Path) -> list[str]:
     Raises MissingFile or BadValue without a result that can be read, and MissingPackage without napari.
     """
     by_method = [_layers(directory, folder, result) for folder, result in planes_below(directory).items()]
-    try:
-        import napari
-    except ImportError as failure:
-        raise MissingPackage(
-            "napari is not installed; it is an extra: pip install 'faintfield[view]', or pip install 'napari[pyqt6]'"
-        ) from failure
+    napari = import_optional("napari", "view", "pip install 'napari[pyqt6]'")
     # The least noisy method sets the scale, as in the report, so that noise may be clipped and planes are not
     white = min(max(white_level(layer.data) for layer in layers) for layers in by_method)
     viewer = napari.Viewer(title=f"faintfield: {directory.resolve().name}")

@@ -19,6 +19,7 @@ from faintfield.calib.homography import fronto_parallel_rt_ref_plane, plane_from
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.arguments import PriorName, SolverOptions
 from faintfield.pipelines.console import progress
+from faintfield.pipelines.errors import import_optional
 from faintfield.pipelines.formats.results.records import Method
 from faintfield.pipelines.reconstruction.planes.solve import solve
 from faintfield.recon.likelihood.images import ElementalImages, Image
@@ -72,9 +73,8 @@ def _tv_denoised(operator: PlaneOperator, images: ElementalImages, weight: float
 
 def _bm3d_denoised(operator: PlaneOperator, images: ElementalImages, weight: float) -> Image:
     """Return the back-projection, denoised by BM3D with a standard deviation of `weight` electrons."""
-    import bm3d  # an extra
-
-    return np.asarray(bm3d.bm3d(back_projection(operator, images), sigma_psd=weight), np.float32)
+    denoise = import_optional("bm3d", "bm3d").bm3d
+    return np.asarray(denoise(back_projection(operator, images), sigma_psd=weight), np.float32)
 
 
 # The method that stands for the paper's, and the same with the best weight, which only the truth can tell.

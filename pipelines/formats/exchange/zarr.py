@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.pipelines.console import progress
-from faintfield.pipelines.errors import BadValue, InputError, MissingPackage
+from faintfield.pipelines.errors import BadValue, InputError, import_optional
 from faintfield.pipelines.formats.files import writing_folder
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.reading import read_json
@@ -66,12 +66,12 @@ def export_planes(directory: Path, out: Path, *, overwrite: bool = False) -> Zar
     MissingPackage
         zarr or ome-zarr-models is not installed.
     """
-    zarr = _require_zarr()
+    zarr, models = import_optional("zarr", "zarr"), import_optional("ome_zarr_models.v05", "zarr")
     stack = _stack_in(directory)
     held = _HELD if overwrite and _is_export(out) else ()
     with writing_folder(out, replace_only=held, reads=[stack.folder]) as building:
         group = zarr.open_group(building, mode="w", zarr_format=3)
-        _write_metadata(group, stack, directory.resolve().name)
+        _write_metadata(models, group, stack, directory.resolve().name)
         for index, record in enumerate(progress(stack.planes, "writing planes")):
             plane = np.atleast_3d(np.asarray(read_frame(stack.folder / Path(record.file).name).pixels_dn, np.float32))
             for level in range(stack.levels):
@@ -102,17 +102,6 @@ def _stack_in(directory: Path) -> _Stack:
     return _Stack(folder, planes, (colours, len(planes), *shapes[0]), scale, units)
 
 
-def _require_zarr() -> Any:
-    try:
-        import ome_zarr_models  # noqa: F401
-        import zarr
-    except ImportError as failure:
-        raise MissingPackage(
-            "zarr or ome-zarr-models is not installed; they are an extra: pip install 'faintfield[zarr]'"
-        ) from failure
-    return zarr
-
-
 def _is_export(folder: Path) -> bool:
     """Return whether a folder is an earlier export: every Zarr group has a zarr.json, ours says who wrote it."""
     try:
@@ -123,22 +112,20 @@ def _is_export(folder: Path) -> bool:
     return isinstance(attributes, dict) and "faintfield" in attributes
 
 
-def _write_metadata(group: Any, stack: _Stack, name: str) -> None:
+def _write_metadata(models: Any, group: Any, stack: _Stack, name: str) -> None:
     """Make the arrays of all resolutions, and describe their axes."""
-    from ome_zarr_models.v05.axes import Axis
-    from ome_zarr_models.v05.image import ImageAttrs
-    from ome_zarr_models.v05.multiscales import Multiscale
-
+    axis = models.axes.Axis
     unit = "millimeter" if stack.scale.unit == "mm" else None
     axes = (
-        Axis(name="c", type="channel"),
-        Axis(name="z", type="space", unit="millimeter" if stack.units.depth == "mm" else None),
-        Axis(name="y", type="space", unit=unit),
-        Axis(name="x", type="space", unit=unit),
+        axis(name="c", type="channel"),
+        axis(name="z", type="space", unit="millimeter" if stack.units.depth == "mm" else None),
+        axis(name="y", type="space", unit=unit),
+        axis(name="x", type="space", unit=unit),
     )
-    datasets = tuple(_dataset(group, stack, level) for level in range(stack.levels))
-    multiscale = Multiscale(axes=axes, datasets=datasets, name=name)
-    group.attrs["ome"] = ImageAttrs(version="0.5", multiscales=[multiscale]).model_dump(mode="json", exclude_none=True)
+    datasets = tuple(_dataset(models, group, stack, level) for level in range(stack.levels))
+    multiscale = models.multiscales.Multiscale(axes=axes, datasets=datasets, name=name)
+    attributes = models.image.ImageAttrs(version="0.5", multiscales=[multiscale])
+    group.attrs["ome"] = attributes.model_dump(mode="json", exclude_none=True)
     group.attrs["faintfield"] = {
         "value": stack.units.light_in_words,
         "row_and_column": stack.scale.unit or "relative",
@@ -147,17 +134,15 @@ def _write_metadata(group: Any, stack: _Stack, name: str) -> None:
     }
 
 
-def _dataset(group: Any, stack: _Stack, level: int) -> Any:
+def _dataset(models: Any, group: Any, stack: _Stack, level: int) -> Any:
     """Make the array of one resolution, and return its entry: where its samples lie."""
-    from ome_zarr_models.v05.multiscales import Dataset
-
     scale, shape, step = stack.scale, stack.shape, 2**level
     size = (*shape[:2], shape[2] // step, shape[3] // step)
     chunks = (1, 1, min(_CHUNK_PX, size[2]), min(_CHUNK_PX, size[3]))
     group.create_array(str(level), shape=size, chunks=chunks, dtype="float32", dimension_names=list("czyx"))
     x, y = scale.origin
     across, shift = scale.across * step, scale.across * (step - 1) / 2  # to the middle of the samples merged into one
-    return Dataset.build(
+    return models.multiscales.Dataset.build(
         path=str(level),
         scale=(1.0, scale.step_mm or 1.0, across, across),
         translation=(0.0, stack.planes[0].depth_mm, y + shift, x + shift),

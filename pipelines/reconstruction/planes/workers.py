@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from faintfield.calib.noise_model import NoiseModel
-from faintfield.pipelines.errors import ClusterFailed, MissingPackage, WrongUsage
+from faintfield.pipelines.errors import ClusterFailed, WrongUsage, import_optional
 from faintfield.pipelines.formats.files import UNFINISHED, translated_write_errors
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.large_arrays import mapped
@@ -203,15 +203,7 @@ def _result_of[Job, Result](work: Callable[[Job], Result], job: Job) -> Result:
 
 
 def _distributed() -> Any:
-    """Return dask.distributed, an optional package that only this module needs."""
-    try:
-        import distributed
-    except ImportError as failure:
-        raise MissingPackage(
-            "dask.distributed is not installed; it is an extra: pip install 'faintfield[cluster]', or leave out "
-            "--scheduler"
-        ) from failure
-    return distributed
+    return import_optional("distributed", "cluster", "leave out --scheduler")
 
 
 @contextmanager
