@@ -4,12 +4,10 @@ import sys
 from collections.abc import Sequence
 
 import faintfield
-from faintfield.recon.names import on_compiling
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command and exit: 0 done, 1 a named failure (one line), 2 wrong usage."""
-    on_compiling.append(_say_compiling)
     sys.exit(run(sys.argv[1:] if arguments is None else arguments))
 
 
@@ -21,9 +19,3 @@ def run(arguments: Sequence[str]) -> int:
     from faintfield.pipelines.launcher import launch
 
     return launch(arguments)
-
-
-def _say_compiling() -> None:
-    from faintfield.pipelines.console import inform
-
-    inform("compiling kernels, which takes up to a minute; later runs find them where numba can write its cache")

@@ -20,6 +20,7 @@ from faintfield.pipelines.console import framed_console, inform, visible
 from faintfield.pipelines.errors import NAMED_FAILURES, FileFailed, MemoryShort, WrongUsage
 from faintfield.pipelines.formats.units import json_of
 from faintfield.pipelines.log_file import logged
+from faintfield.recon.names import on_compiling
 
 DONE, FAILED, WRONG_USAGE = 0, 1, 2
 
@@ -211,6 +212,13 @@ def _named_system_errors() -> Iterator[None]:
         raise MemoryShort(
             f"the command needs more memory than there is ({reason}); ask for less at once, or use a machine with more"
         ) from failure
+
+
+def _announce_compiling() -> None:
+    inform("compiling kernels, which takes up to a minute; later runs find them where numba can write its cache")
+
+
+on_compiling.append(_announce_compiling)
 
 
 def launch(arguments: Sequence[str]) -> int:

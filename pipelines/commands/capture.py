@@ -33,12 +33,11 @@ def init(rig: Path = Path("rig.toml"), /) -> dict[str, str]:
     rig
         File to write; an existing one is left alone.
     """
-    from faintfield.pipelines.formats.files import write_whole
-    from faintfield.pipelines.formats.toml_files import rig_template
+    from faintfield.pipelines.formats.toml_files import write_template
 
     if rig.exists():
         raise OutputExists(f"{rig}: exists and is not overwritten; name another file, or edit this one")
-    write_whole(rig, rig_template())
+    write_template(rig)
     inform(f"wrote {rig}; describe your rig in it, then: faintfield check {rig}")
     return {"rig": str(rig)}
 
@@ -72,7 +71,7 @@ def plan(rig: Path, /, *, options: PlanOptions = _PLAN) -> Prediction:
     rig
         The rig.toml.
     """
-    from faintfield.pipelines.workflows.preparation import predict_capture
+    from faintfield.pipelines.planning.predict import predict_capture
 
     return predict_capture(rig, options)
 

@@ -103,10 +103,9 @@ def darken(
     overwrite
         Replace an earlier set in OUT.
     """
-    from faintfield.pipelines.formats.sets.elemental_set import load_set
     from faintfield.pipelines.simulation.darken import darken_set
 
-    darkened = darken_set(load_set(set_path), out, options, overwrite=overwrite)
+    darkened = darken_set(set_path, out, options, overwrite=overwrite)
     measured = "no SNR" if darkened.snr_measured is None else f"SNR {darkened.snr_measured:.3f}"
     photons = f"{darkened.photons_on_object:.2f} photons per pixel on the object"
     inform(f"{out}: {measured} measured for {options.snr:g} asked; {photons}")

@@ -11,7 +11,9 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import exifread
 import numpy as np
+import rawpy
 from numpy.typing import NDArray
 
 from faintfield.calib.lens import MAX_PIXELS, MAX_SIDE_PX
@@ -208,8 +210,6 @@ def _decoded(file: BufferedReader, path: Path, suffix: str, accept: Accept, page
 
 
 def _read_raw(file: BufferedReader, path: Path, accept: Accept) -> Frame:
-    import rawpy  # slow to load, and only raw files need it
-
     require_size(file, MAX_FRAME_BYTES)
     try:
         with rawpy.imread(file) as raw:
@@ -260,8 +260,6 @@ def _masked_black_dn(raw: Any, period: tuple[int, int]) -> NDArray[np.float64]:
 
 def exif_exposure_s(path: Path) -> float | None:
     """Return the exposure that EXIF states, None if it states none (rawpy would report 1 s)."""
-    import exifread  # slow to load, and only raw files need it
-
     with opened(path) as file, contextlib.suppress(Exception):  # of any type, if EXIF is damaged
         tag = exifread.process_file(file, details=False, stop_tag="EXIF ExposureTime").get("EXIF ExposureTime")
         if tag is not None and tag.values and 0 < float(tag.values[0]) <= MAX_EXPOSURE_S:

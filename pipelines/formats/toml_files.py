@@ -158,9 +158,9 @@ def read_rig_tables[T](path: Path, kind: type[T]) -> T:
         raise UnknownPlugin(f"{path}: {failure}") from None
 
 
-def rig_template() -> str:
-    """Return the text of a commented rig.toml, which describes a simulated rig."""
-    return files("faintfield.pipelines.formats").joinpath("rig_template.toml").read_text(encoding="utf-8")
+def write_template(rig: Path) -> None:
+    """Write a commented rig.toml, which describes a simulated rig."""
+    write_whole(rig, files("faintfield.pipelines.formats").joinpath("rig_template.toml").read_text(encoding="utf-8"))
 
 
 def stage_settings_path(rig: Path) -> Path:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
@@ -14,9 +15,28 @@ from numpy.typing import NDArray
 
 from faintfield.calib.estimate import Estimate
 from faintfield.pipelines.errors import WrongUsage
-from faintfield.pipelines.planning.known import KnownLens, KnownPace, Light, Sensor
+from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE
+from faintfield.pipelines.formats.results.noise import NOISE_FILE
+from faintfield.pipelines.formats.toml_files import read_rig
+from faintfield.pipelines.planning.known import (
+    KnownLens,
+    KnownPace,
+    Light,
+    Sensor,
+    calibration_file,
+    known_lens,
+    known_pace,
+    known_sensor,
+    planned_light,
+)
 from faintfield.pipelines.planning.options import PlanOptions
-from faintfield.pipelines.planning.prediction import Alternative, DepthPrediction, FeaturePrediction, PredictionRecord
+from faintfield.pipelines.planning.prediction import (
+    Alternative,
+    DepthPrediction,
+    FeaturePrediction,
+    PredictionRecord,
+    print_prediction,
+)
 from faintfield.recon.metrics import expected_snr_from_powers
 from faintfield.recon.prediction import (
     depth_resolution_mm,
@@ -45,6 +65,40 @@ class View(NamedTuple):
 
     exposure_s: float
     frames: int
+
+
+def predict_capture(rig: Path, options: PlanOptions) -> PredictionRecord:
+    """Return and print what a capture by a rig.toml will show."""
+    settings = read_rig(rig)
+    sensor = known_sensor(
+        settings,
+        calibration_file(options.noise, NOISE_FILE, rig.parent),
+        read_noise_e=options.read_noise_e,
+        dark_current_e_per_s=options.dark_current_e_per_s,
+        quantum_efficiency=options.quantum_efficiency,
+    )
+    lens = known_lens(settings, sensor, calibration_file(options.geometry, GEOMETRY_FILE, rig.parent), options.fx_px)
+    exposure_s, view = scene_view(settings, options)
+    depths_mm = options.depth_mm or settings.scene.depth_mm
+    sides_px = [*(options.feature_px or []), *_in_px(options.feature_mm or [], depths_mm, lens.f_px)] or [10.0]
+    grids = parse_grids(options.grids or [])
+    light = planned_light(options, exposure_s, sensor)
+    pace = known_pace(settings)
+    predictor = Predictor(settings, options, sensor, lens, pace, light, exposure_s, view, depths_mm, sides_px, grids)
+    record = predictor.record(str(rig))
+    print_prediction(record)
+    return record
+
+
+def _in_px(sides_mm: list[float], depths_mm: Sequence[float], f_px: Estimate) -> list[float]:
+    if not sides_mm:
+        return []
+    if not depths_mm or f_px.value is None:
+        raise WrongUsage(
+            f"--feature-mm {sides_mm[0]:g}: pixels of it are not known without a depth and a focal length; give "
+            "--depth-mm and --fx-px or --geometry, or --feature-px"
+        )
+    return [side_mm * f_px.value / depths_mm[0] for side_mm in sides_mm]
 
 
 def parse_grids(texts: Sequence[str]) -> list[tuple[int, int]]:

@@ -8,6 +8,7 @@ import cv2
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
+from skimage.filters import threshold_li
 
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import write_record, write_whole
@@ -76,8 +77,6 @@ def segmented(light_e: NDArray[np.float32], usable: Region) -> Region | None:
     Li's threshold minimises the cross entropy between an image and its two levels, which weights a difference relative
     to the brightness, as suits photon counts. Otsu's weights its square, and misses the darker parts of objects.
     """
-    from skimage.filters import threshold_li  # loading it takes a while
-
     level = light_e[usable]
     if not level.size or not np.ptp(level):
         return None

@@ -41,18 +41,19 @@ class Darkened(msgspec.Struct, frozen=True):
     scale_e: float
 
 
-def darken_set(bright: ElementalSet, out: Path, options: DarkeningOptions, *, overwrite: bool = False) -> Darkened:
+def darken_set(folder: Path, out: Path, options: DarkeningOptions, *, overwrite: bool = False) -> Darkened:
     """Expose each view of a bright set anew with few photons, and write the dark set; BadValue if none has the SNR."""
+    bright = load_set(folder)
     layouts = channel_layouts(bright)
     light = _light(bright, bright.image_paths[bright.reference_view], layouts)
-    region, scale_e = _region_and_scale(bright.folder, light, options)
+    region, scale_e = _region_and_scale(folder, light, options)
     photons = float(light[region].mean()) * scale_e / options.quantum_efficiency
-    with writing_folder(out, replace_if=FILE_NAME if overwrite else None, reads=[bright.folder]) as folder:
-        _write_dark_views(bright, layouts, folder, options, scale_e)
-        write_png(folder / OBJECT_REGION, mask_picture(region))
+    with writing_folder(out, replace_if=FILE_NAME if overwrite else None, reads=[folder]) as target:
+        _write_dark_views(bright, layouts, target, options, scale_e)
+        write_png(target / OBJECT_REGION, mask_picture(region))
         origin = provenance("darken", options, bright.input_hashes())
         record = origin.parts() | {"scale_e": scale_e, "photons_on_object": photons}
-        write_json(folder / "provenance.json", record)
+        write_json(target / "provenance.json", record)
     known = {"quantum_efficiency": options.quantum_efficiency, "read_noise_e": options.read_noise_e}
     return Darkened(
         out=str(out),
