@@ -28,6 +28,7 @@ _MODULES = {
     "RigError": "rig.errors",
     "RigSettings": "rig.settings",
     "StageSettings": "rig.stages.protocol",
+    "SyntheticOptions": "pipelines.simulation.options",
     "CaptureStep": "rig.plan",
     "Target": "calib.geometry",
     "back_projection": "recon.solver.initialization",
@@ -70,6 +71,7 @@ if TYPE_CHECKING:  # type checkers and editors read these lines; a test compares
     from faintfield.pipelines.formats.sets.elemental_set import load_set as load_set
     from faintfield.pipelines.reconstruction.channels import channel_layouts as channel_layouts
     from faintfield.pipelines.reconstruction.channels import load_channel as load_channel
+    from faintfield.pipelines.simulation.options import SyntheticOptions as SyntheticOptions
     from faintfield.recon.errors import ReconstructionError as ReconstructionError
     from faintfield.recon.likelihood.images import ElementalImages as ElementalImages
     from faintfield.recon.operator.grid import PlaneGrid as PlaneGrid

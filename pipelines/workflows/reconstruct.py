@@ -13,7 +13,6 @@ from faintfield.pipelines.formats.files import exclusive
 from faintfield.pipelines.formats.results.records import REPORT_FILE
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, load_session, with_measured_geometry
-from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.reconstruction.channels import keeping_frames
 from faintfield.pipelines.reconstruction.options import OF_PLANES, Options
 from faintfield.pipelines.reconstruction.planes.sweep import Runner, run_serially
@@ -55,8 +54,7 @@ def reconstruct_and_report(
     started = time.monotonic()
     with exclusive(out):
         outcome = reconstruct_set(elemental_set, out, request, runner or run_serially)
-        with working("writing the report"):
-            report = write_report(out)
+        report = _write_report(out)
     planes = len({record.file for record in outcome.planes})
     inform(f"{planes} plane(s) in {time.monotonic() - started:.1f} s: {report}")
     return msgspec.structs.replace(outcome, report=str(report))
@@ -72,11 +70,17 @@ def surface_and_report(elemental_set: ElementalSet, out: Path, request: SurfaceR
         for folder in dict.fromkeys((page_in, out)):
             locks.enter_context(exclusive(folder))
         record = reconstruct_surface(elemental_set, out, request, pages=(page_in / REPORT_FILE, out / REPORT_FILE))
-        with working("writing the report"):
-            report = write_report(page_in)
+        report = _write_report(page_in)
     sure = f"{record.known_share:.0%} of its depths known, {record.sure_share:.0%} sure"
     inform(f"a surface in {time.monotonic() - started:.1f} s, {sure}: {report}")
     return Outcome(out=str(out), report=str(report), planes=[], surface=record, units=elemental_set.units)
+
+
+def _write_report(folder: Path) -> Path:
+    from faintfield.pipelines.pages.report import write_report  # Matplotlib's memory is needed after that of the images
+
+    with working("writing the report"):
+        return write_report(folder)
 
 
 def open_set(

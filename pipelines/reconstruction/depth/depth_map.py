@@ -7,7 +7,6 @@ from pathlib import Path
 import cv2
 import msgspec
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from faintfield.pipelines.formats.files import remove, sha256, write_record, write_whole
@@ -141,6 +140,8 @@ def map_picture(values: NDArray[np.floating], label: str, low: float, high: floa
 
     The colour bar ends in a point where values lie beyond it.
     """
+    from matplotlib.figure import Figure  # its memory is needed after that of the images
+
     rows, columns = np.indices(values.shape)
     hatch = np.where((rows + columns) % _MARK_PERIOD_PX < 2, _MARK_DARK, _MARK_GREY)
     figure = Figure(
