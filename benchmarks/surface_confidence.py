@@ -11,6 +11,7 @@ one that holds true_depth_mm.tiff, of several scenes at several levels of light.
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from faintfield.pipelines.formats.sets.elemental_set import load_set
-from faintfield.pipelines.reconstruction.depth.search import between_pixels, default_bins, luminance, nodes_of
+from faintfield.pipelines.reconstruction.depth.comparison import between_pixels
+from faintfield.pipelines.reconstruction.depth.search import default_bins, luminance
 from faintfield.recon.surface.confidence import COEFFICIENTS, RIGHT_WITHIN, SURE, features
 from faintfield.recon.surface.estimate import equal_steps, first_depths, halves, next_depths
 from faintfield.recon.surface.evidence import DepthEvidence
@@ -36,11 +38,12 @@ def samples_of(folder: Path, truth: Path) -> tuple[NDArray[np.float64], NDArray[
     """Return the features (sample, feature) of a set's depths, and which are right (sample,)."""
     elemental_set = load_set(folder)
     bins = default_bins(elemental_set)
-    views, nodes = between_pixels(luminance(elemental_set, bins)), nodes_of(elemental_set)
+    views = luminance(elemental_set, bins)
+    views = replace(views, grid=between_pixels(views.grid))
     true_mm = tifffile.imread(truth / "true_depth_mm.tiff")[bins // 2 :: bins, bins // 2 :: bins]
     true_mm = true_mm[: views.grid.shape[0], : views.grid.shape[1]]
     depths = equal_steps(views, 1 / (1.2 * float(np.nanmax(true_mm))), 1 / (0.85 * float(np.nanmin(true_mm))))
-    evidence = DepthEvidence(views, depths, halves(nodes))
+    evidence = DepthEvidence(views, depths, halves(views.nodes))
     index = first_depths(evidence)
     for _ in range(_ROUNDS):
         index, costs = next_depths(evidence, evidence.explained(index))

@@ -34,7 +34,7 @@ from faintfield.pipelines.formats.units import StatedUnits
 from faintfield.pipelines.reconstruction.accuracy import assess, write_depth_errors
 from faintfield.pipelines.reconstruction.channels import SHARE_OF_DISK, channel_layouts
 from faintfield.pipelines.reconstruction.depth.depth_map import kept_depth_map, write_depth_map
-from faintfield.pipelines.reconstruction.depth.search import check_overlap, check_views, default_bins, depths_of_set
+from faintfield.pipelines.reconstruction.depth.search import check_overlap, check_views, depths_of_set
 from faintfield.pipelines.reconstruction.operators import default_pitch_px, plane_grid, tilted_grid
 from faintfield.pipelines.reconstruction.overview import inspect_set, write_overview
 from faintfield.pipelines.reconstruction.planes.sweep import Runner, Sweep, run_serially
@@ -74,13 +74,13 @@ def reconstruct_set(elemental_set: ElementalSet, out: Path, request: Request, ru
     overview, pictures = inspect_set(elemental_set)  # what is wrong with a set is to be found before planes are made
     read_truth(elemental_set.folder)
     depth_map = kept_depth_map(folders, sweep.origins) if request.with_depth_map else None
-    estimate = None
+    search = None
     if request.with_depth_map and depth_map is None:
-        _, estimate = depths_of_set(elemental_set, default_bins(elemental_set), _range_mm(request), out)
+        search = depths_of_set(elemental_set, _range_mm(request), out)
     _make_planes(sweep, folders, out, runner)
     write_overview(overview, pictures, out)
-    if estimate is not None:
-        depth_map = write_depth_map(elemental_set, estimate, sweep.written, request.disparities_px, sweep.origins)
+    if search is not None:
+        depth_map = write_depth_map(elemental_set, search, sweep.written, request.disparities_px, sweep.origins)
     if depth_map is not None:
         for folder in folders.values():
             write_depth_errors(elemental_set, folder, depth_map.file, depth_map.unit)

@@ -81,20 +81,14 @@ class SurfaceEstimate:
     prediction: Prediction | None
 
 
-def estimate_surface(
-    views: PinholeViews, inverse_depths: NDArray[np.float64], nodes: NDArray[np.intp]
-) -> SurfaceEstimate:
+def estimate_surface(views: PinholeViews, inverse_depths: NDArray[np.float64]) -> SurfaceEstimate:
     """Return the surface that explains the views best.
 
     All rounds but the last are done without some of the views; the last starts from the one that predicts these best.
 
-    Parameters
-    ----------
-    views, nodes : PinholeViews, int array (view, 2)
-        The views, and their rows and columns in the grid of nodes.
-    inverse_depths : float array (depth,)
-        The 1/depth to choose from, ascending in equal steps.
+    `inverse_depths` (depth,) are the 1/depth to choose from, ascending in equal steps.
     """
+    nodes = views.nodes
     left_out = validation_views(len(nodes)) if len(nodes) >= _MIN_JUDGED else np.zeros(0, np.intp)
     kept = np.setdiff1d(np.arange(len(nodes)), left_out)
     evidence = DepthEvidence(views, inverse_depths, halves(nodes, kept))
@@ -216,8 +210,8 @@ def equal_steps(views: PinholeViews, far: float, near: float) -> NDArray[np.floa
     return np.linspace(far, near, count)
 
 
-def found_range(views: PinholeViews, nodes: NDArray[np.intp], far: float, near: float) -> tuple[float, float]:
-    """Return the range of 1/depth between far and near in which the views show anything (`nodes` as for a surface).
+def found_range(views: PinholeViews, far: float, near: float) -> tuple[float, float]:
+    """Return the range of 1/depth between far and near in which the views show anything.
 
     Raises
     ------
@@ -228,7 +222,7 @@ def found_range(views: PinholeViews, nodes: NDArray[np.intp], far: float, near: 
     limits = (far, near)
     for _ in range(_SEARCHES):
         depths = equal_steps(coarse, far, near)
-        evidence = DepthEvidence(coarse, depths, halves(nodes))
+        evidence = DepthEvidence(coarse, depths, halves(coarse.nodes))
         index, costs = next_depths(evidence, evidence.explained(first_depths(evidence)))
         likely = confidence(index, costs, depths, explained_share(evidence, index)) >= _LIKELY
         if np.count_nonzero(likely) < _MIN_SAMPLES:

@@ -82,8 +82,12 @@ class DepthEvidence:
         self.views, self.inverse_depths, self.halves = views, inverse_depths, halves
         self._numbers = np.concatenate(halves)
         self._half = np.repeat(np.arange(2), [len(half) for half in halves])
-        light_e = np.ascontiguousarray(views.light_e[self._numbers])
-        self._subset = replace(views, light_e=light_e, ray_from_surface=views.ray_from_surface[self._numbers])
+        self._subset = replace(
+            views,
+            light_e=np.ascontiguousarray(views.light_e[self._numbers]),
+            ray_from_surface=views.ray_from_surface[self._numbers],
+            nodes=views.nodes[self._numbers],
+        )
         middle = self._sums(self._stack(), float(np.median(inverse_depths)), *self._unhidden())
         mean = blurred_mean(middle[0, 1] + middle[1, 1], middle[0, 0] + middle[1, 0], _MEAN_LIGHT)
         variance = np.maximum(mean, 0) + np.float32(views.variance_e2)

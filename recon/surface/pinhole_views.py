@@ -33,6 +33,8 @@ class PinholeViews:
         Of the pinhole camera, in pixels of these images, right and down.
     grid : PlaneGrid
         The samples of the surface at unit depth.
+    nodes : int array (view, 2)
+        Row and column of each view in the grid of nodes.
     """
 
     light_e: NDArray[np.float32]
@@ -41,6 +43,7 @@ class PinholeViews:
     focal_px: tuple[float, float]
     centre_px: tuple[float, float]
     grid: PlaneGrid
+    nodes: NDArray[np.intp]
 
     def rays(self) -> NDArray[np.float32]:
         """Return the direction of each pixel (row, column, 2), x, y at unit depth."""

@@ -202,8 +202,8 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> Searches:
     """Replace what is slow: the search for depths, σ, refinement and pictures; return what the search is given."""
     given: Searches = []
 
-    def search(views: Any, inverse_depths: NDArray[np.float64], nodes: NDArray[np.intp]) -> SurfaceEstimate:
-        given.append((views, inverse_depths, nodes))
+    def search(views: Any, inverse_depths: NDArray[np.float64]) -> SurfaceEstimate:
+        given.append((views, inverse_depths))
         return found_at_once(views)
 
     preview = encoded(np.zeros((4, 4), np.uint8), ".png")

@@ -20,7 +20,7 @@ from faintfield.recon.surface.estimate import SurfaceEstimate
 from faintfield.recon.surface.pinhole_views import PinholeViews
 
 # What a search for depths is given: the views, the 1/depths to compare, and the nodes.
-type Searches = list[tuple[PinholeViews, NDArray[np.float64], NDArray[np.intp]]]
+type Searches = list[tuple[PinholeViews, NDArray[np.float64]]]
 
 # What the search that stands in for the slow one finds everywhere.
 FOUND_MM, FOUND_CONFIDENCE = 600.0, 0.5

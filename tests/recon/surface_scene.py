@@ -76,7 +76,7 @@ def noisy_views_of(light: NDArray[np.floating], seed: int) -> PinholeViews:
 
 def views_of(light: NDArray[np.floating]) -> PinholeViews:
     """Return views that show the given light (view, row, column)."""
-    return PinholeViews(light.astype(np.float32), READ_VARIANCE_E2, matrices(), (FOCAL_PX, FOCAL_PX), AXIS, GRID)
+    return PinholeViews(light.astype(np.float32), READ_VARIANCE_E2, matrices(), (FOCAL_PX, FOCAL_PX), AXIS, GRID, NODES)
 
 
 def away_from_edges(distance: int) -> NDArray[np.bool_]:

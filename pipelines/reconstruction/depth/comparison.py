@@ -28,7 +28,7 @@ from faintfield.recon.errors import NothingInFocus
 from faintfield.recon.likelihood.images import ElementalImages, binned
 from faintfield.recon.operator.grid import PlaneGrid
 
-# Place between two pixels, in pixels, at which `w² + (1 − w)²` is 2/3, as on average: see `_between_bins`.
+# Place between two pixels, in pixels, at which `w² + (1 − w)²` is 2/3, as on average: see `between_pixels`.
 BETWEEN_PIXELS = 0.5 - 0.5 / 3**0.5
 
 # Fewest bins across the detector: limits the size of a bin.
@@ -76,25 +76,25 @@ class BinnedViews:
         """Return the agreement of the views at each depth, all colours together."""
         planes: list[Agreement] = []
         for layout, images in self.colours:
-            factory = OperatorFactory(
-                self.elemental_set, layout, images, bins=self.bins_px // max(layout.lattices[0].step)
-            )
-            found = [
-                agreement(factory.at(depth, _between_bins(self.elemental_set, depth, self.bins_px)), images)
-                for depth in progress(depths_mm, f"comparing the views, {layout.name}")
-            ]
+            bins = self.bins_px // max(layout.lattices[0].step)
+            factory = OperatorFactory(self.elemental_set, layout, images, bins=bins)
+            found = []
+            for depth in progress(depths_mm, f"comparing the views, {layout.name}"):
+                grid = between_pixels(plane_grid(self.elemental_set, depth).binned(self.bins_px))
+                found.append(agreement(factory.at(depth, grid), images))
             planes = [Agreement(*map(add, *pair)) for pair in zip(planes, found, strict=True)] if planes else found
         return planes
 
 
-def _between_bins(elemental_set: ElementalSet, depth_mm: float, bins_px: int) -> PlaneGrid:
-    """Return the samples of a plane between the bins of the reference view, so that no depth is favoured.
+def between_pixels(grid: PlaneGrid) -> PlaneGrid:
+    """Return samples on the pixels of the reference view, or bins of them, moved by `BETWEEN_PIXELS` right and down.
 
-    Where all views are at whole bins, none is blurred by interpolation, and detail that is not blurred agrees best.
+    Interpolation between pixels blurs, and detail that is not blurred counts for more. On a regular grid of nodes, some
+    depths bring all views to whole pixels, and would be favoured. At this place the mean of `w² + (1 − w)²` over the
+    weights w of interpolation is 2/3, as it is over all places: such depths are no longer special.
     """
-    grid = plane_grid(elemental_set, depth_mm).binned(bins_px)
-    moved_mm = BETWEEN_PIXELS * grid.pitch_mm
-    return replace(grid, origin_mm=(grid.origin_mm[0] + moved_mm, grid.origin_mm[1] + moved_mm))
+    moved = BETWEEN_PIXELS * grid.pitch_mm
+    return replace(grid, origin_mm=(grid.origin_mm[0] + moved, grid.origin_mm[1] + moved))
 
 
 def binned_views(elemental_set: ElementalSet, middle_mm: float, out: Path, *, min_bins_px: int = 1) -> BinnedViews:

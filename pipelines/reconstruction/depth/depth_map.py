@@ -15,10 +15,8 @@ from faintfield.pipelines.formats.image_files import ONE_PIXEL, encoded, grey_le
 from faintfield.pipelines.formats.results.plane_files import Origin, read_current
 from faintfield.pipelines.formats.results.records import DEPTH_MAP_FILE, DepthMapFileRecord, DepthMapRecord, Method
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, unit_of_maps
-from faintfield.pipelines.reconstruction.depth.search import default_bins, enlarged, in_unit
-from faintfield.pipelines.reconstruction.operators import plane_grid
+from faintfield.pipelines.reconstruction.depth.search import DepthSearch, in_unit
 from faintfield.recon.surface.confidence import SURE
-from faintfield.recon.surface.estimate import SurfaceEstimate
 
 # The file of the depths by their unit.
 _FILES = {"mm": "depth_mm.tiff", "px": "disparity_px.tiff", "relative": "depth.tiff"}
@@ -51,17 +49,17 @@ def kept_depth_map(folders: Mapping[Method, Path], origins: Mapping[Method, Orig
 
 def write_depth_map(
     elemental_set: ElementalSet,
-    estimate: SurfaceEstimate,
+    search: DepthSearch,
     planes: Mapping[tuple[Method, float], Path],
     disparities_px: Mapping[float, float],
     origins: Mapping[Method, Origin],
 ) -> DepthMapRecord:
     """Write the maps and the all-in-focus picture into each folder of planes, and return their record.
 
-    The estimate is that of `depths_of_set` in the range of the sweep; maps are in px if all depths have a disparity.
+    The search is that in the range of the sweep; maps are in px if all depths have a disparity.
     """
     depths = sorted({depth for _, depth in planes})
-    record, index, pictures = _maps(elemental_set, estimate, depths, disparities_px)
+    record, index, pictures = _maps(elemental_set, search, depths, disparities_px)
     for method, folder in {method: path.parent for (method, _), path in planes.items()}.items():
         remove(folder / DEPTH_MAP_FILE)
         sharp = _all_in_focus([planes[method, depth] for depth in depths], index)
@@ -79,7 +77,7 @@ def write_depth_map(
 
 def _maps(
     elemental_set: ElementalSet,
-    estimate: SurfaceEstimate,
+    search: DepthSearch,
     depths_mm: Sequence[float],
     disparities_px: Mapping[float, float],
 ) -> tuple[DepthMapRecord, NDArray[np.float64], dict[str, tuple[NDArray[np.floating], bytes]]]:
@@ -87,20 +85,19 @@ def _maps(
 
     Each map has its preview. Depths are NaN where they are not known.
     """
-    bins, shape = default_bins(elemental_set), plane_grid(elemental_set, 1.0).shape
-    inverse_depth, confidence = (enlarged(part, shape, bins) for part in (estimate.inverse_depth, estimate.confidence))
+    inverse_depth, confidence = search.estimate.inverse_depth, search.estimate.confidence
     unit = unit_of_maps(elemental_set.units, as_px=bool(disparities_px))
     scale = [
         disparities_px[depth] if disparities_px else in_unit(elemental_set, 1 / depth, unit) for depth in depths_mm
     ]
-    known = confidence.astype(np.float32) >= SURE  # as in the file
+    known = confidence >= SURE
     values = np.clip(in_unit(elemental_set, inverse_depth, unit), min(scale), max(scale))
     record = DepthMapRecord(
         file=_FILES[unit],
         confidence=f"{CONFIDENCE}.tiff",
         all_in_focus=f"{ALL_IN_FOCUS}.tiff",
         unit=unit,
-        bins_px=bins,
+        bins_px=search.bins_px,
         sure_above=SURE,
         sure_share=float(known.mean()),
         median=float(np.median(values[known])) if known.any() else None,

@@ -5,7 +5,7 @@ The maps of `--surface` and of `--depth-map` both come from here.
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,9 +20,10 @@ from faintfield.pipelines.formats.frames import Lattice
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.channels import channel_layouts, lattice_noise, view_electrons
 from faintfield.pipelines.reconstruction.depth.autofocus import overlap, views_of_search
-from faintfield.pipelines.reconstruction.depth.comparison import BETWEEN_PIXELS, check_places
+from faintfield.pipelines.reconstruction.depth.comparison import BETWEEN_PIXELS, between_pixels, check_places
 from faintfield.pipelines.reconstruction.operators import plane_grid, principal_shift, response_of
 from faintfield.recon.errors import GeometryMismatch, NothingInFocus
+from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.surface.estimate import SurfaceEstimate, equal_steps, estimate_surface, found_range
 from faintfield.recon.surface.pinhole_views import UNKNOWN, PinholeViews
 from faintfield.recon.threads import map_in_threads
@@ -65,7 +66,6 @@ def luminance(elemental_set: ElementalSet, bins: int) -> PinholeViews:
     backgrounds = [elemental_set.background_e(noise) for noise in noises]
     read_variances = [float(np.mean(elemental_set.read_variance_e2(noise))) for noise in noises]
     variances = [float(np.mean(dark)) + read for dark, read in zip(backgrounds, read_variances, strict=True)]
-    grid = plane_grid(elemental_set, 1.0).binned(bins)
     views = len(elemental_set.settings.view)
     width, height = elemental_set.settings.camera.size_px
     shape = (height // bins, width // bins)
@@ -93,7 +93,8 @@ def luminance(elemental_set: ElementalSet, bins: int) -> PinholeViews:
         ray_from_surface(elemental_set.poses_rt_cam_ref, principal_shift(elemental_set)),
         (camera.fx_px / bins, camera.fy_px / bins),
         ((camera.cx_px + 0.5) / bins - 0.5, (camera.cy_px + 0.5) / bins - 0.5),
-        grid,
+        plane_grid(elemental_set, 1.0).binned(bins),
+        _nodes(elemental_set),
     )
 
 
@@ -178,33 +179,46 @@ def check_overlap(elemental_set: ElementalSet, range_mm: tuple[float, float]) ->
         )
 
 
-def depths_of_set(
-    elemental_set: ElementalSet,
-    bins: int,
-    range_mm: tuple[float, float],
-    out: Path,
-    *,
-    find_range: bool = False,
-) -> tuple[NDArray[np.float64], SurfaceEstimate]:
-    """Return the 1/depths that are compared, ascending, and the depth of each sample of the bins by them.
+@dataclass(frozen=True)
+class DepthSearch:
+    """The depth of each pixel of the reference view, found in bins of `bins_px` detector pixels.
 
-    The samples are those of `between_pixels`; `enlarged` brings their maps to the pixels. With `find_range` the range
-    of the scene is searched first. `out` is for a temporary file. Raises GeometryMismatch if the range is too wide, or
-    views, poses and range do not fit together, and NothingInFocus if nothing is found, or shuffled views agree as well.
+    `compared` (depth,) are the 1/depth to choose from, ascending; the maps of the estimate are on the samples of `grid`
+    at unit depth.
     """
-    nodes, views = nodes_of(elemental_set), between_pixels(luminance(elemental_set, bins))
+
+    compared: NDArray[np.float64]
+    bins_px: int
+    grid: PlaneGrid
+    estimate: SurfaceEstimate
+
+
+def depths_of_set(
+    elemental_set: ElementalSet, range_mm: tuple[float, float], out: Path, *, find_range: bool = False
+) -> DepthSearch:
+    """Return the depth of each pixel of the reference view in a range, or in that of the scene, found in it first.
+
+    `out` is for a temporary file. Raises GeometryMismatch if the range is too wide, or views, poses and range do not
+    fit together, and NothingInFocus if nothing is found, or shuffled views agree as well.
+    """
+    bins, grid = default_bins(elemental_set), plane_grid(elemental_set, 1.0)
+    views = luminance(elemental_set, bins)
+    views = replace(views, grid=between_pixels(views.grid))
     near, far = 1 / range_mm[0], 1 / range_mm[1]
     with naming_range(elemental_set, far, near):
         if find_range:
             with working("searching the range of depths"):
-                far, near = found_range(views, nodes, far, near)
+                far, near = found_range(views, far, near)
         depths = equal_steps(views, far, near)
         _check_steps(views, depths)
     check_places(views_of_search(elemental_set, range_mm, out), range_mm)
     with naming_range(elemental_set, far, near):
         inform(f"surface {_between(elemental_set, far, near)}: comparing {len(depths)} depths")
         with working("finding the depths of the surface"):
-            return depths, estimate_surface(views, depths, nodes)
+            found = estimate_surface(views, depths)
+    inverse_depth = enlarged(found.inverse_depth, grid.shape, bins)
+    found = replace(found, inverse_depth=inverse_depth, confidence=enlarged(found.confidence, grid.shape, bins))
+    return DepthSearch(depths, bins, grid, found)
 
 
 @contextmanager
@@ -225,7 +239,7 @@ def _between(elemental_set: ElementalSet, far: float, near: float) -> str:
     return f"between {elemental_set.depths_text(float(f'{1 / near:.4g}'), float(f'{1 / far:.4g}'), join=' and ')}"
 
 
-def nodes_of(elemental_set: ElementalSet) -> NDArray[np.intp]:
+def _nodes(elemental_set: ElementalSet) -> NDArray[np.intp]:
     """Return row and column of the node of each view; a row of views if no nodes are stated."""
     views = elemental_set.settings.view
     if any(view.node is None for view in views):
@@ -245,21 +259,9 @@ def _check_steps(views: PinholeViews, depths: NDArray[np.float64]) -> None:
         inform(f"warning: {apart}; a narrower range would find more")
 
 
-def between_pixels(views: PinholeViews) -> PinholeViews:
-    """Return the views with the samples of the surface moved to `BETWEEN_PIXELS`, right and down.
-
-    Interpolation between pixels blurs, and detail that is not blurred counts for more. On a regular grid of nodes, some
-    depths bring all views to whole pixels, and would be favoured. At this place the mean of `w² + (1 − w)²` over the
-    weights w of interpolation is 2/3, as it is over all places: such depths are no longer special.
-    """
-    (x, y), pitch = views.grid.origin_mm, views.grid.pitch_mm
-    moved = BETWEEN_PIXELS * pitch
-    return replace(views, grid=replace(views.grid, origin_mm=(x + moved, y + moved)))
-
-
-def enlarged(
-    part: NDArray[np.floating], shape: tuple[int, int], bins: int, *, moved: float = BETWEEN_PIXELS
-) -> NDArray[np.float64]:
+def enlarged[Number: np.floating](
+    part: NDArray[Number], shape: tuple[int, int], bins: int, *, moved: float = BETWEEN_PIXELS
+) -> NDArray[Number]:
     """Return a map of bins on the samples of a picture (rows, columns), each with the nearest value.
 
     The samples of the map lie right of and below the middles of the bins by `moved` bins.
@@ -268,7 +270,7 @@ def enlarged(
         np.clip(np.floor((np.arange(size) + 0.5) / bins - moved), 0, count - 1).astype(np.intp)
         for size, count in zip(shape, part.shape, strict=True)
     )
-    return np.asarray(part[np.ix_(rows, columns)], np.float64)
+    return part[np.ix_(rows, columns)]
 
 
 def in_unit[Numbers: (float, NDArray[np.float64])](

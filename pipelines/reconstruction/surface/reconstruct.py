@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erfinv
 
+from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.errors import OutputExists
 from faintfield.pipelines.formats.files import remove, remove_leftovers, require_room
@@ -35,11 +36,10 @@ from faintfield.pipelines.reconstruction.channels import (
 )
 from faintfield.pipelines.reconstruction.depth.autofocus import searched_range_mm
 from faintfield.pipelines.reconstruction.depth.search import (
+    DepthSearch,
     check_overlap,
     check_views,
-    default_bins,
     depths_of_set,
-    enlarged,
     in_unit,
     naming_range,
 )
@@ -53,7 +53,6 @@ from faintfield.recon.operator.surface_operator import SurfaceOperator
 from faintfield.recon.prior.collaborative import refined
 from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.surface.confidence import RIGHT_WITHIN, SURE, UNKNOWN_BELOW
-from faintfield.recon.surface.estimate import SurfaceEstimate
 
 # Bytes of a sample in the files: TIFFs of one number and of one per colour, a point, and the picture on the page; and
 # bytes of previews, film and page, which do not grow with the picture.
@@ -93,31 +92,29 @@ def reconstruct_surface(
     else:
         check_overlap(elemental_set, range_mm)
     remove_leftovers(out)
-    bins = default_bins(elemental_set)
-    depths, estimate = depths_of_set(elemental_set, bins, range_mm, out, find_range=find_range)
-    far, near = float(depths[0]), float(depths[-1])
-    inverse_depth = enlarged(estimate.inverse_depth, grid.shape, bins)
+    search = depths_of_set(elemental_set, range_mm, out, find_range=find_range)
+    far, near = float(search.compared[0]), float(search.compared[-1])
     with naming_range(elemental_set, far, near):
         lights = {
-            layout.name: _light(elemental_set, layout, inverse_depth, request, out)
+            layout.name: _light(elemental_set, layout, search, request.solver, out)
             for layout in progress(layouts, "picture")
         }
-    held_out, prediction = None, estimate.prediction
+    held_out, prediction = None, search.estimate.prediction
     if prediction is not None and prediction.pixels:
         held_out = HeldOutRecord(**vars(prediction) | {"views": prediction.views.tolist()})
     facts = SurfaceFacts(
         unit=unit,
         searched=(in_unit(elemental_set, near, unit), in_unit(elemental_set, far, unit)),
         range_found=request.ends is None,
-        depths=len(depths),
-        bins_px=bins,
-        rounds=estimate.rounds,
+        depths=len(search.compared),
+        bins_px=search.bins_px,
+        rounds=search.estimate.rounds,
         sure_above=SURE,
         held_out=held_out,
         channels=[in_units(elemental_set, _channel(name, light)) for name, light in lights.items()],
         wall_time_s=time.monotonic() - started,
     )
-    maps = _maps(elemental_set, inverse_depth, estimate, list(lights.values()), unit, bins)
+    maps = _maps(elemental_set, search, list(lights.values()), unit)
     for page in pages:
         remove(page)
     record = write_surface(out, maps, facts, origin)
@@ -135,8 +132,8 @@ def _needed_bytes(shape: tuple[int, int], colours: int, *, proposal: bool) -> in
 def _light(
     elemental_set: ElementalSet,
     layout: ChannelLayout,
-    inverse_depth: NDArray[np.floating],
-    request: SurfaceRequest,
+    search: DepthSearch,
+    options: SolverOptions,
     out: Path,
 ) -> Solution:
     """Return one colour of the picture on a surface of known depth, with `sigma` and `visibility` beside it.
@@ -145,15 +142,15 @@ def _light(
     """
     images = load_channel(elemental_set, layout, memory_or_file(out))
     factory = OperatorFactory(elemental_set, layout, images)
-    operator = factory.of_surface(inverse_depth, plane_grid(elemental_set, 1.0))
+    operator = factory.of_surface(search.estimate.inverse_depth, search.grid)
     if message := blind_views(elemental_set, operator, "the surface"):
         inform(message)
-    objective = Objective.of(SceneProblem(operator, images), request.solver)
-    solution, sigma = solve_then_sigma(objective, request.solver)
-    if request.solver.prior is None:
+    objective = Objective.of(SceneProblem(operator, images), options)
+    solution, sigma = solve_then_sigma(objective, options)
+    if options.prior is None:
         solution = replace(solution, plane=refined(operator, images, solution.plane))
     else:
-        (solution,) = with_prior(objective, [solution], request.solver)
+        (solution,) = with_prior(objective, [solution], options)
     visibility = _visibility(operator, layout)
     del images, factory, operator, objective
     return replace(solution, sidecars=solution.sidecars | {"sigma": sigma(), "visibility": visibility})
@@ -187,14 +184,11 @@ def _channel(name: str, light: Solution) -> SurfaceChannel:
 
 def _maps(
     elemental_set: ElementalSet,
-    inverse_depth: NDArray[np.float64],
-    estimate: SurfaceEstimate,
+    search: DepthSearch,
     lights: list[Solution],
     unit: Literal["mm", "px", "relative"],
-    bins: int,
 ) -> SurfaceMaps:
-    grid = plane_grid(elemental_set, 1.0)
-    confidence = enlarged(estimate.confidence, grid.shape, bins).astype(np.float32)
+    inverse_depth, confidence = search.estimate.inverse_depth, search.estimate.confidence
     known = confidence >= UNKNOWN_BELOW
     depth = in_unit(elemental_set, inverse_depth, unit)
     # Of a normal distribution that lies within the tolerance with this probability
@@ -203,7 +197,7 @@ def _maps(
     light = light_per_e(elemental_set)
     proposed = all("proposal" in solution.sidecars for solution in lights)
     return SurfaceMaps(
-        grid=grid,
+        grid=search.grid,
         picture=_colours([light * solution.plane for solution in lights]),
         picture_sigma=_colours([light * solution.sidecars["sigma"] for solution in lights]),
         picture_proposal=_colours([light * solution.sidecars["proposal"] for solution in lights]) if proposed else None,

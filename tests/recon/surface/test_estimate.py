@@ -32,7 +32,7 @@ def _recorded() -> tuple[SurfaceEstimate, list[NDArray[np.intp]]]:
             used.append(np.concatenate(halves))
 
     with patch.object(estimate, "DepthEvidence", Recorded):
-        return estimate_surface(surface_scene.drawn_views(LEVEL_E), DEPTHS, NODES), used
+        return estimate_surface(surface_scene.drawn_views(LEVEL_E), DEPTHS), used
 
 
 def _estimate() -> SurfaceEstimate:
@@ -75,7 +75,7 @@ def test_last_round_starts_from_the_best_prediction(monkeypatch: pytest.MonkeyPa
         return explained(self, index)
 
     monkeypatch.setattr(DepthEvidence, "explained", recorded)
-    assert estimate_surface(surface_scene.drawn_views(LEVEL_E), DEPTHS[::3], NODES).rounds == 2
+    assert estimate_surface(surface_scene.drawn_views(LEVEL_E), DEPTHS[::3]).rounds == 2
     assert starts[-2] is starts[1]  # the last is the result, judged for its confidence
 
 
@@ -94,7 +94,7 @@ def test_number_of_threads_changes_rounding_only(monkeypatch: pytest.MonkeyPatch
     results = []
     for threads in (1, 2):
         monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", threads)
-        results.append(estimate_surface(surface_scene.drawn_views(LEVEL_E), DEPTHS[::3], NODES))
+        results.append(estimate_surface(surface_scene.drawn_views(LEVEL_E), DEPTHS[::3]))
     assert results[0].rounds == results[1].rounds
     np.testing.assert_allclose(results[1].inverse_depth, results[0].inverse_depth, rtol=1e-5)
 
@@ -103,7 +103,7 @@ def test_pixels_without_a_number_matter_only_nearby() -> None:
     light = surface_scene.drawn_views(LEVEL_E).light_e.copy()
     light[np.random.default_rng(3).permutation(25)[:12], 26:34, 4:12] = UNKNOWN  # of half of the views
     light[6, 5, 70] = UNKNOWN
-    result = estimate_surface(surface_scene.views_of(light), DEPTHS, NODES)
+    result = estimate_surface(surface_scene.views_of(light), DEPTHS)
     change = np.abs(result.inverse_depth / _estimate().inverse_depth - 1)
     assert (change[:, 36:] < RIGHT_WITHIN / 4).mean() > 0.97
     assert (_error(result)[surface_scene.away_from_edges(2)] < RIGHT_WITHIN).mean() > 0.95
@@ -114,7 +114,7 @@ def _estimate_of(
 ) -> SurfaceEstimate:
     """Return the surface of the given light (view, row, column), with noise."""
     views = surface_scene.noisy_views_of(light, seed)
-    return estimate_surface(views if matrices is None else replace(views, ray_from_surface=matrices), DEPTHS, NODES)
+    return estimate_surface(views if matrices is None else replace(views, ray_from_surface=matrices), DEPTHS)
 
 
 def _sure(result: SurfaceEstimate, truth: NDArray[np.float64] | float | None = None) -> tuple[float, float]:

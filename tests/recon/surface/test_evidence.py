@@ -59,7 +59,7 @@ def test_steps_are_as_fine_as_outermost_view_needs() -> None:
 
 @pytest.mark.parametrize(("farthest", "nearest"), [(1 / 1000, 1 / 380), (1 / 602, 1 / 498)])
 def test_range_contains_the_scene_and_little_more(farthest: float, nearest: float) -> None:
-    far, near = found_range(surface_scene.drawn_views(LEVEL_E), NODES, farthest, nearest)
+    far, near = found_range(surface_scene.drawn_views(LEVEL_E), farthest, nearest)
     assert farthest <= far < FAR < NEAR < near <= nearest
     assert near - far < 2 * (NEAR - FAR)
 
@@ -67,7 +67,7 @@ def test_range_contains_the_scene_and_little_more(farthest: float, nearest: floa
 def test_noise_alone_has_no_range() -> None:
     views = surface_scene.noisy_views_of(np.full((25, *SHAPE), 5.0), 1)
     with pytest.raises(NothingInFocus, match=r"^the views tell the depth of [0-9.]+% of the picture; give"):
-        found_range(views, NODES, 1 / 1000, 1 / 380)
+        found_range(views, 1 / 1000, 1 / 380)
 
 
 def _evidence(views: PinholeViews) -> DepthEvidence:

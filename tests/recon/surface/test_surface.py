@@ -106,7 +106,8 @@ def _views(light: NDArray[np.floating] | None = None, count: int = 6) -> Pinhole
     if light is None:
         light = generator.uniform(1, 9, (count, *SHAPE))
         light[generator.random(light.shape) < 0.1] = UNKNOWN
-    return PinholeViews(light.astype(np.float32), 1.5, matrices, (11.0, 10.0), (5.2, 3.4), GRID)
+    nodes = np.argwhere(np.ones((1, count)))
+    return PinholeViews(light.astype(np.float32), 1.5, matrices, (11.0, 10.0), (5.2, 3.4), GRID, nodes)
 
 
 def _place(views: PinholeViews, view: int, row: int, column: int) -> tuple[float, float]:
@@ -187,5 +188,6 @@ def test_bins_add_light_of_their_pixels() -> None:
 def test_reach_is_samples_moved_per_inverse_depth() -> None:
     matrices = np.stack([np.eye(3, 4)] * 2)
     matrices[1, :2, 3] = -30, 40
-    views = PinholeViews(np.ones((2, *SHAPE), np.float32), 1.0, matrices, (10.0, 10.0), (5.0, 3.5), GRID)
+    light, nodes = np.ones((2, *SHAPE), np.float32), np.array([(0, 0), (0, 1)])
+    views = PinholeViews(light, 1.0, matrices, (10.0, 10.0), (5.0, 3.5), GRID, nodes)
     np.testing.assert_allclose(views.reach, [0, 50 / 0.1], rtol=1e-6)  # samples are 0.1 apart

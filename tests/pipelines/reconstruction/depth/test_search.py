@@ -16,8 +16,8 @@ from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
-from faintfield.pipelines.reconstruction.depth.comparison import BETWEEN_PIXELS
-from faintfield.pipelines.reconstruction.depth.search import between_pixels, enlarged
+from faintfield.pipelines.reconstruction.depth.comparison import BETWEEN_PIXELS, between_pixels
+from faintfield.pipelines.reconstruction.depth.search import enlarged
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
 from faintfield.pipelines.reconstruction.planes.penalised import Objective, solve_then_sigma
 from faintfield.pipelines.reconstruction.planes.solve import solve
@@ -25,7 +25,7 @@ from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.surface.pinhole_views import UNKNOWN
 from tests.pipelines.conftest import Command, Edit, assert_refused
 from tests.pipelines.surfaces import Searches
-from tests.recon.surface_scene import expected_light, views_of
+from tests.recon.surface_scene import GRID
 
 RANGE = ("--depth-range-mm", "400:900")
 FAST = (*RANGE, "--penalty-weight", 0.5, "--passes", 2)
@@ -48,15 +48,15 @@ def test_search_is_given_electrons_of_light(seen: Searches, scene: Path, edit: E
     done("reconstruct", scene, "--surface", *FAST, "--out", scene / "out")
     edit(scene, lambda settings: [view.pop("node") for view in settings["view"]])
     done("reconstruct", scene, "--surface", *FAST, "--out", scene / "row")
-    (views, inverse_depths, nodes), (_, _, row) = seen
-    assert row.tolist() == [[0, index] for index in range(9)]
+    (views, inverse_depths), (row_of_views, _) = seen
+    assert row_of_views.nodes.tolist() == [[0, index] for index in range(9)]
     assert views.light_e.shape == (9, 72, 96)
     np.testing.assert_allclose(views.light_e[5], _light_e(scene, "view_r1_c2.tiff"), atol=1e-4)
     assert (views.light_e[1] == UNKNOWN).all()
     assert (np.delete(views.light_e, 1, axis=0) > -100).all()
     assert tifffile.imread(scene / "out" / "visibility.tiff").max() < 8.5
     assert (1 / inverse_depths[[-1, 0]]).tolist() == pytest.approx([400, 900])
-    assert nodes[5].tolist() == [1, 2]
+    assert views.nodes[5].tolist() == [1, 2]
 
 
 def test_mosaic_is_binned_by_its_period(
@@ -175,8 +175,7 @@ def test_samples_between_pixels_have_mean_blur() -> None:
     places = (np.arange(1000) + 0.5) / 1000
     anywhere = np.mean((1 - places) ** 2 + places**2)
     assert (1 - BETWEEN_PIXELS) ** 2 + BETWEEN_PIXELS**2 == pytest.approx(anywhere, rel=1e-5)
-    views = views_of(expected_light(1.0))
-    before, after = views.grid, between_pixels(views).grid
+    before, after = GRID, between_pixels(GRID)
     moved_mm = np.subtract(after.origin_mm, before.origin_mm)
     np.testing.assert_allclose(moved_mm, BETWEEN_PIXELS * before.pitch_mm, rtol=1e-9)
     assert (after.shape, after.pitch_mm) == (before.shape, before.pitch_mm)
