@@ -67,16 +67,18 @@ class Objective:
     """Objective that PMLEM minimises, without the penalty's weight.
 
     `posed` is the operator, and the images with their likelihood; `level_e` the mean light of the samples that the
-    views see, in electrons.
+    views see, in electrons. In the sum with `other_colours` (samples) a prior finds groups of alike patches.
     """
 
     posed: SceneProblem
     penalty: Penalty
     start: Image
     level_e: float
+    options: SolverOptions
+    other_colours: Image | None = None
 
     @classmethod
-    def of(cls, posed: SceneProblem, options: SolverOptions) -> "Objective":
+    def of(cls, posed: SceneProblem, options: SolverOptions, other_colours: Image | None = None) -> "Objective":
         """Choose likelihood and penalty according to the options, the light and the noise."""
         start = posed.start()
         level_e = mean_light_e(posed.operator, start)
@@ -86,13 +88,13 @@ class Objective:
         def noise_e() -> float:
             return float(1 / np.sqrt(np.median(posed.fit(level_e).metric(start)[posed.well_seen()])))
 
-        return cls(posed, Penalty.for_noise(options.penalty, noise_e), start, level_e)
+        return cls(posed, Penalty.for_noise(options.penalty, noise_e), start, level_e, options, other_colours)
 
 
-def solve_pmlem(objective: Objective, options: SolverOptions) -> list[Solution]:
+def solve_pmlem(objective: Objective) -> list[Solution]:
     """Run PMLEM to its certificate and return the planes; all their records are of the one iteration."""
-    weight, start, dual, how = _choose_weight(objective, options)
-    record, samples = certified(objective, start, weight, dual, options)
+    weight, start, dual, how = _choose_weight(objective)
+    record, samples = certified(objective, start, weight, dual)
     record = structs.replace(record, **{"passes_before": 1.0, "penalty_weight_curve": None} | how)
     return [Solution(plane, record) for plane in objective.posed.operator.planes_of(samples)]
 
@@ -122,9 +124,7 @@ def with_sigma(
     ]
 
 
-def certified(
-    objective: Objective, start: Image, weight: float, dual: DualField, options: SolverOptions
-) -> tuple[SolveRecord, Image]:
+def certified(objective: Objective, start: Image, weight: float, dual: DualField) -> tuple[SolveRecord, Image]:
     """Run PMLEM with a given weight to its certificate; return its record and samples.
 
     The dual field says from where, and from which proposal the penalty counts.
@@ -137,7 +137,7 @@ def certified(
         tolerance=_TOLERANCE,
         dual=dual,
     )
-    limit = options.passes or MAX_PASSES
+    limit = objective.options.passes or MAX_PASSES
     for count, iterate in enumerate(iterates, 1):
         if iterate.certificate.distance <= _TOLERANCE or max(count, iterate.passes) >= limit:
             break
@@ -163,20 +163,20 @@ def certified(
     return record, iterate.plane
 
 
-def solve_then_sigma(objective: Objective, options: SolverOptions) -> tuple[Solution, Callable[[], Image]]:
+def solve_then_sigma(objective: Objective) -> tuple[Solution, Callable[[], Image]]:
     """Reconstruct one colour of one plane by PMLEM; also return a function that computes its standard deviation.
 
     That takes memory for many planes, but neither the images nor the operator: the caller can drop these first.
     """
-    (solution,) = solve_pmlem(objective, options)
+    (solution,) = solve_pmlem(objective)
     (local,) = local_fits(objective.posed.operator, objective.posed.fit(objective.level_e), solution.plane)
     weight, generator = solution.record.penalty_weight or 0.0, np.random.default_rng(_SEED)
     return solution, partial(standard_deviation, local, weight, objective.penalty, generator)
 
 
-def _choose_weight(objective: Objective, options: SolverOptions) -> tuple[float, Image, DualField, dict[str, Any]]:
+def _choose_weight(objective: Objective) -> tuple[float, Image, DualField, dict[str, Any]]:
     """Return the penalty weight for PMLEM, where a reconstruction with it may start, and how it was chosen."""
-    posed, start = objective.posed, objective.start
+    posed, start, options = objective.posed, objective.start, objective.options
     if options.penalty == "none":
         return 0.0, start, posed.dual(), {"penalty_weight_chosen": "none: no penalty"}
     if options.penalty_weight != "auto":

@@ -19,29 +19,22 @@ from faintfield.recon.solver.cross_validation import MIN_VIEWS
 from faintfield.recon.solver.uncertainty import Answers, LocalProblem
 
 
-def with_prior(
-    objective: Objective,
-    solutions: Sequence[Solution],
-    options: SolverOptions,
-    *,
-    other_colours: Image | None = None,
-) -> list[Solution]:
+def with_prior(objective: Objective, solutions: Sequence[Solution]) -> list[Solution]:
     """Return planes under the prior of the options, given those of total variation.
 
     The proposal x̂ is a mixture of candidates chosen by held-out views. What is returned is the certified optimum of
     `min L(f) + β TV(f − x̂)` over f ≥ 0, with the β of total variation: where the data contradict the proposal, they
-    win. Its record says how far they moved it. Groups of alike patches are found in the sum with `other_colours`
-    (samples), if given. Standard deviations are added where the options ask for them.
+    win. Its record says how far they moved it. Standard deviations are added where the options ask for them.
     """
     found, answers = list(solutions), None
-    if options.has_prior:
-        made = _about_proposals(objective, solutions, options, other_colours=other_colours)
+    if objective.options.has_prior:
+        made = _about_proposals(objective, solutions)
         if isinstance(made, str):
             prior = PriorRecord(name="tv", left_out=made)
             found = [replace(solution, record=structs.replace(solution.record, prior=prior)) for solution in solutions]
         else:
             found, answers = made
-    return with_sigma(objective, found, answers) if options.uncertainty else found
+    return with_sigma(objective, found, answers) if objective.options.uncertainty else found
 
 
 def _contradiction(objective: Objective, samples: Image, evidences: Sequence[Evidence]) -> str | None:
@@ -59,10 +52,11 @@ def _contradiction(objective: Objective, samples: Image, evidences: Sequence[Evi
 
 
 def _about_proposals(
-    objective: Objective, solutions: Sequence[Solution], options: SolverOptions, *, other_colours: Image | None
+    objective: Objective, solutions: Sequence[Solution]
 ) -> tuple[list[Solution], Callable[[int, LocalProblem], Answers]] | str:
     """Return the planes about their proposals, and how each answers to noise; or why nothing is proposed."""
-    operator, first = objective.posed.operator, solutions[0].record
+    operator, options, first = objective.posed.operator, objective.options, solutions[0].record
+    other_colours = objective.other_colours
     if len(operator.seeing_views) < MIN_VIEWS:
         return "too few views to hold some out"
     weight = first.penalty_weight or 0.0
@@ -82,7 +76,7 @@ def _about_proposals(
         return "total variation predicts held-out views best"
     proposed = operator.samples_of([proposal.picture for proposal in proposals])
     dual = replace(objective.posed.dual(), proposal=proposed)
-    record, found = certified(objective, np.maximum(proposed, 1e-3 * objective.start), weight, dual, options)
+    record, found = certified(objective, np.maximum(proposed, 1e-3 * objective.start), weight, dual)
     record = structs.replace(
         record,
         penalty_weight_chosen=first.penalty_weight_chosen,

@@ -17,7 +17,7 @@ from faintfield.pipelines.reconstruction.operators import OperatorFactory
 from faintfield.pipelines.reconstruction.planes.penalised import Objective, Pilot, Solution, solve_pmlem
 from faintfield.pipelines.reconstruction.planes.prior import with_prior
 from faintfield.recon.errors import GeometryMismatch
-from faintfield.recon.likelihood.images import ElementalImages, Image, select_likelihood
+from faintfield.recon.likelihood.images import ElementalImages, select_likelihood
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.occlusion import opacity
 from faintfield.recon.operator.plane_operator import PlaneOperator
@@ -70,9 +70,8 @@ def solve(
         chosen = "none: a mean of the views"
         return Solution(plane, SolveRecord(penalty_weight=None, penalty_weight_chosen=chosen, passes=1))
     if method == "pmlem":
-        objective = Objective.of(SceneProblem(operator, images), options)
-        start = [pilot.solution] if pilot else solve_pmlem(objective, options)
-        return with_prior(objective, start, options, other_colours=pilot.other_colours if pilot else None)[0]
+        objective = Objective.of(SceneProblem(operator, images), options, pilot.other_colours if pilot else None)
+        return with_prior(objective, [pilot.solution] if pilot else solve_pmlem(objective))[0]
     return _solve_one_step_late(operator, images, method, options)
 
 
@@ -130,16 +129,14 @@ def solve_together(
     """
     _check_memory(grids.values())
     operator = factory.of_scene(grids)
-    objective = Objective.of(SceneProblem(operator, images), options)
-    joint = [pilots[place].solution for place in grids] if pilots else solve_pmlem(objective, options)
     other_colours = operator.samples_of([pilots[place].other_colours for place in grids]) if pilots else None
+    objective = Objective.of(SceneProblem(operator, images), options, other_colours)
+    joint = [pilots[place].solution for place in grids] if pilots else solve_pmlem(objective)
     found: dict[Method, list[Solution]] = {}
     if "joint" in methods:
-        found["joint"] = with_prior(objective, joint, options, other_colours=other_colours)
+        found["joint"] = with_prior(objective, joint)
     if "occlusion" in methods:
-        found["occlusion"] = _with_occlusion(
-            factory, objective, grids, joint, options, other_colours, found.get("joint")
-        )
+        found["occlusion"] = _with_occlusion(factory, objective, grids, joint, found.get("joint"))
     return {method: dict(zip(grids, planes, strict=True)) for method, planes in found.items()}
 
 
@@ -159,8 +156,6 @@ def _with_occlusion(
     objective: Objective,
     grids: Mapping[Place, PlaneGrid],
     joint: list[Solution],
-    options: SolverOptions,
-    other_colours: Image | None,
     done: list[Solution] | None,
 ) -> list[Solution]:
     """Estimate opacity from the planes, then reconstruct the light again behind it with the same penalty weight.
@@ -171,27 +166,24 @@ def _with_occlusion(
     The plane written is `α f`: where a plane is transparent it has no light of its own. The certificate is that of f.
     """
     first = joint[0].record
-    options = replace(options, penalty_weight=first.penalty_weight or 0.0)
 
     def without(reason: str) -> list[Solution]:
         inform(f"occlusion is left out: {reason}; the planes are those of joint")
         return [
             replace(solution, record=structs.replace(solution.record, occlusion=False, occlusion_left_out=reason))
-            for solution in done or with_prior(objective, joint, options, other_colours=other_colours)
+            for solution in done or with_prior(objective, joint)
         ]
 
     try:
         occluded = factory.of_scene(grids, [opacity(solution.plane) for solution in joint])
     except GeometryMismatch:
         return without("a plane would be hidden from all views")
-    behind = replace(objective, posed=replace(objective.posed, operator=occluded))
-    better = solve_pmlem(behind, options)
+    options = replace(objective.options, penalty_weight=first.penalty_weight or 0.0)
+    behind = replace(objective, posed=replace(objective.posed, operator=occluded), options=options)
+    better = solve_pmlem(behind)
     if (better[0].record.objective or 0.0) >= (first.objective or 0.0):
         return without("it explains the images no better")
-    return [
-        _of_opaque_part(solution, first)
-        for solution in with_prior(behind, better, options, other_colours=other_colours)
-    ]
+    return [_of_opaque_part(solution, first) for solution in with_prior(behind, better)]
 
 
 def _of_opaque_part(solution: Solution, first: SolveRecord) -> Solution:

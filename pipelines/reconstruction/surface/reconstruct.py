@@ -146,11 +146,11 @@ def _light(
     if message := blind_views(elemental_set, operator, "the surface"):
         inform(message)
     objective = Objective.of(SceneProblem(operator, images), options)
-    solution, sigma = solve_then_sigma(objective, options)
+    solution, sigma = solve_then_sigma(objective)
     if options.prior is None:
         solution = replace(solution, plane=refined(operator, images, solution.plane))
     else:
-        (solution,) = with_prior(objective, [solution], options)
+        (solution,) = with_prior(objective, [solution])
     visibility = _visibility(operator, layout)
     del images, factory, operator, objective
     return replace(solution, sidecars=solution.sidecars | {"sigma": sigma(), "visibility": visibility})

@@ -98,7 +98,7 @@ def test_frames_in_turn_give_planes_of_the_session(session: Path, bins: int) -> 
     assert 1 < rounds < 15 if interrupted else rounds == 1
     objective = Objective.of(SceneProblem(operator, images), SolverOptions())
     weight = universal_penalty_weight(operator, objective.posed.images, objective.start)
-    record, solved = certified(objective, objective.start, weight, objective.posed.dual(), SolverOptions())
+    record, solved = certified(objective, objective.start, weight, objective.posed.dual())
     assert record.certificate is not None
     assert record.certificate.reached
     refined = planes.picture(0, "pmlem")

@@ -126,21 +126,21 @@ def test_intervals_cover_the_truth_on_objects(truth: Image, prior: PriorName) ->
 def test_plane_about_proposal_answers_as_to_other_data() -> None:
     operator, images = dark_views(pieces(48), 3)
     objective = Objective.of(SceneProblem(operator, images), SolverOptions())
-    (pilot,) = solve_pmlem(objective, SolverOptions())
+    (pilot,) = solve_pmlem(objective)
     weight = pilot.record.penalty_weight or 0.0
     (evidence,) = evidence_of_planes(operator, images, pilot.plane)
     (proposal,) = propose(objective.posed, pilot.plane, [evidence], weight, patch_candidates)
 
     def about(posed: SceneProblem, proposed: Image) -> Image:
         dual = replace(posed.dual(), proposal=proposed)
-        return certified(replace(objective, posed=posed), objective.start, weight, dual, SolverOptions())[1]
+        return certified(replace(objective, posed=posed), objective.start, weight, dual)[1]
 
     plane = about(objective.posed, proposal.picture)
     deviation = np.sqrt(images.background_e + images.read_variance_e2)
     noise = np.random.default_rng(5).normal(0, deviation, images.electrons.shape)
     noisy = replace(objective.posed.images, electrons=(images.electrons + 0.5 * noise).astype(np.float32))
     others = replace(objective.posed, images=noisy)
-    (other_pilot,) = solve_pmlem(replace(objective, posed=others), SolverOptions(penalty_weight=weight))
+    (other_pilot,) = solve_pmlem(replace(objective, posed=others, options=SolverOptions(penalty_weight=weight)))
     (other_evidence,) = evidence_of_planes(operator, noisy, other_pilot.plane)
     really = about(others, proposal.again(other_evidence._replace(noise=evidence.noise), other_pilot.plane)) - plane
 

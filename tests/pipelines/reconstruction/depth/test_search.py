@@ -151,7 +151,7 @@ def test_deviation_without_images_is_that_of_plane(simulated_scene: Path) -> Non
     images = load_channel(elemental_set, layout)
     operator = OperatorFactory(elemental_set, layout, images).at(500.0, plane_grid(elemental_set, 500.0))
     settings = SolverOptions(penalty_weight=0.5, passes=5)
-    solution, sigma = solve_then_sigma(Objective.of(SceneProblem(operator, images), settings), settings)
+    solution, sigma = solve_then_sigma(Objective.of(SceneProblem(operator, images), settings))
     expected = solve(operator, images, "pmlem", replace(settings, uncertainty=True))
     np.testing.assert_array_equal(solution.plane, expected.plane)
     np.testing.assert_array_equal(sigma(), expected.sidecars["sigma"])

@@ -1,6 +1,7 @@
 """`reconstruct --prior`: its files and records, errors below those without it, and the light of other colours."""
 
 import weakref
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -174,11 +175,11 @@ def _by_hand(folder: Path, depth_mm: float, settings: SolverOptions) -> list[Ima
         images = load_channel(elemental_set, layout)
         operator = OperatorFactory(elemental_set, layout, images).at(depth_mm, plane_grid(elemental_set, depth_mm))
         objectives.append(Objective.of(SceneProblem(operator, images), settings))
-        first.append(solve_pmlem(objectives[-1], settings))
+        first.append(solve_pmlem(objectives[-1]))
     red, green, blue = (solution.plane for (solution,) in first)
     others = [green + blue, red + blue, red + green]
     return [
-        with_prior(objective, solution, settings, other_colours=light)[0].plane
+        with_prior(replace(objective, other_colours=light), solution)[0].plane
         for objective, solution, light in zip(objectives, first, others, strict=True)
     ]
 
