@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
-from msgspec import UNSET
+from msgspec import UNSET, UnsetType
 
 from faintfield.pipelines.arguments import PriorName, SolverOptions
 from faintfield.pipelines.errors import WrongUsage
@@ -59,33 +59,27 @@ class Request:
     disparities_px: dict[float, float] = field(default_factory=dict)
     tilted: list[TiltedPlane] = field(default_factory=list)
     found: BestFocusRecord | None = None
-    auto_sweep: int | None = None
+    auto_sweep: int | UnsetType = UNSET
 
-    def of_plane(self, method: Method, place: Place) -> "Request":
-        """Return the part of the request that one plane depends on: all planes for methods that solve them together."""
-        alone = replace(self, with_depth_map=False, auto_sweep=None)
-        if method in JOINT_METHODS:
-            return alone
-        if isinstance(place, TiltedPlane):
-            return replace(alone, depths_mm=[], tilted=[place])
-        return replace(alone, depths_mm=[place], tilted=[])
-
-    def options(self, method: Method, poses: Poses) -> ReconstructionOptions:
-        """Return the options that the results of a method record."""
+    def options(self, method: Method, poses: Poses, place: Place | None = None) -> ReconstructionOptions:
+        """Return the options that the results of a method record, or those that one plane of it depends on."""
         solver, improves = self.solver, method in _WITH_PRIOR
+        depths_mm, tilted = self.depths_mm, self.tilted
+        if place is not None and method not in JOINT_METHODS:
+            depths_mm, tilted = ([], [place]) if isinstance(place, TiltedPlane) else ([place], [])
         effective = {
             "prior": solver.prior if solver.has_prior and improves else UNSET,
             "proposal": (solver.proposal and improves) or UNSET,
         }
         return ReconstructionOptions(
             method=method,
-            depth_mm=self.depths_mm,
+            depth_mm=depths_mm,
             **vars(solver) | effective,
             pitch_mm=self.pitch_mm,
             focus=self.with_focus,
-            auto_sweep=UNSET if self.auto_sweep is None else self.auto_sweep,
-            depth_map=("px" if self.disparities_px else "mm") if self.with_depth_map else None,
-            plane_pose={plane.name: [*plane.rt_ref_plane, *(plane.size_mm or ())] for plane in self.tilted},
+            auto_sweep=self.auto_sweep if place is None else UNSET,
+            depth_map=("px" if self.disparities_px else "mm") if self.with_depth_map and place is None else None,
+            plane_pose={plane.name: [*plane.rt_ref_plane, *(plane.size_mm or ())] for plane in tilted},
             poses=poses,
         )
 
@@ -261,7 +255,7 @@ def resolve(
         disparities_px=disparities if len(disparities) == len(depths) else {},
         tilted=selection.tilted,
         found=found,
-        auto_sweep=len(swept_mm) if selection.auto_sweep else None,
+        auto_sweep=len(swept_mm) if selection.auto_sweep else UNSET,
     )
 
 

@@ -15,7 +15,7 @@ from faintfield.pipelines.formats.files import remove, remove_leftovers, require
 from faintfield.pipelines.formats.plane_poses import Place
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.results.figures import METRICS_FILE, Metrics
-from faintfield.pipelines.formats.results.plane_files import PARTS, PlaneFiles
+from faintfield.pipelines.formats.results.plane_files import PARTS, Origin, PlaneFiles
 from faintfield.pipelines.formats.results.records import (
     RECONSTRUCTION_FILE,
     REPORT_FILE,
@@ -37,7 +37,7 @@ from faintfield.pipelines.reconstruction.depth.depth_map import kept_depth_map, 
 from faintfield.pipelines.reconstruction.depth.search import check_overlap, check_views, depths_of_set
 from faintfield.pipelines.reconstruction.operators import default_pitch_px, plane_grid, tilted_grid
 from faintfield.pipelines.reconstruction.overview import inspect_set, write_overview
-from faintfield.pipelines.reconstruction.planes.sweep import Runner, Sweep, run_serially
+from faintfield.pipelines.reconstruction.planes.sweep import PlaneTask, Runner, Sweep, run_serially
 from faintfield.pipelines.reconstruction.request import Request, folder_of_method
 from faintfield.recon.operator.grid import PlaneGrid
 
@@ -158,21 +158,19 @@ def _sweep(elemental_set: ElementalSet, folders: dict[Method, Path], request: Re
     for plane in request.tilted:
         grids[plane] = tilted_grid(elemental_set, plane, request.pitch_mm or plane.depth_mm * mm_per_depth)
     inputs = elemental_set.input_hashes()
-    units = elemental_set.units
-    all_planes = {
-        name: provenance(
-            "reconstruct", in_units(elemental_set, request.options(name, elemental_set.poses)), inputs, units
-        )
-        for name in folders
-    }
+
+    def origin(method: Method, place: Place | None = None) -> Origin:
+        options = in_units(elemental_set, request.options(method, elemental_set.poses, place))
+        return provenance("reconstruct", options, inputs, elemental_set.units)
+
     channels = tuple(layout.name for layout in layouts)
-    files = []
-    for place in grids:
-        for name, folder in folders.items():
-            options = in_units(elemental_set, request.of_plane(name, place).options(name, elemental_set.poses))
-            origin = msgspec.structs.replace(all_planes[name], options=options)
-            files.append(PlaneFiles(folder, name, place, channels, origin, plane_stem(elemental_set, place)))
-    return Sweep(elemental_set, layouts, grids, files, all_planes, request.solver, request.with_focus)
+    files = tuple(
+        PlaneFiles(folder, name, place, channels, origin(name, place), plane_stem(elemental_set, place))
+        for place in grids
+        for name, folder in folders.items()
+    )
+    plan = PlaneTask(tuple(layouts), grids, files, request.solver, request.with_focus)
+    return Sweep(elemental_set, plan, {name: origin(name) for name in folders})
 
 
 def _warn(elemental_set: ElementalSet, records: list[PlaneRecord]) -> None:

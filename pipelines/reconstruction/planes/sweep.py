@@ -179,43 +179,38 @@ def run_serially(
 class Sweep:
     """The planes of one call: those missing are made, and each is written as soon as all its colours are there.
 
-    There is a file for each method and plane. `origins` are the provenances of all planes of a method together, and
-    `finished` the planes that are there.
+    `plan` is the task of all planes. `origins` are the provenances of all planes of a method together, and `finished`
+    the planes that are there.
     """
 
     elemental_set: ElementalSet
-    layouts: list[ChannelLayout]
-    grids: dict[Place, PlaneGrid]
-    files: Sequence[PlaneFiles]
+    plan: PlaneTask
     origins: dict[Method, Origin]
-    solver: SolverOptions
-    with_focus: bool
     finished: dict[tuple[Method, Place], PlaneFileRecord] = field(default_factory=dict)
 
     def needed_bytes(self) -> int:
         """Return about how much disk the results take: planes, previews, and the report that shows them again."""
-        samples = sum(grid.shape[0] * grid.shape[1] for grid in self.grids.values()) * len(self.layouts)
-        beside = self.solver.uncertainty + 2 * self.solver.proposal
+        samples = sum(grid.shape[0] * grid.shape[1] for grid in self.plan.grids.values()) * len(self.plan.layouts)
+        beside = self.plan.solver.uncertainty + 2 * self.plan.solver.proposal
         files = len(self.origins) * (1 + beside) + ("occlusion" in self.origins)
         return samples * files * (np.dtype(np.float32).itemsize + 3)
 
     def run(self, runner: Runner, out: Path) -> None:
         """Run the missing tasks, and write each plane at once (FileFailed: a colour cannot be read back)."""
-        for files in self.files:
+        planned = self.plan.files
+        for files in planned:
             if record := files.finished():
                 self.finished[files.method, files.place] = record
         if self.finished:
-            inform(
-                f"{len(self.finished)} of {len(self.files)} planes are there, made from the same inputs; they are kept"
-            )
+            inform(f"{len(self.finished)} of {len(planned)} planes are there, made from the same inputs; they are kept")
         tasks = self._tasks()
-        self._write_complete(self.files)
+        self._write_complete(planned)
         with closing(runner(self.elemental_set, out, tasks)) as done:
             for task, messages in progress(done, "reconstructing planes", len(tasks)):
                 for message in messages:
                     inform(message)
                 self._write_complete(task.files)
-        for files in self.files:
+        for files in planned:
             if (files.method, files.place) not in self.finished:
                 raise FileFailed(
                     f"{files.path}: one of its colours cannot be read back after it was written; see to its disk, and "
@@ -224,18 +219,18 @@ class Sweep:
 
     def _tasks(self) -> list[PlaneTask]:
         """Return the missing tasks, one channel after the other; with all channels in each if a prior compares them."""
-        wanted = [files for files in self.files if (files.method, files.place) not in self.finished]
-        missing = [files.missing() for files in wanted]
-        tasks = []
-        for layouts in [self.layouts] if self.solver.has_prior else [[layout] for layout in self.layouts]:
+        plan, tasks = self.plan, []
+        wanted = [files for files in plan.files if (files.method, files.place) not in self.finished]
+        missing = [(files, files.missing()) for files in wanted]
+        for layouts in [plan.layouts] if plan.solver.has_prior else [(layout,) for layout in plan.layouts]:
             names = {layout.name for layout in layouts}
-            left = [files for files, channels in zip(wanted, missing, strict=True) if names.intersection(channels)]
+            left = [files for files, channels in missing if names.intersection(channels)]
             single = [files for files in left if files.method not in JOINT_METHODS]
-            for place, grid in self.grids.items():
+            for place, grid in plan.grids.items():
                 of_plane = tuple(files for files in single if files.place == place)
-                tasks.append(PlaneTask(tuple(layouts), {place: grid}, of_plane, self.solver, self.with_focus))
+                tasks.append(replace(plan, layouts=layouts, grids={place: grid}, files=of_plane))
             joint = tuple(files for files in left if files.method in JOINT_METHODS)
-            tasks.append(PlaneTask(tuple(layouts), self.grids, joint, self.solver, self.with_focus))
+            tasks.append(replace(plan, layouts=layouts, files=joint))
         return [task for task in tasks if task.files]
 
     def _write_complete(self, candidates: Sequence[PlaneFiles]) -> None:
@@ -249,8 +244,8 @@ class Sweep:
         """The records of all planes: by channel, plane, method."""
         return [
             self.finished[method, place].planes[index]
-            for index in range(len(self.layouts))
-            for place in self.grids
+            for index in range(len(self.plan.layouts))
+            for place in self.plan.grids
             for method in self.origins
         ]
 
@@ -258,15 +253,17 @@ class Sweep:
     def written(self) -> dict[tuple[Method, float], Path]:
         """The files of the planes of constant depth."""
         return {
-            (files.method, files.place): files.path for files in self.files if not isinstance(files.place, TiltedPlane)
+            (files.method, files.place): files.path
+            for files in self.plan.files
+            if not isinstance(files.place, TiltedPlane)
         }
 
     def focus(self) -> FocusCurve | None:
         """Return the focus curve of a sweep and the depths of its peaks, None if not asked for."""
-        if not self.with_focus:
+        if not self.plan.with_focus:
             return None
-        method = self.files[0].method
-        depths = [place for place in self.grids if not isinstance(place, TiltedPlane)]
+        method = self.plan.files[0].method
+        depths = [place for place in self.plan.grids if not isinstance(place, TiltedPlane)]
         curve = [_sum(self.finished[method, depth].focus) for depth in depths]
         stated = self.elemental_set.stated_depth
         return FocusCurve(
