@@ -259,7 +259,7 @@ def _shared_folder(out: Path) -> Iterator[Path]:
 class _Colour:
     """A colour in files: `path`, whose suffixes tell its arrays apart, and the shape (view, row, column).
 
-    The set is without its maps and its noise, so that a task is small.
+    The set is without its maps, so that a task is small; of its noise, it keeps what converts light to its unit.
     """
 
     path: Path
@@ -274,10 +274,10 @@ class _Colour:
 
 @dataclass(frozen=True)
 class _Job:
-    """A task with the files of its colours."""
+    """A task with the files of its colours, by name."""
 
     task: PlaneTask
-    colours: tuple[_Colour, ...]
+    colours: dict[str, _Colour]
 
 
 def _jobs(elemental_set: ElementalSet, shared: Path, tasks: Sequence[PlaneTask]) -> Iterator[_Job]:
@@ -288,18 +288,16 @@ def _jobs(elemental_set: ElementalSet, shared: Path, tasks: Sequence[PlaneTask])
             if layout.name not in colours:
                 colours[layout.name] = _share(elemental_set, layout, shared)
         elsewhere = tuple(replace(files, folder=files.folder.resolve()) for files in task.files)
-        yield _Job(replace(task, files=elsewhere), tuple(colours[layout.name] for layout in task.layouts))
+        yield _Job(replace(task, files=elsewhere), {layout.name: colours[layout.name] for layout in task.layouts})
 
 
 def _share(elemental_set: ElementalSet, layout: ChannelLayout, shared: Path) -> _Colour:
     """Read a colour into files that all workers map: its electrons, its valid pixels, and the maps of the detector."""
-    small = replace(
-        elemental_set,
-        noise=NoiseModel(0.0, 1.0, 0.0),
-        flat=None,
-        unusable=np.zeros((0, 0), bool),
-        read_frame=read_frame,
+    noise = elemental_set.noise
+    means = NoiseModel(
+        float(np.mean(noise.offset_dn)), float(np.mean(noise.gain_dn_per_e)), 0.0, saturation_dn=noise.saturation_dn
     )
+    small = replace(elemental_set, noise=means, flat=None, unusable=np.zeros((0, 0), bool), read_frame=read_frame)
     shape = (len(elemental_set.settings.view) * len(layout.lattices), *layout.lattices[0].shape)
     colour = _Colour(shared / layout.name, shape, small, layout)
 
@@ -333,5 +331,4 @@ def _opened(colour: _Colour) -> Channel:
 
 
 def _do(job: _Job) -> list[str]:
-    by_name = {colour.layout.name: colour for colour in job.colours}
-    return do_task(job.task, lambda layout: _opened(by_name[layout.name]))
+    return do_task(job.task, lambda layout: _opened(job.colours[layout.name]))
