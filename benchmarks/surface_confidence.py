@@ -11,7 +11,6 @@ one that holds true_depth_mm.tiff, of several scenes at several levels of light.
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +19,6 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from faintfield.pipelines.formats.sets.elemental_set import load_set
-from faintfield.pipelines.reconstruction.depth.comparison import between_pixels
 from faintfield.pipelines.reconstruction.depth.search import default_bins, luminance
 from faintfield.recon.surface.confidence import COEFFICIENTS, RIGHT_WITHIN, SURE, features
 from faintfield.recon.surface.estimate import equal_steps, first_depths, halves, next_depths
@@ -39,7 +37,6 @@ def samples_of(folder: Path, truth: Path) -> tuple[NDArray[np.float64], NDArray[
     elemental_set = load_set(folder)
     bins = default_bins(elemental_set)
     views = luminance(elemental_set, bins)
-    views = replace(views, grid=between_pixels(views.grid))
     true_mm = tifffile.imread(truth / "true_depth_mm.tiff")[bins // 2 :: bins, bins // 2 :: bins]
     true_mm = true_mm[: views.grid.shape[0], : views.grid.shape[1]]
     depths = equal_steps(views, 1 / (1.2 * float(np.nanmax(true_mm))), 1 / (0.85 * float(np.nanmin(true_mm))))

@@ -57,6 +57,7 @@ def default_bins(elemental_set: ElementalSet) -> int:
 def luminance(elemental_set: ElementalSet, bins: int) -> PinholeViews:
     """Return the light of all views, in bins of `bins` by `bins` detector pixels, with distortion undone.
 
+    The samples of the surface lie between the bins, see `between_pixels`.
     Each view is read by one thread. Raises WrongSize, WrongBitDepth or UnreadableImage for a frame that does not match.
     """
     layouts = channel_layouts(elemental_set)
@@ -93,7 +94,7 @@ def luminance(elemental_set: ElementalSet, bins: int) -> PinholeViews:
         ray_from_surface(elemental_set.poses_rt_cam_ref, principal_shift(elemental_set)),
         (camera.fx_px / bins, camera.fy_px / bins),
         ((camera.cx_px + 0.5) / bins - 0.5, (camera.cy_px + 0.5) / bins - 0.5),
-        plane_grid(elemental_set, 1.0).binned(bins),
+        between_pixels(plane_grid(elemental_set, 1.0).binned(bins)),
         _nodes(elemental_set),
     )
 
@@ -203,7 +204,6 @@ def depths_of_set(
     """
     bins, grid = default_bins(elemental_set), plane_grid(elemental_set, 1.0)
     views = luminance(elemental_set, bins)
-    views = replace(views, grid=between_pixels(views.grid))
     near, far = 1 / range_mm[0], 1 / range_mm[1]
     with naming_range(elemental_set, far, near):
         if find_range:
