@@ -18,7 +18,7 @@ from faintfield.recon.operator.kernels import Hiding
 from faintfield.recon.operator.occlusion import Occluders, hiding_of
 from faintfield.recon.operator.placement import EDGE_TOLERANCE, UNSEEN
 from faintfield.recon.operator.relief import Relief
-from faintfield.recon.operator.sweeps import Sweeps
+from faintfield.recon.operator.sweeps import Sweep, Sweeps
 
 type Scene = tuple[kernels.SceneGeometry, Hiding]
 
@@ -37,18 +37,9 @@ class ArraySweeps:
         self._dtype = geometry.maps.dtype
         self._kept: dict[int, list[sparse.csr_array]] = {}
 
-    def run(
-        self,
-        operation: int,
-        views: NDArray[np.intp],
-        image_of_view: NDArray[np.intp],
-        *,
-        samples: Image | None = None,
-        images: Image | None = None,
-        seen: Image | None = None,
-        pixels: kernels.PixelModel | None = None,
-    ) -> tuple[float, Image]:
+    def run(self, sweep: Sweep) -> tuple[float, Image]:
         """Do an operation view by view."""
+        operation, views, image_of_view, samples, images, expected_images, pixels = sweep
         value, sums = 0.0, np.zeros(kernels.size_of(self._geometry))
         light = None if samples is None else samples.reshape(-1).astype(np.float64)
         for view in views.tolist():
@@ -63,8 +54,8 @@ class ArraySweeps:
                 assert light is not None
                 expected = matrix @ light
                 if operation == kernels.FORWARD:
-                    assert seen is not None
-                    seen[image] = expected.reshape(seen.shape[1:])
+                    assert expected_images is not None
+                    expected_images[image] = expected.reshape(expected_images.shape[1:])
                 elif operation == kernels.NORMAL:
                     sums += matrix.T @ expected
                 elif operation in (kernels.PRECISION, kernels.PRECISION_OF_EACH):
@@ -225,14 +216,14 @@ def _check_scene(
     lattices = geometry.maps.size // (3 * rows * geometry.detector[2])
     tested, truth = make(_own_reach(geometry), hiding, workers), ArraySweeps(_own_reach(geometry), hiding, 1)
     everything = np.arange(views)
-    tested.run(kernels.REACH, everything, everything)
+    tested.run(Sweep(kernels.REACH, everything, everything))
     samples = generator.uniform(0.2, 6.0, kernels.size_of(geometry)).astype(dtype)
     images = generator.normal(4.0, 3.0, (views, rows, columns)).astype(dtype)
     background, variance = generator.uniform(0.2, 3.0, (2, lattices, rows, columns)).astype(dtype)
     kept = samples.copy(), images.copy()
 
     def check_sums(operation: int, chosen: NDArray[np.intp], allowed: float = tolerance, **given: Any) -> None:
-        sums, wanted = (sweeps.run(operation, chosen, everything, **given)[1] for sweeps in (tested, truth))
+        sums, wanted = (sweeps.run(Sweep(operation, chosen, everything, **given))[1] for sweeps in (tested, truth))
         _close(sums, wanted, allowed)
 
     for chosen in (everything, everything[-2::-2].copy()):
@@ -242,8 +233,8 @@ def _check_scene(
         image_of_view = np.zeros(views, np.intp)
         image_of_view[chosen] = np.arange(len(chosen))
         found, wanted = np.zeros((2, len(chosen), rows, columns), dtype)
-        tested.run(kernels.FORWARD, chosen, image_of_view, samples=samples, seen=found)
-        truth.run(kernels.FORWARD, chosen, image_of_view, samples=samples, seen=wanted)
+        tested.run(Sweep(kernels.FORWARD, chosen, image_of_view, samples=samples, expected_images=found))
+        truth.run(Sweep(kernels.FORWARD, chosen, image_of_view, samples=samples, expected_images=wanted))
         assert wanted.any(), "the scene of the contract is seen"
         _close(found, wanted, tolerance)
         for model in (SHIFTED_POISSON, POISSON_GAUSSIAN, LEAST_SQUARES):
@@ -253,9 +244,9 @@ def _check_scene(
             of_data: dict[str, Any] = {"samples": samples, "images": images, "pixels": pixels}
             # The exact model's sum over counts may leave out what is below 1e-7
             allowed = max(tolerance, 1e-6) if model == POISSON_GAUSSIAN else tolerance
-            value, ratio = truth.run(kernels.VALUE_AND_RATIO, chosen, everything, **of_data)
+            value, ratio = truth.run(Sweep(kernels.VALUE_AND_RATIO, chosen, everything, **of_data))
             for operation in (kernels.RATIO, kernels.VALUE, kernels.VALUE_AND_RATIO):
-                tested_value, tested_ratio = tested.run(operation, chosen, everything, **of_data)
+                tested_value, tested_ratio = tested.run(Sweep(operation, chosen, everything, **of_data))
                 if operation != kernels.RATIO:
                     assert abs(tested_value - value) <= allowed * abs(value), (tested_value, value)
                 if operation != kernels.VALUE:

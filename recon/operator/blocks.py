@@ -104,15 +104,15 @@ def visit_plane(scatters, samples, layout, plane, scratch, blocks):
     place, on_plane = place_of(plane), advanced(layout, index(LAYOUT_SIZE) * plane)
     for number in range(2):
         half, first = advanced(blocks, half_of(plane, index(number))), index(number * HALF_PX)
-        how, start, width = half[index(0)], half[index(1)], on_plane[index(2)]
-        if how > SCATTERED:
+        scheme, start, width = half[index(0)], half[index(1)], on_plane[index(2)]
+        if scheme > SCATTERED:
             prefetch_block(samples, start + ROW_TAPS * width)
             taps = advanced(samples, index(start))
             if scatters:
-                _scatter_in_step(how, on_plane[index(3)], taps, width, half, scratch, place, first)
+                _scatter_in_step(scheme, on_plane[index(3)], taps, width, half, scratch, place, first)
             else:
-                _gather_in_step(how, on_plane[index(3)], taps, width, half, scratch, place, first)
-        elif how == SCATTERED:
+                _gather_in_step(scheme, on_plane[index(3)], taps, width, half, scratch, place, first)
+        elif scheme == SCATTERED:
             _visit_scattered(scatters, samples, on_plane, scratch, place, first)
 
 
@@ -170,34 +170,34 @@ def _may_hide(opaque, first_row, layout, near, blocks):
 
 
 @compiled
-def _gather_in_step(how, advance, samples, stride, half, scratch, place, first):
+def _gather_in_step(scheme, advance, samples, stride, half, scratch, place, first):
     """Interpolate with as few rows and columns of taps as the pixels need, each number compiled separately."""
-    if advance > 1 and how <= IN_STEP_2_3:
+    if advance > 1 and scheme <= IN_STEP_2_3:
         _gather_taps(2, 3, 2, samples, stride, half, scratch, place, first)
     elif advance > 1:
         _gather_taps(3, 4, 2, samples, stride, half, scratch, place, first)
-    elif how == IN_STEP_2_2:
+    elif scheme == IN_STEP_2_2:
         _gather_taps(2, 2, 1, samples, stride, half, scratch, place, first)
-    elif how == IN_STEP_2_3:
+    elif scheme == IN_STEP_2_3:
         _gather_taps(2, 3, 1, samples, stride, half, scratch, place, first)
-    elif how == IN_STEP_3_3:
+    elif scheme == IN_STEP_3_3:
         _gather_taps(3, 3, 1, samples, stride, half, scratch, place, first)
     else:
         _gather_taps(3, 4, 1, samples, stride, half, scratch, place, first)
 
 
 @compiled
-def _scatter_in_step(how, advance, samples, stride, half, scratch, place, first):
+def _scatter_in_step(scheme, advance, samples, stride, half, scratch, place, first):
     """Scatter with the taps of `_gather_in_step`."""
-    if advance > 1 and how <= IN_STEP_2_3:
+    if advance > 1 and scheme <= IN_STEP_2_3:
         _scatter_taps(2, 3, 2, samples, stride, half, scratch, place, first)
     elif advance > 1:
         _scatter_taps(3, 4, 2, samples, stride, half, scratch, place, first)
-    elif how == IN_STEP_2_2:
+    elif scheme == IN_STEP_2_2:
         _scatter_taps(2, 2, 1, samples, stride, half, scratch, place, first)
-    elif how == IN_STEP_2_3:
+    elif scheme == IN_STEP_2_3:
         _scatter_taps(2, 3, 1, samples, stride, half, scratch, place, first)
-    elif how == IN_STEP_3_3:
+    elif scheme == IN_STEP_3_3:
         _scatter_taps(3, 3, 1, samples, stride, half, scratch, place, first)
     else:
         _scatter_taps(3, 4, 1, samples, stride, half, scratch, place, first)
@@ -231,11 +231,11 @@ def _gather_taps(rows, columns, advance, samples, stride, half, scratch, place, 
     for k in range(index(half[index(4)])):
         along, at = across[k] - column, index(advance) * k
         u0, u1, u2 = _row_weights(down[k] - row, rows)
-        seen = u0 * _along_row(columns, along, samples, at)
-        seen += u1 * _along_row(columns, along, samples, index(stride) + at)
+        light = u0 * _along_row(columns, along, samples, at)
+        light += u1 * _along_row(columns, along, samples, index(stride) + at)
         if rows > 2:
-            seen += u2 * _along_row(columns, along, samples, index(2 * stride) + at)
-        expected[k] += weights[k] * seen
+            light += u2 * _along_row(columns, along, samples, index(2 * stride) + at)
+        expected[k] += weights[k] * light
 
 
 @inlined
@@ -244,11 +244,11 @@ def _along_row(columns, along, samples, at):
     number = type(along)
     if columns == 2:
         return samples[at] + along * (samples[at + index(1)] - samples[at])
-    seen = _tent(along) * samples[at] + _tent(along - number(1)) * samples[at + index(1)]
-    seen += _tent(along - number(2)) * samples[at + index(2)]
+    light = _tent(along) * samples[at] + _tent(along - number(1)) * samples[at + index(1)]
+    light += _tent(along - number(2)) * samples[at + index(2)]
     if columns > 3:
-        seen += _tent(along - number(3)) * samples[at + index(3)]
-    return seen
+        light += _tent(along - number(3)) * samples[at + index(3)]
+    return light
 
 
 @inlined
@@ -297,27 +297,20 @@ def _scatter_taps(rows, columns, advance, samples, stride, half, scratch, place,
                 target[index(2) * k + index(1)] += odd
 
 
-@inlined
-def _corner(scratch, place, k, start, height, stride, advance):
-    """Return the upper left of the four samples around a pixel's point, and the point's distances down and right."""
-    number = type(scratch[0])
-    column = scratch[place + index(COLUMN) + k] + number(np.int32(k)) * advance
-    row = scratch[place + index(ROW) + k]
-    left, upper = min(np.int32(column), np.int32(stride - 2)), min(np.int32(row), np.int32(height - 2))
-    return index(start + np.intp(upper) * stride + np.intp(left)), row - number(upper), column - number(left)
-
-
 @compiled
 def _visit_scattered(scatters, samples, layout, scratch, place, first):
     """Scatter or interpolate pixel by pixel, with the same weights."""
     start, height, stride = layout[index(0)], layout[index(1)], layout[index(2)]
-    advance = type(scratch[0])(layout[index(3)])
-    zero, one, below = type(scratch[0])(0), index(1), index(stride)
+    number, advance = type(scratch[0]), type(scratch[0])(layout[index(3)])
+    zero, one, below = number(0), index(1), index(stride)
     for k in range(first, first + index(HALF_PX)):
         weight = scratch[place + index(WEIGHT) + k]
         if weight == zero:
             continue
-        at, down, right = _corner(scratch, place, k, start, height, stride, advance)
+        column = scratch[place + index(COLUMN) + k] + number(np.int32(k)) * advance
+        row = scratch[place + index(ROW) + k]
+        left, top = min(np.int32(column), np.int32(stride - 2)), min(np.int32(row), np.int32(height - 2))
+        at, down, right = index(start + np.intp(top) * stride + np.intp(left)), row - number(top), column - number(left)
         if scatters:
             value = weight * scratch[index(EXPECTED) + k]
             lower = value * down

@@ -102,14 +102,26 @@ class PixelModel(NamedTuple):
 # One long function: its loops share some twenty pointers and counts, which would have to be passed for every block.
 @compiled
 def sweep(
-    operation, planes, seen, accumulator, images, image_of_view, pixels, geometry, hiding, space, views, worker, workers
+    operation,
+    planes,
+    expected_images,
+    accumulator,
+    images,
+    image_of_view,
+    pixels,
+    geometry,
+    hiding,
+    space,
+    views,
+    worker,
+    workers,
 ):
     """Process a worker's share of the detector pixels of `views`; return their negative log-likelihood.
 
     Parameters
     ----------
     operation : int
-        `FORWARD`: seen ← H planes, where not zero. `ADJOINT`: accumulator += Hᵀ images.
+        `FORWARD`: expected_images ← H planes, where not zero. `ADJOINT`: accumulator += Hᵀ images.
         `RATIO`: accumulator += Hᵀ r, with the ratio r of the pixel model, from images and H planes.
         `VALUE`: only the returned value, which is meaningful for this operation and the next alone.
         `VALUE_AND_RATIO`: both; the logarithms of the value take a tenth of the time.
@@ -121,7 +133,7 @@ def sweep(
         An operation changes nothing else.
     planes, accumulator : array (sample,)
         The samples that are read, and those that are added to: all planes, one after the other.
-    seen, images : array (image × row × column,)
+    expected_images, images : array (image × row × column,)
         The images that are written, and those that are read; view v has image `image_of_view[v]`.
     space : BlockWorkspace
         The worker's own.
@@ -133,7 +145,8 @@ def sweep(
     expected, models = scratch, pointer(space.models)
     counted = advanced(scratch, index(COUNTED) if count_of_planes > 1 else weights_of(index(0)))
     homographies, maps, layer = pointer(geometry.homographies), pointer(geometry.maps), index(geometry.maps.size // 3)
-    planes_at, added_at, seen_at, images_at = pointer(planes), pointer(accumulator), pointer(seen), pointer(images)
+    planes_at, added_at, images_at = pointer(planes), pointer(accumulator), pointer(images)
+    expected_at = pointer(expected_images)
     background_at, variance_at = pointer(pixels.background), pointer(pixels.variance)
     valid_at, masked = pointer(geometry.valid), geometry.valid.size > 0
     opacities, opaque, depths = pointer(hiding.opacities), pointer(hiding.opaque), pointer(hiding.depths)
@@ -145,7 +158,7 @@ def sweep(
             lattice, image = geometry.lattice_of_view[view], image_of_view[view]
             for row in range(tile, min(tile + TILE_ROWS, rows)):
                 begin, end = geometry.reach[view, row, 0], geometry.reach[view, row, 1]
-                met_from, met_to = end, begin
+                left, right = end, begin
                 for first in range(begin, end, BLOCK_PX):
                     count = index(min(BLOCK_PX, columns - first))
                     if len(bent) > 0:
@@ -157,7 +170,7 @@ def sweep(
                         maps, layer, at, bent, scratch, blocks,
                     ):  # fmt: skip
                         continue
-                    met_from, met_to = min(met_from, first), first + BLOCK_PX
+                    left, right = min(left, first), first + BLOCK_PX
                     if operation == REACH:
                         continue
                     if masked:
@@ -174,7 +187,7 @@ def sweep(
                     else:
                         gather(planes_at, layout, count_of_planes, scratch, blocks)
                     if operation == FORWARD:
-                        copy(scratch, index(EXPECTED), seen_at, pixel, count)
+                        copy(scratch, index(EXPECTED), expected_at, pixel, count)
                         continue
                     at = index((lattice * rows + row) * columns + first)
                     if operation < NORMAL and operation != ADJOINT:
@@ -192,7 +205,7 @@ def sweep(
                     elif operation != VALUE:
                         scatter(added_at, layout, count_of_planes, scratch, blocks)
                 if operation == REACH:
-                    geometry.reach[view, row, 0], geometry.reach[view, row, 1] = met_from, met_to
+                    geometry.reach[view, row, 0], geometry.reach[view, row, 1] = left, right
     return value
 
 

@@ -41,14 +41,14 @@ EDGE_TOLERANCE = 1e-3
 # Code of a pixel that sees no part of a surface.
 UNSEEN = -(2**15)
 
-# How a block lies on a plane; the last four are in step with it, with so many rows and columns of taps.
+# Schemes by which a block visits a plane; the last four are in step with it, with so many rows and columns of taps.
 OUTSIDE, SCATTERED, IN_STEP_2_2, IN_STEP_2_3, IN_STEP_3_3, IN_STEP_3_4 = 0, 1, 2, 3, 4, 5
 
 # Columns of `layout`: a plane's first sample, rows, columns, and the samples that it advances by from pixel to pixel.
 LAYOUT_SIZE = 4
 LARGEST_ADVANCE = 2
 
-# Numbers of each half in `blocks`: how it lies, the first sample of its taps, that sample's row and column, and its
+# Numbers of each half in `blocks`: the scheme, the first sample of its taps, that sample's row and column, and its
 # pixels. Where the block is in step as a whole, the first half stands for both.
 _HALF_SIZE = 5
 
@@ -95,7 +95,7 @@ def half_of(plane, half):
 def locate_on_all(homographies, matrix, views, layout, planes, samples, maps, layer, pixel, bent, scratch, blocks):
     """Find where a block of pixels lies on every plane; return whether it sees any.
 
-    `blocks` (plane × half × 5,) receives how it lies there.
+    `blocks` (plane × half × 5,) receives the scheme of each half.
     """
     meets = False
     for plane in range(index(planes)):
@@ -203,16 +203,16 @@ def _arrange(ranges, layout, samples, blocks, half, first, pixels):
     start = layout[index(0)] + row_from * stride + column_from + np.intp(first) * advance
     end = start + (ROW_TAPS - 1) * stride + np.intp(pixels + index(MARGIN)) * advance
     rows, columns = row_to - row_from + 2, column_to - column_from + 2
-    how = IN_STEP_3_4
+    scheme = IN_STEP_3_4
     if row_to < row_from:
-        how = OUTSIDE
+        scheme = OUTSIDE
     elif rows > ROW_TAPS or columns > COLUMN_TAPS or start < 0 or end > samples:
-        how = SCATTERED
+        scheme = SCATTERED
     elif columns <= 3:
         if rows > 2:
-            how = IN_STEP_3_3
+            scheme = IN_STEP_3_3
         else:
-            how = IN_STEP_2_3 if columns > 2 else IN_STEP_2_2
-    blocks[half], blocks[half + index(1)] = how, start
+            scheme = IN_STEP_2_3 if columns > 2 else IN_STEP_2_2
+    blocks[half], blocks[half + index(1)] = scheme, start
     blocks[half + index(2)], blocks[half + index(3)] = row_from, column_from
     blocks[half + index(4)] = np.intp(pixels)

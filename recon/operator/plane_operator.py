@@ -1,6 +1,7 @@
 """H of a single plane, for callers that have one plane: its samples are an array (row, column)."""
 
 from copy import copy
+from typing import TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,8 +9,17 @@ from numpy.typing import NDArray
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.operator.geometry import DetectorMaps, Surface, window_geometry
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.kernels import SceneGeometry
 from faintfield.recon.operator.scene_operator import SceneOperator
+
+
+class OperatorOptions(TypedDict, total=False):
+    """Options of `recon.operator.scene_operator.SceneOperator` that the operators of one plane take, too."""
+
+    flat: NDArray[np.floating] | None
+    valid: NDArray[np.bool_] | None
+    lattice_of_view: NDArray[np.intp] | None
+    dtype: type[np.float32] | type[np.float64]
+    workers: int | None
 
 
 class PlaneOperator(SceneOperator):
@@ -20,10 +30,10 @@ class PlaneOperator(SceneOperator):
     plane_from_ray : array (view, 3, 3)
         Homography from a ray (x, y, 1) to plane coordinates (x, y, 1) in mm; the homogeneous scale is positive for
         points in front of the camera.
-    rays, flat, valid, lattice_of_view, dtype, workers, surface
-        As for `recon.operator.scene_operator.SceneOperator`.
     grid : PlaneGrid
         The samples of the plane.
+    rays, surface, **options
+        As for `recon.operator.scene_operator.SceneOperator`.
 
     Raises
     ------
@@ -37,26 +47,11 @@ class PlaneOperator(SceneOperator):
         rays: NDArray[np.floating] | DetectorMaps,
         grid: PlaneGrid,
         *,
-        flat: NDArray[np.floating] | None = None,
-        valid: NDArray[np.bool_] | None = None,
-        lattice_of_view: NDArray[np.intp] | None = None,
-        dtype: type[np.float32] | type[np.float64] = np.float32,
-        workers: int | None = None,
         surface: Surface | None = None,
+        **options: Unpack[OperatorOptions],
     ) -> None:
-        super().__init__(
-            plane_from_ray[np.newaxis],
-            rays,
-            [grid],
-            flat=flat,
-            valid=valid,
-            lattice_of_view=lattice_of_view,
-            dtype=dtype,
-            workers=workers,
-            surface=surface,
-        )
-        self.grid = grid
-        self.samples_shape = grid.shape
+        super().__init__(plane_from_ray[np.newaxis], rays, [grid], surface=surface, **options)
+        self.grid, self.samples_shape = grid, grid.shape
 
     def window(
         self, rows: slice, columns: slice, workers: int | None = None, kept_maps: dict[float, Image] | None = None
@@ -79,15 +74,10 @@ class PlaneOperator(SceneOperator):
         GeometryMismatch
             No pixel of any view sees this part.
         """
-        grid = self.grid.window(rows, columns)
-        part = copy(self)
-        part.workers, part._kept_maps = workers or self.workers, kept_maps  # noqa: SLF001
-        part._take_window(grid, window_geometry(self._geometry, grid, (rows.start, columns.start)))  # noqa: SLF001
-        return part
-
-    def _take_window(self, grid: PlaneGrid, geometry: SceneGeometry) -> None:
+        grid, part = self.grid.window(rows, columns), copy(self)
         for cached in ("_sensitivity", "seeing_views"):
-            self.__dict__.pop(cached, None)
-        self.grid = grid
-        self._see(geometry, (grid,))
-        self.samples_shape = grid.shape
+            part.__dict__.pop(cached, None)
+        part.grid, part.workers, part._kept_maps = grid, workers or self.workers, kept_maps  # noqa: SLF001
+        part._see(window_geometry(self._geometry, grid, (rows.start, columns.start)), (grid,))  # noqa: SLF001
+        part.samples_shape = grid.shape
+        return part

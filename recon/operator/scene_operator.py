@@ -14,7 +14,7 @@ from faintfield.recon.operator import kernels
 from faintfield.recon.operator.geometry import DetectorMaps, Surface, scene_geometry
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.occlusion import Occluders, hiding_of
-from faintfield.recon.operator.sweeps import CompiledSweeps, Sweeps
+from faintfield.recon.operator.sweeps import CompiledSweeps, Sweep, Sweeps
 
 type ViewSelection = Sequence[int] | NDArray[np.integer] | None
 
@@ -100,7 +100,7 @@ class SceneOperator:
         self._geometry, self.grids = geometry, grids
         self._sweeps = self._make_sweeps(geometry, self._hiding, self.workers)
         self.samples_shape: tuple[int, ...] = (kernels.size_of(geometry),)
-        self._sweeps.run(kernels.REACH, self.all_views, self.all_views)
+        self._sweeps.run(Sweep(kernels.REACH, self.all_views, self.all_views))
         for grid, sensitivity in zip(grids, self.planes_of(self.sensitivity()), strict=True):
             if not sensitivity.any():
                 raise GeometryMismatch(
@@ -112,12 +112,12 @@ class SceneOperator:
     def forward(self, samples: Image, views: ViewSelection = None) -> Image:
         """Return H f: the planes as each view sees them together, (view, row, column)."""
         chosen = self._views(views)
-        seen = np.zeros((len(chosen), *self.images_shape[1:]), self.dtype)
+        expected = np.zeros((len(chosen), *self.images_shape[1:]), self.dtype)
         image_of_view = np.zeros(self.images_shape[0], np.intp)
         image_of_view[chosen] = np.arange(len(chosen))
         samples = self._checked("samples", samples, self.samples_shape)
-        self._sweeps.run(kernels.FORWARD, chosen, image_of_view, samples=samples, seen=seen)
-        return seen
+        self._sweeps.run(Sweep(kernels.FORWARD, chosen, image_of_view, samples=samples, expected_images=expected))
+        return expected
 
     def adjoint(self, images: Image, views: ViewSelection = None) -> Image:
         """Return Hᵀ g (samples) of images (view, row, column), summed over `views`."""
@@ -132,7 +132,7 @@ class SceneOperator:
     def adjoint_of_forward(self, samples: Image, views: ViewSelection = None) -> Image:
         """Return Hᵀ H f (samples), with no array as large as the images."""
         samples = self._checked("samples", samples, self.samples_shape)
-        sums = self._sweeps.run(kernels.NORMAL, self._views(views), self.all_views, samples=samples)[1]
+        sums = self._sweeps.run(Sweep(kernels.NORMAL, self._views(views), self.all_views, samples=samples))[1]
         return sums.reshape(self.samples_shape)
 
     def adjoint_of_precision(
@@ -154,7 +154,7 @@ class SceneOperator:
         pixels = kernels.PixelModel(likelihood.model, known, known, level)
         operation = kernels.PRECISION_OF_EACH if of_each else kernels.PRECISION
         samples = self._checked("samples", samples, self.samples_shape)
-        sums = self._sweeps.run(operation, self._views(views), self.all_views, samples=samples, pixels=pixels)[1]
+        sums = self._sweeps.run(Sweep(operation, self._views(views), self.all_views, samples=samples, pixels=pixels))[1]
         return sums.reshape(self.samples_shape)
 
     def adjoint_of_map(self, value: float | Image, views: ViewSelection = None) -> Image:
@@ -239,7 +239,8 @@ class SceneOperator:
         return float(value) if np.ndim(value) == 0 else self._map(value)[self.lattice_of_view[views]]
 
     def _adjoint(self, images: Image, views: NDArray[np.intp], image_of_view: NDArray[np.intp]) -> Image:
-        return self._sweeps.run(kernels.ADJOINT, views, image_of_view, images=images)[1].reshape(self.samples_shape)
+        sums = self._sweeps.run(Sweep(kernels.ADJOINT, views, image_of_view, images=images))[1]
+        return sums.reshape(self.samples_shape)
 
     def _likelihood(
         self, operation: int, samples: Image, images: ElementalImages, views: ViewSelection
@@ -256,7 +257,7 @@ class SceneOperator:
         samples = self._checked("samples", samples, self.samples_shape)
         data = self._checked("images", images.electrons, self.images_shape)
         chosen = self._views(views)
-        return self._sweeps.run(operation, chosen, self.all_views, samples=samples, images=data, pixels=pixels)
+        return self._sweeps.run(Sweep(operation, chosen, self.all_views, samples=samples, images=data, pixels=pixels))
 
     def _checked(self, name: str, array: Image, shape: tuple[int, ...]) -> Image:
         """Return samples or images in the operator's dtype, copied only where they have to be."""

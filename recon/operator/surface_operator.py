@@ -1,5 +1,7 @@
 """H of a surface: what each detector pixel of each view sees of one picture whose samples have depths of their own."""
 
+from typing import Unpack
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -7,7 +9,7 @@ from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.operator.geometry import DetectorMaps, check_lattices
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.placement import UNSEEN
-from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.operator.plane_operator import OperatorOptions, PlaneOperator
 from faintfield.recon.operator.relief import draw_relief
 
 
@@ -44,12 +46,12 @@ class SurfaceOperator(PlaneOperator):
     ray_from_surface : array (view, 3, 4)
         From (x, y, 1, 1/depth), a direction of the reference view with a depth, to the ray of each view, homogeneous;
         the scale is positive for points in front of the camera.
-    rays, flat, valid, lattice_of_view, dtype, workers
-        As for `recon.operator.scene_operator.SceneOperator`.
     grid : PlaneGrid
         The samples at unit depth: the directions of the reference view that they lie in.
     inverse_depth : array (row, column)
         1/depth of each sample in 1/mm, zero for points at infinity; NaN where there is no surface.
+    rays, **options
+        As for `recon.operator.scene_operator.SceneOperator`.
 
     Raises
     ------
@@ -68,30 +70,17 @@ class SurfaceOperator(PlaneOperator):
         rays: NDArray[np.floating] | DetectorMaps,
         grid: PlaneGrid,
         inverse_depth: NDArray[np.floating],
-        *,
-        flat: NDArray[np.floating] | None = None,
-        valid: NDArray[np.bool_] | None = None,
-        lattice_of_view: NDArray[np.intp] | None = None,
-        dtype: type[np.float32] | type[np.float64] = np.float32,
-        workers: int | None = None,
+        **options: Unpack[OperatorOptions],
     ) -> None:
-        maps = DetectorMaps.of(rays, flat, dtype)
-        rays = np.ascontiguousarray(maps.rays)
-        matrices = ray_from_surface.astype(np.float64)
+        maps = DetectorMaps.of(rays, options.pop("flat", None), options.get("dtype", np.float32))
+        rays, matrices = np.ascontiguousarray(maps.rays), ray_from_surface.astype(np.float64)
+        lattice_of_view = options.get("lattice_of_view")
         lattices = np.zeros(len(matrices), np.intp) if lattice_of_view is None else np.asarray(lattice_of_view)
         _check_surface(matrices, len(rays), grid, inverse_depth, lattices)
-        self._relief = draw_relief(inverse_depth, grid, matrices, rays, lattices.tolist(), workers)
+        self._relief = draw_relief(inverse_depth, grid, matrices, rays, lattices.tolist(), options.get("workers"))
         at_infinity, slopes = homographies_of_surface(matrices)
-        super().__init__(
-            at_infinity + self._relief.origin * slopes,
-            maps,
-            grid,
-            valid=valid,
-            lattice_of_view=lattice_of_view,
-            dtype=dtype,
-            workers=workers,
-            surface=(grid.index_from_plane() @ slopes, self._relief),
-        )
+        surface = grid.index_from_plane() @ slopes, self._relief
+        super().__init__(at_infinity + self._relief.origin * slopes, maps, grid, surface=surface, **options)
 
     def inverse_depth_of_pixels(self) -> NDArray[np.float32]:
         """Return 1/depth at which each pixel (view, row, column) meets the surface, 0 where it sees no part of it."""

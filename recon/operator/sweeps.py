@@ -4,7 +4,7 @@
 takes part by one class that satisfies `Sweeps`; `faintfield.testing.sweeps_contract` tells whether it does.
 """
 
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,32 @@ from faintfield.recon.operator import kernels
 from faintfield.recon.operator.kernels import Hiding
 from faintfield.recon.operator.placement import make_workspace
 from faintfield.recon.threads import run_in_threads
+
+
+class Sweep(NamedTuple):
+    """One of the operations that `kernels.sweep` explains, on some views.
+
+    Attributes
+    ----------
+    operation, views, image_of_view : int, int array (chosen view,), int array (view,)
+        The operation; the views that are processed, each once; index of each view's image in `images` and
+        `expected_images`.
+    samples : float array (sample,) or of any shape with as many elements, optional
+        The light of all planes; every operation but `ADJOINT` and `REACH` needs it.
+    images, expected_images : float array (image, row, column), optional
+        Images that `ADJOINT` and the operations that compare with data read; zeros, into which `FORWARD` writes
+        H `samples`.
+    pixels : PixelModel, optional
+        Statistics of the pixels, for operations that compare with data or take a precision.
+    """
+
+    operation: int
+    views: NDArray[np.intp]
+    image_of_view: NDArray[np.intp]
+    samples: Image | None = None
+    images: Image | None = None
+    expected_images: Image | None = None
+    pixels: kernels.PixelModel | None = None
 
 
 class Sweeps(Protocol):
@@ -26,36 +52,10 @@ class Sweeps(Protocol):
 
     def __init__(self, geometry: kernels.SceneGeometry, hiding: Hiding, workers: int) -> None: ...
 
-    def run(
-        self,
-        operation: int,
-        views: NDArray[np.intp],
-        image_of_view: NDArray[np.intp],
-        *,
-        samples: Image | None = None,
-        images: Image | None = None,
-        seen: Image | None = None,
-        pixels: kernels.PixelModel | None = None,
-    ) -> tuple[float, Image]:
-        """Do one of the operations that `kernels.sweep` explains.
+    def run(self, sweep: Sweep) -> tuple[float, Image]:
+        """Return the negative log-likelihood, of `VALUE` and `VALUE_AND_RATIO` alone, and what is added to the samples.
 
-        Parameters
-        ----------
-        views, image_of_view : int array (chosen view,), int array (view,)
-            The views that are processed, each once; index of each view's image in `images` and `seen`.
-        samples : float array (sample,) or of any shape with as many elements, optional
-            The light of all planes; every operation but `ADJOINT` and `REACH` needs it.
-        images, seen : float array (image, row, column), optional
-            Images that `ADJOINT` and the operations that compare with data read; zeros, into which `FORWARD` writes
-            H `samples`.
-        pixels : PixelModel, optional
-            Statistics of the pixels, for operations that compare with data or take a precision.
-
-        Returns
-        -------
-        value, sums : float, float array (sample,)
-            The negative log-likelihood, of `VALUE` and `VALUE_AND_RATIO` alone; what the operation adds to the samples,
-            of size 1 for those that add nothing.
+        The latter are (sample,), or of size 1 for operations that add nothing.
         """
 
 
@@ -66,18 +66,9 @@ class CompiledSweeps:
         self._geometry, self._hiding, self._workers = geometry, hiding, workers
         self._dtype = geometry.maps.dtype
 
-    def run(
-        self,
-        operation: int,
-        views: NDArray[np.intp],
-        image_of_view: NDArray[np.intp],
-        *,
-        samples: Image | None = None,
-        images: Image | None = None,
-        seen: Image | None = None,
-        pixels: kernels.PixelModel | None = None,
-    ) -> tuple[float, Image]:
+    def run(self, sweep: Sweep) -> tuple[float, Image]:
         """Run the kernel in all threads; return the sums of their values and of their samples."""
+        operation, views, image_of_view, samples, images, expected_images, pixels = sweep
         nothing = _read_only(np.zeros(1, self._dtype))
         planes, data = (nothing if array is None else _read_only(array) for array in (samples, images))
         background, variance = (nothing, nothing) if pixels is None else map(_read_only, pixels[1:3])
@@ -86,7 +77,7 @@ class CompiledSweeps:
         sums = [np.zeros(size, self._dtype) for _ in range(self._workers)]
 
         def work(worker: int) -> float:
-            written = np.zeros(1, self._dtype) if seen is None else seen.reshape(-1)
+            written = np.zeros(1, self._dtype) if expected_images is None else expected_images.reshape(-1)
             arrays = (planes, written, sums[worker], data, _read_only(image_of_view))
             space = make_workspace(len(self._geometry.layout), self._dtype)
             share = (_read_only(views), worker, self._workers)
