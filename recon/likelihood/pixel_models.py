@@ -13,7 +13,7 @@ negative log-likelihood with respect to (H f) is 1 − r, and that negative log-
 
 import numpy as np
 
-from faintfield.recon.numba_tools import advanced, compiled, exponential, index, logarithm
+from faintfield.recon.numba_tools import advanced, compiled, exponential, index, inlined, logarithm
 
 SHIFTED_POISSON, POISSON_GAUSSIAN, LEAST_SQUARES = 0, 1, 2
 
@@ -114,16 +114,17 @@ def _poisson_gaussian(count, expected, observed, background, variance, response,
         mean[k] = max(expected[k] + background[k], number(_MIN_MEAN_E))
         sigma2[k] = max(variance[k], number(_MIN_VARIANCE_E2))
         shrink[k] = exponential(-one / sigma2[k])
+        mass[k], moment[k] = one, zero
     widest = _modes(count, mode, observed, mean, sigma2, response, step)
     reach = int(_SPREADS * np.sqrt(widest)) + _EXTRA
     for k in range(count):
-        mass[k], moment[k], term[k] = one, zero, one
+        term[k] = one
         step[k] = exponential(min((observed[k] - mode[k] - half) / sigma2[k] + logarithm(mean[k]), limit))
-    _sum_upwards(count, reach, mode, step, shrink, term, mass, moment)
+    _add_counts(True, count, reach, mode, step, shrink, term, mass, moment)
     for k in range(count):
         term[k] = one
         step[k] = exponential(min((mode[k] - observed[k] - half) / sigma2[k] - logarithm(mean[k]), limit))
-    _sum_downwards(count, reach, mode, step, shrink, term, mass, moment)
+    _add_counts(False, count, reach, mode, step, shrink, term, mass, moment)
     total = zero
     for k in range(count):
         miss = observed[k] - mode[k]
@@ -134,27 +135,19 @@ def _poisson_gaussian(count, expected, observed, background, variance, response,
     return np.float64(total)
 
 
-@compiled
-def _sum_upwards(count, reach, mode, step, shrink, term, mass, moment):
-    """Add the terms of the counts above the mode to `mass`, and their products with the distance to `moment`."""
-    for away in range(1, reach + 1):
-        distance = type(step[0])(away)
-        for k in range(count):
-            term[k] *= step[k] / (mode[k] + distance)
-            mass[k] += term[k]
-            moment[k] += distance * term[k]
-            step[k] *= shrink[k]
+@inlined
+def _add_counts(above, count, reach, mode, step, shrink, term, mass, moment):
+    """Add the terms of the counts above the mode, or below it, to `mass`, and those times the distance to `moment`.
 
-
-@compiled
-def _sum_downwards(count, reach, mode, step, shrink, term, mass, moment):
-    """Add the terms of the counts below the mode likewise; terms are zero from a count of −1 on."""
+    Terms are zero from a count of −1 on.
+    """
+    number = type(step[0])
     for away in range(1, reach + 1):
-        distance = type(step[0])(away)
+        distance = number(away)
         for k in range(count):
-            term[k] *= step[k] * (mode[k] - distance + type(step[0])(1))
+            term[k] *= step[k] / (mode[k] + distance) if above else step[k] * (mode[k] - distance + number(1))
             mass[k] += term[k]
-            moment[k] -= distance * term[k]
+            moment[k] += distance * term[k] if above else -distance * term[k]
             step[k] *= shrink[k]
 
 
