@@ -34,9 +34,7 @@ _STEPS, _STEP = 200, np.float32(0.35)
 def near_side(index: Image, of_near: bool = True) -> NDArray[np.bool_]:
     """Return the samples (row, column) at an edge that are on its nearer side, or on its farther one."""
     found = np.zeros(index.shape, bool)
-    right, down = np.diff(index, axis=1), np.diff(index, axis=0)
-    if not of_near:
-        right, down = -right, -down
+    right, down = (np.diff(index if of_near else -index, axis=axis) for axis in (1, 0))
     found[:, 1:] |= right > EDGE_STEPS
     found[:, :-1] |= right < -EDGE_STEPS
     found[1:] |= down > EDGE_STEPS

@@ -1,7 +1,6 @@
 """Depth and light of a surface by turns, each given the other, among depths whose range may be unknown."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,13 +93,13 @@ def estimate_surface(views: PinholeViews, inverse_depths: NDArray[np.float64]) -
     evidence = DepthEvidence(views, inverse_depths, halves(nodes, kept))
     candidates = [first_depths(evidence)]
     known = evidence.explained(candidates[0])
-    best, judged = 0, _Judged.of(evidence, known, left_out)
+    best, least = 0, _errors(evidence, known, left_out)
     for number in range(1, _ROUNDS + 1):
         candidates.append(next_depths(evidence, known)[0])
         known = evidence.explained(candidates[-1])
-        new = _Judged.of(evidence, known, left_out)
-        if new.is_better_than(judged):
-            best, judged = number, new
+        errors = _errors(evidence, known, left_out)
+        if np.nansum(errors - least, dtype=np.float64) <= 0:  # where both surfaces are seen
+            best, least = number, errors
     prediction = None
     if left_out.size:
         beside = [kept[np.abs(nodes[kept] - nodes[view]).sum(axis=1) == 1] for view in left_out]
@@ -114,21 +113,10 @@ def estimate_surface(views: PinholeViews, inverse_depths: NDArray[np.float64]) -
     return SurfaceEstimate(depths, sure, best + 1, prediction)
 
 
-class _Judged(NamedTuple):
-    """Squared errors over variance (view, row, column) of views that were left out, and where they see the surface."""
-
-    squares: NDArray[np.float32]
-    seen: NDArray[np.bool_]
-
-    @classmethod
-    def of(cls, evidence: DepthEvidence, known: Explained, views: NDArray[np.intp]) -> "_Judged":
-        expected = known.operator.forward(known.light(), views)
-        return cls(squared_errors(evidence, expected, views), seen_of(evidence, known, views))
-
-    def is_better_than(self, other: "_Judged") -> bool:
-        """Return whether the errors are no larger where both surfaces are seen."""
-        both = self.seen & other.seen
-        return float(np.sum(self.squares[both] - other.squares[both], dtype=np.float64)) <= 0
+def _errors(evidence: DepthEvidence, known: Explained, views: NDArray[np.intp]) -> NDArray[np.float32]:
+    """Return the squared errors over variance of views (view, row, column), NaN where they do not see the surface."""
+    squares = squared_errors(evidence, known.operator.forward(known.light(), views), views)
+    return np.where(seen_of(evidence, known, views), squares, np.float32(np.nan))
 
 
 def first_depths(evidence: DepthEvidence) -> NDArray[np.float32]:
@@ -174,7 +162,7 @@ def _votes(evidence: Image, scale: float) -> NDArray[np.float32]:
 
 def _refined(evidence: Image, start: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return piecewise plane depths near the evidence: a search of each sample and a smoothing of all by turns."""
-    surface = PiecewisePlane.start(start)
+    surface = PiecewisePlane(start)
     target = np.empty_like(start)
     for distance in _STAGES:
         _search(evidence, surface.values, np.float32(0.5 / distance), target)

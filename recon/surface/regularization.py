@@ -1,8 +1,6 @@
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
 """Consistent depths of neighbours, compiled: costs summed over paths, and piecewise plane depths."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,7 +14,6 @@ _STEP = np.float32(12**-0.5)
 _DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
 
 
-@dataclass
 class PiecewisePlane:
     """A map that consists of planes, by total generalised variation of second order, and the state of its minimisation.
 
@@ -26,25 +23,16 @@ class PiecewisePlane:
     `values` (row, column) are u, and `slopes` (2, row, column) w, right and down.
     """
 
-    values: NDArray[np.float32]
-    slopes: NDArray[np.float32]
-    _ahead: NDArray[np.float32]
-    _dual: NDArray[np.float32]
-
-    @classmethod
-    def start(cls, values: Image) -> "PiecewisePlane":
-        """Return a map to start from."""
-        u = np.array(values, np.float32)
-        slopes, dual = np.zeros((2, *u.shape), np.float32), np.zeros((5, *u.shape), np.float32)
-        return cls(u, slopes, np.stack([u, *slopes]), dual)
+    def __init__(self, values: Image) -> None:
+        self.values, self.slopes = np.array(values, np.float32), np.zeros((2, *values.shape), np.float32)
+        self._ahead, self._dual = np.stack([self.values, *self.slopes]), np.zeros((5, *values.shape), np.float32)
 
     def approach(self, target: Image, weight: float, bend: tuple[float, float], steps: int) -> None:
         """Make steps towards the minimum, given v (row, column), c, and α₁ and α₀."""
         v = np.ascontiguousarray(target, np.float32)
-        numbers = np.float32(weight), np.float32(bend[0]), np.float32(bend[1])
         for _ in range(steps):
-            _ascend(self._ahead, self._dual, numbers[1], numbers[2])
-            _descend(self.values, self.slopes, self._ahead, self._dual, v, numbers[0])
+            _ascend(self._ahead, self._dual, *map(np.float32, bend))
+            _descend(self.values, self.slopes, self._ahead, self._dual, v, np.float32(weight))
 
 
 @compiled

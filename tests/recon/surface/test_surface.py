@@ -83,7 +83,7 @@ def test_energy_reaches_scipys_minimum(bend: tuple[float, float]) -> None:
     best = np.concatenate([target.ravel(), np.zeros(2 * target.size)])
     for tiny in (1e-2, 1e-4, 1e-6, 1e-8):
         best = minimize(energy, best, (tiny,), "BFGS", jac=True).x
-    surface = PiecewisePlane.start(np.zeros_like(target))  # wherever it starts
+    surface = PiecewisePlane(np.zeros_like(target))  # wherever it starts
     surface.approach(target, weight, bend, 4000)
     result = np.concatenate([surface.values.ravel(), surface.slopes.ravel()]).astype(float)
     assert abs(energy(result, 0)[0] / energy(best, 0)[0] - 1) < 1e-3
