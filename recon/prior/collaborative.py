@@ -74,7 +74,9 @@ def collaborative_wiener(
     ValueError
         Shapes differ, the picture is smaller than a patch, or the size of a patch is not a multiple of four.
     """
-    (wiener,) = _filtered(picture, pilot, noise, patches or Patches(), guide, workers, 1)
+    (wiener,) = wiener_and_thresholded(
+        picture, pilot, noise, patches or Patches(), guide=guide, workers=workers, filters=1
+    )
     return wiener
 
 
@@ -86,19 +88,13 @@ def wiener_and_thresholded(
     *,
     guide: Image | None = None,
     workers: int | None = None,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    filters: int = 2,
+) -> list[NDArray[np.float32]]:
     """Return what `collaborative_wiener` returns, and the picture whose groups keep what stands out of the noise.
 
     The second, the filter's first step, keeps the picture's own coefficients above 2.7 standard deviations of their
-    noise. So it also shows what the pilot lost.
+    noise. So it also shows what the pilot lost. It is left out if `filters` is 1.
     """
-    wiener, thresholded = _filtered(picture, pilot, noise, patches, guide, workers, 2)
-    return wiener, thresholded
-
-
-def _filtered(
-    picture: Image, pilot: Image, noise: Noise, patches: Patches, guide: Image | None, workers: int | None, filters: int
-) -> list[NDArray[np.float32]]:
     guide = pilot if guide is None else guide
     picture, pilot, guide, variance = (
         np.ascontiguousarray(array, np.float32) for array in (picture, pilot, guide, noise.variance)

@@ -13,19 +13,14 @@ from numpy.typing import NDArray
 from faintfield.recon.likelihood.images import Image, blurred
 from faintfield.recon.operator.occlusion import opacity
 from faintfield.recon.prior.evidence import Evidence, evidence_of_planes
-from faintfield.recon.solver.cross_validation import MIN_VIEWS, folds_to_predict, validation_views
+from faintfield.recon.solver.cross_validation import MIN_VIEWS, Fold, folds_to_predict
 from faintfield.recon.solver.data_fit import SceneProblem
-from faintfield.recon.solver.initialization import mean_light_e
-from faintfield.recon.solver.penalties import differences
-from faintfield.recon.solver.pmlem import pmlem
+from faintfield.recon.solver.penalties import Penalty, differences
 from faintfield.recon.solver.proximal import DualField
 from faintfield.recon.solver.uncertainty import Answers, Expected, LocalProblem, UsualErrors, Weights
 
 # Fewest folds: the choice by one is noisy.
 _MIN_FOLDS = 2
-
-# Accuracy of the planes of a fold and limit on their passes: the candidates made of them differ by more.
-_TOLERANCE, _MAX_PASSES = 0.02, 4
 
 # Spacings of the blur of the border between what is lit and what is dark.
 _BORDER_BLUR = (1, 1, 2)
@@ -166,10 +161,16 @@ def propose(
         raise ValueError(f"need at least {MIN_VIEWS} views that see anything to leave some out, got {len(views)}")
     regions = [regions_of(*of_plane) for of_plane in zip(operator.planes_of(samples), evidences, strict=True)]
     totals: list[list[Scores]] = [[] for _ in evidences]
-    for fold in range(max(_MIN_FOLDS, folds_to_predict(problem))):
-        held_out = views[validation_views(len(views), fold)]
-        planes = _planes_of_fold(problem, samples, penalty_weight, np.setdiff1d(views, held_out))
-        found = _fold_scores(problem, planes, held_out, candidates, regions, other_colours)
+    for number in range(max(_MIN_FOLDS, folds_to_predict(problem))):
+        fold = Fold(problem, Penalty(), number)
+        planes = fold.solve(penalty_weight, samples, problem.dual()).plane
+        known = evidence_of_planes(operator, problem.images, planes, fold.training, other_colours=other_colours)
+        truths = evidence_of_planes(operator, problem.images, planes, fold.validation)
+        made = [list(candidates(evidence).values()) for evidence in known]
+        found = [
+            [scores(pictures, truth.picture, truth.coverage * share) for share in shares.values()]
+            for pictures, truth, shares in zip(made, truths, regions, strict=True)
+        ]
         totals = [
             [a + b for a, b in zip(total, more, strict=True)] if total else more
             for total, more in zip(totals, found, strict=True)
@@ -193,43 +194,6 @@ def regions_of(plane: Image, evidence: Evidence) -> Regions:
         "dark, detail": (1 - lit) * detail,
         "dark, smooth": (1 - lit) * (1 - detail),
     }
-
-
-def _fold_scores(
-    problem: SceneProblem,
-    planes: Image,
-    held_out: NDArray[np.intp],
-    candidates: Candidates,
-    regions: list[Regions],
-    other_colours: Image | None,
-) -> list[list[Scores]]:
-    """Return the scores of each plane's candidates from the training views, by region."""
-    operator, images = problem.operator, problem.images
-    training = np.setdiff1d(operator.seeing_views, held_out)
-    known = evidence_of_planes(operator, images, planes, training, other_colours=other_colours)
-    made = [list(candidates(evidence).values()) for evidence in known]
-    truths = evidence_of_planes(operator, images, planes, held_out)
-    return [
-        [scores(pictures, truth.picture, truth.coverage * share) for share in shares.values()]
-        for pictures, truth, shares in zip(made, truths, regions, strict=True)
-    ]
-
-
-def _planes_of_fold(problem: SceneProblem, samples: Image, penalty_weight: float, training: NDArray[np.intp]) -> Image:
-    """Return the planes (samples) that total variation gives of the training views."""
-    start = problem.start(training)
-    share = training.size / len(problem.operator.seeing_views)
-    iterates = pmlem(
-        problem.fit(mean_light_e(problem.operator, start), training),
-        np.maximum(samples, 1e-3 * start),
-        penalty_weight=penalty_weight * share**0.5,
-        tolerance=_TOLERANCE,
-        dual=problem.dual(),
-    )
-    for count, iterate in enumerate(iterates, 1):
-        if iterate.certificate.distance <= _TOLERANCE or max(count, iterate.passes) >= _MAX_PASSES:
-            break
-    return iterate.plane
 
 
 def _proposal(

@@ -15,7 +15,8 @@ from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.solver.initialization import mean_light_e
 from faintfield.recon.solver.penalties import Penalty
-from faintfield.recon.solver.pmlem import PmlemIterate, pmlem
+from faintfield.recon.solver.pmlem import PmlemIterate, iterate_until, pmlem
+from faintfield.recon.solver.proximal import DualField
 from faintfield.recon.threads import map_in_threads
 
 # Largest number of folds; each leaves out one view in as many.
@@ -126,10 +127,8 @@ def cross_validated_weight(
     return CrossValidatedWeight(weight, candidates, passes, None if windows else folds[0].solutions[best])
 
 
-def _folds_of(problem: SceneProblem, penalty: Penalty, count: int, level_e: float | None = None) -> list["_Fold"]:
-    views = problem.operator.seeing_views
-    left_out = [views[validation_views(len(views), n)] for n in range(min(count, _folds(len(views))))]
-    return [_Fold(problem, penalty, validation, level_e) for validation in left_out]
+def _folds_of(problem: SceneProblem, penalty: Penalty, count: int, level_e: float | None = None) -> list["Fold"]:
+    return [Fold(problem, penalty, n, level_e) for n in range(min(count, _folds(len(problem.operator.seeing_views))))]
 
 
 def folds_to_predict(problem: SceneProblem) -> int:
@@ -139,44 +138,42 @@ def folds_to_predict(problem: SceneProblem) -> int:
     return min(int(np.ceil(MIN_SCORED_PIXELS / pixels_per_fold)), _folds(count))
 
 
-class _Fold:
-    """Training and validation views, and the solutions so far."""
+class Fold:
+    """Training and validation views of a fold, and the solutions so far."""
 
-    def __init__(
-        self, problem: SceneProblem, penalty: Penalty, validation: NDArray[np.intp], level_e: float | None
-    ) -> None:
+    def __init__(self, problem: SceneProblem, penalty: Penalty, fold: int, level_e: float | None = None) -> None:
         views = problem.operator.seeing_views
-        training = np.setdiff1d(views, validation)
-        self._start = problem.start(training)
-        self._fit = problem.fit(level_e or mean_light_e(problem.operator, self._start), training)
-        self._problem, self._validation, self._penalty = problem, validation, penalty
-        self._share = len(training) / len(views)
+        self.validation = views[validation_views(len(views), fold)]
+        self.training = np.setdiff1d(views, self.validation)
+        self._start = problem.start(self.training)
+        self._fit = problem.fit(level_e or mean_light_e(problem.operator, self._start), self.training)
+        self._problem, self._penalty = problem, penalty
+        self._share = len(self.training) / len(views)
         self.samples = self._start.size
         self.passes = self._share
         self.solutions: dict[int, PmlemIterate] = {}
 
+    def solve(self, weight: float, near: Image | None, dual: DualField) -> PmlemIterate:
+        """Return the planes of the training views, given β for all views; `near` are nearby planes to start from."""
+        start = self._start if near is None else np.maximum(near, 1e-3 * self._start)
+        weight *= self._share**0.5
+        iterates = pmlem(
+            self._fit, start, penalty_weight=weight, penalty=self._penalty, tolerance=_TOLERANCE, dual=dual
+        )
+        return iterate_until(iterates, _TOLERANCE, _MAX_PASSES)
+
     def score(self, step: int, weight: float) -> float:
         """Return the loss of the candidate of a step, solved from its neighbour's solution."""
         near = self.solutions.get(step + 1) or self.solutions.get(step - 1)
-        iterates = pmlem(
-            self._fit,
-            self._start if near is None else np.maximum(near.plane, 1e-3 * self._start),
-            penalty_weight=weight * self._share**0.5,
-            penalty=self._penalty,
-            tolerance=_TOLERANCE,
-            dual=self._problem.dual() if near is None else near.dual.copy(),
-        )
-        for done, iterate in enumerate(iterates, 1):
-            if iterate.certificate.distance <= _TOLERANCE or max(done, iterate.passes) >= _MAX_PASSES:
-                break
-        self.solutions[step] = iterate
-        self.passes += iterate.passes * self._share + (1 - self._share)
+        plane, dual = (None, self._problem.dual()) if near is None else (near.plane, near.dual.copy())
+        solution = self.solutions[step] = self.solve(weight, plane, dual)
+        self.passes += solution.passes * self._share + (1 - self._share)
         problem = self._problem
-        return problem.operator.negative_log_likelihood(iterate.plane, problem.images, self._validation)
+        return problem.operator.negative_log_likelihood(solution.plane, problem.images, self.validation)
 
 
 def _losses(
-    folds: list[_Fold], guess: float, apply: Callable[[Callable[[_Fold], float], Sequence[_Fold]], Iterable[float]]
+    folds: list[Fold], guess: float, apply: Callable[[Callable[[Fold], float], Sequence[Fold]], Iterable[float]]
 ) -> dict[int, float]:
     """Return the loss of each candidate `guess · ratioⁿ` by n; `apply` scores all folds."""
     losses: dict[int, float] = {}

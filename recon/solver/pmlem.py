@@ -121,6 +121,14 @@ def pmlem(
     return _Pmlem(fit, penalty_weight, penalty, tolerance).iterates(start, dual)
 
 
+def iterate_until(iterates: Iterator[PmlemIterate], tolerance: float, max_passes: int) -> PmlemIterate:
+    """Return the first iterate that is certified within a tolerance, or the one after `max_passes`."""
+    for count, iterate in enumerate(iterates, 1):  # where no step lowers the objective, passes stay as they are
+        if iterate.certificate.distance <= tolerance or max(count, iterate.passes) >= max_passes:
+            break
+    return iterate
+
+
 class _Pmlem:
     def __init__(self, fit: DataFit, weight: float, penalty: Penalty, tolerance: float) -> None:
         self._fit, self._weight, self._penalty, self._tolerance = fit, weight, penalty, tolerance

@@ -1,6 +1,6 @@
 """The standard deviation of each sample of a penalised plane."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -71,7 +71,13 @@ def local_fits(operator: SceneOperator, fit: DataFit, samples: Image) -> list[Lo
     return found
 
 
-def standard_deviation(local: LocalFit, weight: float, penalty: Penalty, generator: np.random.Generator) -> Image:
+def standard_deviation(
+    local: LocalFit,
+    weight: float,
+    penalty: Penalty,
+    generator: np.random.Generator,
+    answers_of: "Callable[[LocalProblem], Answers] | None" = None,
+) -> Image:
     """Return the standard deviation (row, column) of a plane in electrons: the root of its expected squared error.
 
     The plane is solved again from data with added noise of the size that they have already, on the quadratic that L is
@@ -80,15 +86,12 @@ def standard_deviation(local: LocalFit, weight: float, penalty: Penalty, generat
     divided by its row sums, on opaque samples and beside them, and weighted against the usual ratio. The error beyond
     that is the contrast that the penalty removed; it is spread evenly, because it is not where the answers are.
 
-    `weight` and `penalty` are β ≥ 0 of the optimum, and φ. Without a penalty, the variance is 1/W.
+    `weight` and `penalty` are β ≥ 0 of the optimum, and φ. Without a penalty, the variance is 1/W. The answers are
+    those of the optimum of likelihood and penalty, unless `answers_of` makes others of the local problem.
     """
     if weight == 0 or penalty.name == "none":
         return np.asarray(1 / np.sqrt(local.metric), local.plane.dtype)
-    return error_of_answers(Answers(LocalProblem(local, weight, penalty)), generator)
-
-
-def error_of_answers(answers: "Answers", generator: np.random.Generator) -> Image:
-    """Return the standard deviation (row, column) of an estimate from its answers to noise."""
+    answers = (answers_of or Answers)(LocalProblem(local, weight, penalty))
     problem, usual = answers.problem, answers.usual
     noises = [problem.noise(generator) for _ in range(_DRAWS)]
     size = np.float32(usual.change)

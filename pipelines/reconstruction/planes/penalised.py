@@ -1,8 +1,9 @@
 """PMLEM with its weight chosen from the data: planes at the certified optimum of likelihood and penalty."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -15,12 +16,11 @@ from faintfield.recon.solver.cross_validation import MIN_VIEWS, cross_validated_
 from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.solver.initialization import mean_light_e, universal_penalty_weight
 from faintfield.recon.solver.penalties import Penalty
-from faintfield.recon.solver.pmlem import pmlem
+from faintfield.recon.solver.pmlem import iterate_until, pmlem
 from faintfield.recon.solver.proximal import DualField
 from faintfield.recon.solver.uncertainty import (
     Answers,
     LocalProblem,
-    error_of_answers,
     local_fits,
     standard_deviation,
 )
@@ -100,28 +100,21 @@ def solve_pmlem(objective: Objective) -> list[Solution]:
 
 
 def with_sigma(
-    objective: Objective, solutions: list[Solution], answers: Callable[[int, LocalProblem], Answers] | None = None
+    objective: Objective, solutions: list[Solution], answers: Sequence[Callable[[LocalProblem], Answers]] = ()
 ) -> list[Solution]:
     """Return all planes of one colour with their standard deviation beside them.
 
-    `answers` returns how the plane of an index answers to noise, given what the views say near it; as the optimum of
-    likelihood and penalty by default.
+    `answers` tell of each plane how it answers to noise, as for `standard_deviation`.
     """
     operator, weight = objective.posed.operator, solutions[0].record.penalty_weight or 0.0
     samples = operator.samples_of([solution.plane for solution in solutions])
     generator = np.random.default_rng(_SEED)
     fits = local_fits(operator, objective.posed.fit(objective.level_e), samples)
-    sigmas = []
-    for index, local in enumerate(fits):
-        if answers is None:
-            sigmas.append(standard_deviation(local, weight, objective.penalty, generator))
-        else:
-            problem = LocalProblem(local, weight, objective.penalty)
-            sigmas.append(error_of_answers(answers(index, problem), generator))
-    return [
-        replace(solution, sidecars=solution.sidecars | {"sigma": sigma})
-        for solution, sigma in zip(solutions, sigmas, strict=True)
-    ]
+    found = []
+    for solution, local, of_plane in zip_longest(solutions, fits, answers):
+        sigma = standard_deviation(local, weight, objective.penalty, generator, of_plane)
+        found.append(replace(solution, sidecars=solution.sidecars | {"sigma": sigma}))
+    return found
 
 
 def certified(objective: Objective, start: Image, weight: float, dual: DualField) -> tuple[SolveRecord, Image]:
@@ -137,10 +130,7 @@ def certified(objective: Objective, start: Image, weight: float, dual: DualField
         tolerance=_TOLERANCE,
         dual=dual,
     )
-    limit = objective.options.passes or MAX_PASSES
-    for count, iterate in enumerate(iterates, 1):
-        if iterate.certificate.distance <= _TOLERANCE or max(count, iterate.passes) >= limit:
-            break
+    iterate = iterate_until(iterates, _TOLERANCE, objective.options.passes or MAX_PASSES)
     certificate = Certificate(
         kind=_PMLEM_CERTIFICATE,
         value=float(iterate.certificate.distance),

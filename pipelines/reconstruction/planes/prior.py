@@ -26,7 +26,8 @@ def with_prior(objective: Objective, solutions: Sequence[Solution]) -> list[Solu
     `min L(f) + β TV(f − x̂)` over f ≥ 0, with the β of total variation: where the data contradict the proposal, they
     win. Its record says how far they moved it. Standard deviations are added where the options ask for them.
     """
-    found, answers = list(solutions), None
+    found: list[Solution] = list(solutions)
+    answers: list[Callable[[LocalProblem], Answers]] = []
     if objective.options.has_prior:
         made = _about_proposals(objective, solutions)
         if isinstance(made, str):
@@ -53,7 +54,7 @@ def _contradiction(objective: Objective, samples: Image, evidences: Sequence[Evi
 
 def _about_proposals(
     objective: Objective, solutions: Sequence[Solution]
-) -> tuple[list[Solution], Callable[[int, LocalProblem], Answers]] | str:
+) -> tuple[list[Solution], list[Callable[[LocalProblem], Answers]]] | str:
     """Return the planes about their proposals, and how each answers to noise; or why nothing is proposed."""
     operator, options, first = objective.posed.operator, objective.options, solutions[0].record
     other_colours = objective.other_colours
@@ -84,14 +85,13 @@ def _about_proposals(
         passes_before=(first.passes_before or 0) + first.passes,
     )
     planes = zip(operator.planes_of(found), solutions, proposals, strict=True)
-
-    def answers(index: int, problem: LocalProblem) -> Answers:
-        return ProposalAnswers(problem, proposals[index], solutions[index].plane)
-
     return [
         _solution(plane, record, solution.sidecars, proposal, options, no_network)
         for plane, solution, proposal in planes
-    ], answers
+    ], [
+        partial(ProposalAnswers, proposal=proposal, pilot=solution.plane)
+        for solution, proposal in zip(solutions, proposals, strict=True)
+    ]
 
 
 def _with_network(evidence: Evidence, *, alone: bool) -> dict[str, Image]:
