@@ -10,13 +10,10 @@ from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.kernels import SceneGeometry
 from faintfield.recon.operator.placement import BLOCK_PX, LARGEST_ADVANCE
-from faintfield.recon.operator.relief import Relief
+from faintfield.recon.operator.relief import LARGEST_CODE, Relief
 
 # Distance of the pixels at which the part of the detector that sees a window is looked for.
 _NODE_PX = 16
-
-# Largest code of a relief, in its unit.
-_LARGEST_CODE = 2**15 - 1
 
 type Precision = type[np.float32] | type[np.float64] | np.dtype[np.floating]
 
@@ -144,7 +141,7 @@ def window_geometry(geometry: SceneGeometry, grid: PlaneGrid, first: tuple[int, 
     views = len(geometry.lattice_of_view)
     # The nearest and the farthest depth of a surface; a pixel moves along a line between them
     ends = (-1, 1) if geometry.bent else ()
-    bends = [end * _LARGEST_CODE * float(geometry.relief_step) * homographies[views:] for end in ends]
+    bends = [end * LARGEST_CODE * float(geometry.relief_step) * homographies[views:] for end in ends]
     depths = [homographies[:views] + bend for bend in bends] or [homographies]
     reach = np.zeros((views, rows, 2), np.intp)
     for view, lattice in enumerate(geometry.lattice_of_view.tolist()):

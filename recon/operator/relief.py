@@ -21,7 +21,7 @@ _MAX_STEP, _MAX_BEND = 1.0, 2.5
 _BORDER = 2
 
 # Codes run from minus this to this.
-_HIGHEST = 2**15 - 1
+LARGEST_CODE = 2**15 - 1
 
 # Cells may be drawn this much too large (in cells), so that rounding leaves no cracks between them.
 _OVERLAP = np.float32(1e-3)
@@ -79,7 +79,7 @@ def draw_relief(
     known = inverse_depth[np.isfinite(inverse_depth)].astype(np.float64)
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
     codes = np.empty((len(ray_from_surface), *rays.shape[1:3]), np.int16)
-    relief = Relief(codes, (high - low) / (2 * (_HIGHEST - 1)), 0.5 * (low + high))
+    relief = Relief(codes, (high - low) / (2 * (LARGEST_CODE - 1)), 0.5 * (low + high))
     farthest = float(np.abs(ray_from_surface[:, :2, 3]).max())
     tear = _MAX_STEP * grid.pitch_mm / farthest if farthest > 0 else np.inf
     whole = np.pad(_whole_cells(inverse_depth, tear), _BORDER, mode="edge")
@@ -216,5 +216,5 @@ def _read(buffer, rays, left, top, per_mm, tear, step, codes):
                 right, down = x - column, y - row
                 upper, lower = a + right * (b - a), c + right * (d - c)
                 code = int(np.rint((upper + down * (lower - upper)) * per_step))
-                code = min(max(code, -_HIGHEST), _HIGHEST)
+                code = min(max(code, -LARGEST_CODE), LARGEST_CODE)
             codes[i, j] = code

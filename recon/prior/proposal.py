@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from faintfield.recon.likelihood.images import Image, blurred
 from faintfield.recon.operator.occlusion import opacity
 from faintfield.recon.prior.evidence import Evidence, evidence_of_planes
-from faintfield.recon.solver.cross_validation import MIN_VIEWS, Fold, folds_to_predict
+from faintfield.recon.solver.cross_validation import Fold, folds_to_predict
 from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.solver.penalties import Penalty, differences
 from faintfield.recon.solver.proximal import DualField
@@ -141,7 +141,7 @@ def propose(
     Parameters
     ----------
     problem, samples, penalty_weight : SceneProblem, float array (samples), float
-        Operator and images; f, the planes of total variation; their β.
+        Operator and images, of at least `MIN_VIEWS` views that see anything; f, the planes of total variation; their β.
     evidences : sequence of Evidence
         Evidence of all views for each plane.
     candidates : callable
@@ -149,16 +149,8 @@ def propose(
         where all predict alike.
     other_colours : float array (samples), optional
         The planes in other colours, for the evidence of the folds.
-
-    Raises
-    ------
-    ValueError
-        Fewer than `MIN_VIEWS` views see anything.
     """
     operator = problem.operator
-    views = operator.seeing_views
-    if len(views) < MIN_VIEWS:
-        raise ValueError(f"need at least {MIN_VIEWS} views that see anything to leave some out, got {len(views)}")
     regions = [regions_of(*of_plane) for of_plane in zip(operator.planes_of(samples), evidences, strict=True)]
     totals: list[list[Scores]] = [[] for _ in evidences]
     for number in range(max(_MIN_FOLDS, folds_to_predict(problem))):

@@ -91,25 +91,17 @@ def cross_validated_weight(
     Parameters
     ----------
     problem, penalty : SceneProblem, Penalty
-        One plane, or several planes together; φ.
+        One plane, or several planes together, that at least `MIN_VIEWS` views see; φ.
     guess : float
         A weight to start from, for all views.
     level_e : float, optional
         Mean light of the samples that the views see, in electrons, for windows; by default that of each window.
-
-    Raises
-    ------
-    ValueError
-        Fewer than `MIN_VIEWS` views see anything.
 
     Notes
     -----
     The noise of the data's part of the objective grows as the root of the number of views, and so does the weight from
     the training views to all views.
     """
-    views = len(problem.operator.seeing_views)
-    if views < MIN_VIEWS:
-        raise ValueError(f"need at least {MIN_VIEWS} views that see anything to leave some out, got {views}")
     windows = windows_of(problem, MIN_VIEWS)
     if windows:
         # A dark window is solved with the light of the whole plane, as that will be

@@ -55,8 +55,6 @@ def pmlem_one_step_late(
 
     Raises
     ------
-    ValueError
-        An argument is out of its range, or `start` is not positive.
     NotConverged
         The weight is so large that most denominators could become negative, or an iterate is not finite.
 
@@ -65,10 +63,6 @@ def pmlem_one_step_late(
     The denominator is positive for every f only where `s > (2 + √2) β`. Samples seen by fewer views keep their start
     value, see `updated_samples`. With a large β iterates may oscillate without end, which `oscillates` detects.
     """
-    if not (penalty_weight >= 0 and epsilon > 0):
-        raise ValueError(f"need penalty_weight >= 0 and epsilon > 0, got {penalty_weight} and {epsilon}")
-    if not (start > 0).all():
-        raise ValueError(f"start must be positive everywhere, its least value is {start.min()}")
     sensitivity = operator.sensitivity()
     updated, seen = updated_samples(sensitivity, penalty_weight), well_seen_samples(sensitivity)
     if np.count_nonzero(updated & seen) < np.count_nonzero(seen) / 2:
@@ -77,16 +71,8 @@ def pmlem_one_step_late(
             f"penalty weight {penalty_weight:.3g} makes most denominators of eq. (2) negative; with these views it "
             f"must stay below {limit:.3g}: give a smaller one"
         )
-    return _one_step_late(operator, images, np.array(start, operator.dtype), penalty_weight, epsilon)
-
-
-def _one_step_late(
-    operator: PlaneOperator, images: ElementalImages, plane: Image, penalty_weight: float, epsilon: float
-) -> Iterator[Iterate]:
-    sensitivity = operator.sensitivity()
-    updated = updated_samples(sensitivity, penalty_weight)
-    step = np.zeros_like(plane)
-    passes = 0
+    plane = np.array(start, operator.dtype)
+    step, passes = np.zeros_like(plane), 0
     while True:
         denominator = sensitivity
         if penalty_weight > 0:

@@ -6,6 +6,7 @@ That is `min ½ Σ w (x − v)² + β Σ φ(|∇(x − x̂)|)` over x ≥ 0, wit
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -28,17 +29,8 @@ _CHECK_SHARE = 0.1
 _FIRST_LENGTH, _CONVEXITY = 1.0, 0.6
 
 
-@dataclass(frozen=True)
-class ProxResult:
-    """The solution of a proximal problem.
-
-    Attributes
-    ----------
-    plane : float array (samples)
-        x, at least zero.
-    gap, steps : float, int
-        Bound on the objective's excess over its minimum, and steps made.
-    """
+class ProxResult(NamedTuple):
+    """The solution x ≥ 0 (samples), a bound on the objective's excess over its minimum, and steps made."""
 
     plane: Image
     gap: float

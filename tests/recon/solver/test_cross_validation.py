@@ -94,12 +94,6 @@ def test_candidates_scale_penalty_by_share_of_training_views() -> None:
         assert loss == pytest.approx(views * rows * np.sum(moved**2) / (2 * variance_e2), rel=0.2)
 
 
-def test_too_few_views_are_refused() -> None:
-    few = views_displaced_by(np.zeros((3, 2)), (4, 4), margin=0)
-    with pytest.raises(ValueError, match="at least 4 views"):
-        cross_validated_weight(SceneProblem(few, ElementalImages(np.ones((3, 4, 4)))), 1.0, Penalty())
-
-
 def test_views_that_see_nothing_are_left_out() -> None:
     aside = np.zeros((49, 2))
     aside[:, 1] = np.where(np.arange(49) % 7 == 3, 0.5, 1000.0)
