@@ -193,7 +193,7 @@ class PlaneAccumulator:
             _binned_sum(elemental_set.background_e(self._noise), bins),
             _binned_sum(elemental_set.read_variance_e2(self._noise), bins),
         )
-        operator = self._factory.of_views(self._depths_mm[index], self._grids[index], views, images.valid)
+        operator = self._factory.at(self._depths_mm[index], self._grids[index], views, images.valid)
         objective = Objective.of(SceneProblem(operator, images), SolverOptions())
         weight = universal_penalty_weight(operator, objective.posed.images, objective.start)
         before = self._refined.get(index)
@@ -213,7 +213,7 @@ class PlaneAccumulator:
         """Back-project a frame to a plane; None if its view does not see the plane."""
         depth_mm, grid = self._depths_mm[index], self._grids[index]
         try:
-            operator = self._factory.of_views(depth_mm, grid, [read.view], read.images.valid)
+            operator = self._factory.at(depth_mm, grid, [read.view], read.images.valid)
         except GeometryMismatch:
             return None
         return seen_by_view(operator, read.images, read.share)

@@ -112,7 +112,7 @@ class OperatorFactory:
     """Makes the operators of one channel; rays, response and mask, which they share, are computed once.
 
     `bins` is the width of the bins of images from `ElementalImages.binned`. Without `images`, whose mask all operators
-    share, only `of_views` makes operators.
+    share, operators are those of some views with their own.
     """
 
     def __init__(
@@ -127,22 +127,17 @@ class OperatorFactory:
         whole = binned(response > 0, bins) == 1  # a bin with an unusable pixel holds the electrons of that, too
         self._maps = DetectorMaps(rays, np.where(whole, binned(response, bins), 0))
         self._poses, self._principal_shift = elemental_set.poses_rt_cam_ref, principal_shift(elemental_set)
-        valid, lattice_of_view = (
-            None if images is None else images.valid,
-            np.tile(np.arange(self._phases), len(self._poses)),
-        )
-        self._shared: dict[str, Any] = {"valid": valid, "lattice_of_view": lattice_of_view}
+        self._shared = self._of_views(len(self._poses), None if images is None else images.valid)
 
-    def at(self, place: Place, grid: PlaneGrid) -> PlaneOperator:
-        """Return H of a plane at a depth, or of a pose."""
-        return PlaneOperator(self._homographies(place), self._maps, grid, **self._shared)
+    def _of_views(self, count: int, valid: NDArray[np.bool_] | None) -> dict[str, Any]:
+        return {"valid": valid, "lattice_of_view": np.tile(np.arange(self._phases), count)}
 
-    def of_views(
-        self, place: Place, grid: PlaneGrid, views: Sequence[int], valid: NDArray[np.bool_] | None
+    def at(
+        self, place: Place, grid: PlaneGrid, views: Sequence[int] | None = None, valid: NDArray[np.bool_] | None = None
     ) -> PlaneOperator:
-        """Return H of a plane in some views alone, in their order, with a mask (view, row, column) of their own."""
-        own = {"valid": valid, "lattice_of_view": np.tile(np.arange(self._phases), len(views))}
-        return PlaneOperator(self._homographies(place, views), self._maps, grid, **self._shared | own)
+        """Return H of a plane at a depth, or of a pose; of some views alone with their mask (view, row, column)."""
+        shared = self._shared if views is None else self._of_views(len(views), valid)
+        return PlaneOperator(self._homographies(place, views), self._maps, grid, **shared)
 
     def of_surface(self, inverse_depth: NDArray[np.floating], grid: PlaneGrid) -> SurfaceOperator:
         """Return H of the surface with these 1/depths in 1/mm, on the samples of a grid at unit depth."""

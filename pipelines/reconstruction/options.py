@@ -102,8 +102,10 @@ class Options:
 DEFAULTS = Options()
 
 
-def sweep_values(option: str, text: str, example: str) -> list[float]:
-    """Return the numbers of FIRST:LAST:COUNT, in equal steps."""
+def sweep_values(option: str, text: str | None, example: str = "400:900:64") -> list[float]:
+    """Return the numbers of FIRST:LAST:COUNT, in equal steps; none of an option that is not given."""
+    if text is None:
+        return []
     parts = re.fullmatch(r"(-?\d+(?:\.\d*)?):(-?\d+(?:\.\d*)?):(\d+)", text)
     if parts is None:
         raise WrongUsage(f"{option} {text}: is no sweep; give FIRST:LAST:COUNT, such as {example}")

@@ -88,11 +88,10 @@ class Request:
 class Selection:
     """Planes as the options select them, before the set is known: single ones and those of a sweep, by unit.
 
-    `solver` has the prior that is chosen by default.
+    The options have the prior that is chosen by default.
     """
 
     options: Options
-    solver: SolverOptions
     methods: list[Method]
     tilted: list[TiltedPlane]
     single: dict[_Unit, list[float]]
@@ -126,7 +125,6 @@ def select_planes(options: Options) -> Selection:
         )
     selection = Selection(
         options=options,
-        solver=options.solver,
         methods=_methods(options),
         tilted=read_plane_poses(options.plane_pose or []),
         single={
@@ -135,18 +133,19 @@ def select_planes(options: Options) -> Selection:
             "px": options.disparity_px or [],
         },
         swept={
-            "own": _swept("--sweep", None if options.sweep == "auto" else options.sweep),
-            "mm": _swept("--sweep-mm", options.sweep_mm),
-            "px": _swept("--sweep-px", options.sweep_px, "-3.5:0.8:40"),
+            "own": [] if options.sweep == "auto" else sweep_values("--sweep", options.sweep),
+            "mm": sweep_values("--sweep-mm", options.sweep_mm),
+            "px": sweep_values("--sweep-px", options.sweep_px, "-3.5:0.8:40"),
         },
     )
     if any(depth <= 0 for depth in selection.swept["mm"]):
         raise WrongUsage(f"--sweep-mm {options.sweep_mm}: is no sweep; give two different positive depths")
     if options.solver.prior is None:
-        selection = replace(selection, solver=replace(options.solver, prior=_default_prior(selection)))
+        solver = replace(options.solver, prior=_default_prior(selection))
+        selection = replace(selection, options=replace(options, solver=solver))
     _check_depths(selection)
     _check_methods(selection)
-    check_prior(selection.methods, selection.solver)
+    check_prior(selection.methods, selection.options.solver)
     return selection
 
 
@@ -156,12 +155,8 @@ def _methods(options: Options) -> list[Method]:
     return list(dict.fromkeys(given)) or [DEFAULT_METHOD]
 
 
-def _swept(option: str, text: str | None, example: str = "400:900:64") -> list[float]:
-    return sweep_values(option, text, example) if text else []
-
-
 def _default_prior(selection: Selection) -> PriorName:
-    options, solver = selection.options, selection.solver
+    options, solver = selection.options, selection.options.solver
     helps = solver.penalty == "tv" and solver.penalty_weight != 0 and bool(_WITH_PRIOR & set(selection.methods))
     sweeps = bool(options.sweep or options.sweep_mm or options.sweep_px) and not selection.auto
     return "auto" if helps and not sweeps else "tv"
@@ -203,7 +198,7 @@ def _check_depths(selection: Selection) -> None:
 
 def _check_methods(selection: Selection) -> None:
     """Refuse options that contradict one another or would have no effect (WrongUsage)."""
-    methods, solver = selection.methods, selection.solver
+    methods, solver = selection.methods, selection.options.solver
     if selection.tilted and "occlusion" in methods:
         raise WrongUsage(
             "occlusion needs to know which plane is nearer, which is undefined for planes given by a pose; use joint"
@@ -248,7 +243,7 @@ def resolve(
     return Request(
         distinct_depths(depths, elemental_set),
         selection.methods,
-        selection.solver,
+        selection.options.solver,
         selection.options.pitch_mm,
         with_focus=(any(selection.swept.values()) or selection.auto_sweep) and not selection.auto,
         with_depth_map=selection.options.depth_map,

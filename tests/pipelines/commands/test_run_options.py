@@ -116,11 +116,11 @@ def test_prior_applies_to_planes_and_surface() -> None:
     assert surface is not None
     assert (surface.solver.prior, surface.solver.uncertainty) == ("patches", False)
     planes = select_planes(given)
-    assert (planes.solver.prior, planes.solver.uncertainty) == ("patches", True)
+    assert (planes.options.solver.prior, planes.options.solver.uncertainty) == ("patches", True)
     by_default = Options(depth_mm=[500.0], surface=True)
     surface = select_surface(by_default)
     assert surface is not None
     assert surface.solver.prior is None
-    assert select_planes(by_default).solver.prior == "auto"
-    assert select_planes(Options(depth_mm=[500.0], method=["mlem"])).solver.prior == "tv"
-    assert select_planes(Options(sweep_mm="480:520:2")).solver.prior == "tv"
+    assert select_planes(by_default).options.solver.prior == "auto"
+    assert select_planes(Options(depth_mm=[500.0], method=["mlem"])).options.solver.prior == "tv"
+    assert select_planes(Options(sweep_mm="480:520:2")).options.solver.prior == "tv"
