@@ -125,7 +125,7 @@ def load_channel(elemental_set: ElementalSet, layout: ChannelLayout, allocate: A
     def load(view: int) -> None:
         nonlocal valid
         part = slice(view * phases, (view + 1) * phases)
-        over = _add_up(elemental_set, layout, noise_of, elemental_set.frame_paths(view), electrons[part])
+        over = _add_up(elemental_set, layout, noise_of, elemental_set.frame_paths[view], electrons[part])
         if over.any():
             with allocating:
                 if valid is None:

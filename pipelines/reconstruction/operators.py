@@ -42,14 +42,19 @@ def default_pitch_px(elemental_set: ElementalSet, layouts: list[ChannelLayout]) 
     return 1 if fewest_per_sample >= 1 else max(step)
 
 
-def plane_grid(elemental_set: ElementalSet, depth_mm: float, pitch_mm: float | None = None) -> PlaneGrid:
-    """Return the samples of the plane at a depth, one per pixel of the reference view by default.
+def plane_grid(elemental_set: ElementalSet, place: Place, pitch_mm: float | None = None) -> PlaneGrid:
+    """Return the samples of a plane, one per pixel of the reference view by default.
 
-    Raises GeometryMismatch if the plane is not in front of the camera, or the pitch leaves it without samples.
+    At a depth it has what the reference view sees; a tilted one its stated size, or what that view sees of it. Raises
+    GeometryMismatch if the plane is not in front of the camera, the pitch leaves it without samples, or a part of the
+    view does not meet it, or only very far away.
     """
+    if isinstance(place, TiltedPlane):
+        return _tilted_grid(elemental_set, place, pitch_mm)
+    depth_mm = place
     check_in_front(depth_mm)
     camera = elemental_set.settings.camera
-    cx_px, cy_px = elemental_set.principal_points_px()[elemental_set.reference_view].tolist()
+    cx_px, cy_px = elemental_set.principal_points_px[elemental_set.reference_view].tolist()
     width, height = camera.size_px
     mm_per_px_x, mm_per_px_y = depth_mm / camera.fx_px, depth_mm / camera.fy_px
     try:
@@ -64,17 +69,15 @@ def plane_grid(elemental_set: ElementalSet, depth_mm: float, pitch_mm: float | N
         raise GeometryMismatch(f"plane at {elemental_set.depth_text(depth_mm)}: {failure}") from failure
 
 
-def tilted_grid(elemental_set: ElementalSet, plane: TiltedPlane, pitch_mm: float) -> PlaneGrid:
-    """Return the samples of a plane of any pose: of its stated size, or what the reference view sees of it.
-
-    Raises GeometryMismatch if a part of the view does not meet the plane in front of the camera, or only very far away.
-    """
-    width, height = elemental_set.settings.camera.size_px
+def _tilted_grid(elemental_set: ElementalSet, plane: TiltedPlane, pitch_mm: float | None) -> PlaneGrid:
+    camera = elemental_set.settings.camera
+    width, height = camera.size_px
     if not plane.depth_mm > 0:
         raise GeometryMismatch(
             f"plane '{plane.name}': lies behind the camera, at {plane.depth_mm:g} mm along its axis; z points forward: "
             "correct its pose"
         )
+    pitch_mm = plane.depth_mm / camera.fx_px if pitch_mm is None else pitch_mm
     low, high = _covered_part(elemental_set, plane)
     samples, max_samples = float(np.prod((high - low) / pitch_mm)), _MAX_SAMPLES_PER_PIXEL * width * height
     if samples > max_samples:
@@ -95,9 +98,7 @@ def _covered_part(elemental_set: ElementalSet, plane: TiltedPlane) -> tuple[NDAr
     camera = elemental_set.settings.camera
     width, height = camera.size_px
     columns, rows = np.meshgrid(np.linspace(-0.5, width - 0.5, 3), np.linspace(-0.5, height - 0.5, 3))
-    shift_px = (
-        np.array([camera.cx_px, camera.cy_px]) - elemental_set.principal_points_px()[elemental_set.reference_view]
-    )
+    shift_px = np.array([camera.cx_px, camera.cy_px]) - elemental_set.principal_points_px[elemental_set.reference_view]
     rays = elemental_set.lens.rays_at(np.column_stack([columns.ravel(), rows.ravel()]) + shift_px)
     points = plane.on_plane(np.column_stack([rays, np.ones(len(rays))]))
     if np.isnan(points).any():
@@ -174,7 +175,7 @@ def response_of(elemental_set: ElementalSet, lattice: Lattice) -> NDArray[np.flo
 def principal_shift(elemental_set: ElementalSet) -> NDArray[np.float64] | None:
     """Return the shift (view, 2) of the rays of views with a principal point of their own, None without such views."""
     camera = elemental_set.settings.camera
-    shift_px = np.array([camera.cx_px, camera.cy_px]) - elemental_set.principal_points_px()
+    shift_px = np.array([camera.cx_px, camera.cy_px]) - elemental_set.principal_points_px
     if not shift_px.any():
         return None
     if any(camera.distortion):
@@ -192,7 +193,7 @@ def seen_from(
     """Return where views see what pixels (pixel, 2) of the reference view show of a plane: x, y (view, pixel, 2)."""
     camera, poses = elemental_set.settings.camera, elemental_set.poses_rt_cam_ref
     # The lens has the camera's principal point; a view with its own has its picture shifted
-    shifts = elemental_set.principal_points_px() - np.array([camera.cx_px, camera.cy_px])
+    shifts = elemental_set.principal_points_px - np.array([camera.cx_px, camera.cy_px])
     straight, plane = pixels - shifts[elemental_set.reference_view], fronto_parallel_rt_ref_plane(depth_mm)
     return np.array([transfer(elemental_set.lens, poses[view], plane, straight) + shifts[view] for view in views])
 

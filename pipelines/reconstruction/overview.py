@@ -94,7 +94,7 @@ def brightness_within(elemental_set: ElementalSet, region: Region | None, name: 
     has_reference = len(elemental_set.noise_reference) >= elemental_set.frames_per_view
     signal, reference = [], []
     for layout in channel_layouts(elemental_set):
-        images = view_electrons(elemental_set, layout, elemental_set.frame_paths(elemental_set.reference_view))
+        images = view_electrons(elemental_set, layout, elemental_set.frame_paths[elemental_set.reference_view])
         no_light = view_electrons(elemental_set, layout, elemental_set.noise_reference[: elemental_set.frames_per_view])
         for index, lattice in enumerate(layout.lattices):
             where = np.ones(lattice.shape, bool) if region is None else lattice.of(region)

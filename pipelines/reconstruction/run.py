@@ -12,7 +12,7 @@ from msgspec import UNSET, UnsetType
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue, OutputExists
 from faintfield.pipelines.formats.files import remove, remove_leftovers, require_room, write_record
-from faintfield.pipelines.formats.plane_poses import Place
+from faintfield.pipelines.formats.plane_poses import Place, depth_of
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.results.figures import METRICS_FILE, Metrics
 from faintfield.pipelines.formats.results.plane_files import PARTS, Origin, PlaneFiles
@@ -35,11 +35,10 @@ from faintfield.pipelines.reconstruction.accuracy import assess, write_depth_err
 from faintfield.pipelines.reconstruction.channels import SHARE_OF_DISK, channel_layouts
 from faintfield.pipelines.reconstruction.depth.depth_map import kept_depth_map, write_depth_map
 from faintfield.pipelines.reconstruction.depth.search import check_overlap, check_views, depths_of_set
-from faintfield.pipelines.reconstruction.operators import default_pitch_px, plane_grid, tilted_grid
+from faintfield.pipelines.reconstruction.operators import default_pitch_px, plane_grid
 from faintfield.pipelines.reconstruction.overview import inspect_set, write_overview
 from faintfield.pipelines.reconstruction.planes.sweep import PlaneTask, Runner, Sweep, run_serially
 from faintfield.pipelines.reconstruction.request import Request, folder_of_method
-from faintfield.recon.operator.grid import PlaneGrid
 
 # Planes whose mean is at most this, in electrons per pixel, count as black.
 _BLACK_E = 1e-5
@@ -152,11 +151,10 @@ def _make_planes(sweep: Sweep, folders: dict[Method, Path], out: Path, runner: R
 def _sweep(elemental_set: ElementalSet, folders: dict[Method, Path], request: Request) -> Sweep:
     layouts = channel_layouts(elemental_set)
     mm_per_depth = default_pitch_px(elemental_set, layouts) / elemental_set.settings.camera.fx_px
-    grids: dict[Place, PlaneGrid] = {
-        depth: plane_grid(elemental_set, depth, request.pitch_mm or depth * mm_per_depth) for depth in request.depths_mm
+    places: list[Place] = [*request.depths_mm, *request.tilted]
+    grids = {
+        place: plane_grid(elemental_set, place, request.pitch_mm or depth_of(place) * mm_per_depth) for place in places
     }
-    for plane in request.tilted:
-        grids[plane] = tilted_grid(elemental_set, plane, request.pitch_mm or plane.depth_mm * mm_per_depth)
     inputs = elemental_set.input_hashes()
 
     def origin(method: Method, place: Place | None = None) -> Origin:

@@ -19,7 +19,7 @@ from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.surface.estimate import SurfaceEstimate
 from faintfield.recon.surface.pinhole_views import PinholeViews
 
-# What a search for depths is given: the views, the 1/depths to compare, and the nodes.
+# What a search for depths is given: the views, and the 1/depths to compare.
 type Searches = list[tuple[PinholeViews, NDArray[np.float64]]]
 
 # What the search that stands in for the slow one finds everywhere.

@@ -127,7 +127,7 @@ def export_posed(
     Lengths are in `unit`, or relative. An earlier export, a folder with files of the patterns `held` only, is replaced.
     """
     elemental_set = load_set_or_session(set_path)
-    points_px = elemental_set.principal_points_px().tolist()
+    points_px = elemental_set.principal_points_px.tolist()
     parts = zip(elemental_set.settings.view, points_px, elemental_set.poses_rt_cam_ref, strict=True)
     views = [
         PosedImage(Path(view.image), replace(elemental_set.lens, cx_px=cx_px, cy_px=cy_px), pose)

@@ -102,10 +102,10 @@ class ElementalSet:
         """Number of frames that are added up to a view."""
         return 1 + len(self.settings.view[0].repeats)
 
-    def frame_paths(self, view: int) -> list[Path]:
-        """Return the paths of all frames of a view."""
-        entry = self.settings.view[view]
-        return [self.folder / name for name in (entry.image, *entry.repeats)]
+    @cached_property
+    def frame_paths(self) -> list[list[Path]]:
+        """Paths of all frames of each view."""
+        return [[self.folder / name for name in (view.image, *view.repeats)] for view in self.settings.view]
 
     def background_e(self, noise: NoiseModel) -> Map:
         """Return the dark electrons expected in all frames of a view, by the noise model of all pixels or a part."""
@@ -115,8 +115,9 @@ class ElementalSet:
         """Return the variance in e⁻² that reading adds to a view, once per frame."""
         return self.frames_per_view * noise.read_variance_e2()
 
+    @property
     def principal_points_px(self) -> NDArray[np.float64]:
-        """Return cx, cy of each view (view, 2)."""
+        """Principal point cx, cy of each view (view, 2)."""
         camera = self.settings.camera
         return np.array(
             [
@@ -184,7 +185,7 @@ class ElementalSet:
         nodes = np.array([view.node or (np.nan, np.nan) for view in self.settings.view], float)
         if np.isnan(nodes).any():
             raise BadValue(f"{self.folder}: disparities need the node of every view; give depths in mm instead")
-        centres = self.principal_points_px()
+        centres = self.principal_points_px
         ratio = self.settings.arrangement.pitch_ratio if self.settings.arrangement is not None else 1.0
         steps = (nodes - nodes[self.reference_view])[:, ::-1] / [1.0, ratio]
         return steps, centres - centres[self.reference_view]

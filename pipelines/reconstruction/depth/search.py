@@ -75,7 +75,7 @@ def luminance(elemental_set: ElementalSet, bins: int) -> PinholeViews:
 
     def read(view: int) -> None:
         total = np.zeros(shape, np.float32)
-        paths = elemental_set.frame_paths(view)
+        paths = elemental_set.frame_paths[view]
         electrons = (found for layout in layouts for found in view_electrons(elemental_set, layout, paths))
         for (_, lattice), response, background, (sum_e, over) in zip(
             parts, responses, backgrounds, electrons, strict=True

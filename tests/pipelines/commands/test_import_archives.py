@@ -65,7 +65,7 @@ def test_positions_in_names_place_cameras(tmp_path: Path, done: Command) -> None
     # The plane on which pictures are aligned stays where it is in all of them, also with uneven steps
     assert elemental_set.depth_of_disparity(0.0) == pytest.approx(20 * 10 / 2, rel=1e-3)
     moved = 20 * elemental_set.poses_rt_cam_ref[:, 3:5] / elemental_set.depth_of_disparity(0.0)
-    moved += elemental_set.principal_points_px()
+    moved += elemental_set.principal_points_px
     np.testing.assert_allclose(moved, moved[[4] * 9], atol=1e-9)
 
 

@@ -51,8 +51,8 @@ def test_exported_principal_points_come_back(program: str, tmp_path: Path, done:
     words = ("--images", tmp_path / "set", "--reference", "view_r1_c1.tiff")
     done("import", program, tmp_path / "model", tmp_path / "back", *words)
     first, back = load_set(tmp_path / "set"), load_set(tmp_path / "back")
-    assert len(np.unique(first.principal_points_px(), axis=0)) == 6
-    np.testing.assert_allclose(back.principal_points_px(), first.principal_points_px(), atol=1e-9)
+    assert len(np.unique(first.principal_points_px, axis=0)) == 6
+    np.testing.assert_allclose(back.principal_points_px, first.principal_points_px, atol=1e-9)
     np.testing.assert_allclose(back.poses_rt_cam_ref, first.poses_rt_cam_ref, atol=1e-6)
     assert [view.node for view in back.settings.view] == [view.node for view in first.settings.view]
 

@@ -59,7 +59,7 @@ def _plain(elemental_set: ElementalSet) -> tuple[NDArray[np.floating], NDArray[n
     assert noise.response is not None
     first, second = noise.response.bends_per_dn
     for frame in range(2):
-        pixels = np.stack([tifffile.imread(elemental_set.frame_paths(view)[frame]) for view in range(3)])
+        pixels = np.stack([tifffile.imread(elemental_set.frame_paths[view][frame]) for view in range(3)])
         signal = pixels - noise.offset_dn
         within = np.clip(signal, 0, noise.response.up_to_dn)
         slope = 1 + 2 * first * within + 3 * second * within**2

@@ -125,7 +125,7 @@ def test_exported_transforms_come_back(
     done("import", "nerfstudio", tmp_path / "out", tmp_path / "back", *words)
     first, back = load_set(tmp_path / "set"), load_set(tmp_path / "back")
     np.testing.assert_allclose(back.poses_rt_cam_ref, first.poses_rt_cam_ref, atol=1e-9)
-    np.testing.assert_allclose(back.principal_points_px(), first.principal_points_px(), atol=1e-12)
+    np.testing.assert_allclose(back.principal_points_px, first.principal_points_px, atol=1e-12)
     assert back.lens.fy_px == first.lens.fy_px
     assert back.lens.distortion[:4] == (-0.05, 0.0, 0.0, 0.001)
     written = json.loads((tmp_path / "out" / "transforms.json").read_text())
