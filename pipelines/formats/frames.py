@@ -39,6 +39,9 @@ RAW_SUFFIXES = {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", 
 PLAIN_SUFFIXES = NETPBM_SUFFIXES | {".bmp", ".exr"}
 IMAGE_SUFFIXES = TIFF_SUFFIXES | PHOTO_SUFFIXES | PLAIN_SUFFIXES | RAW_SUFFIXES
 
+_COLOUR_NAMES = {"R": "red", "G": "green", "B": "blue"}
+_RGB = ("red", "green", "blue")
+
 # Complaints about damaged EXIF are dropped: such a file states no exposure.
 logging.getLogger("exifread").addHandler(logging.NullHandler())
 
@@ -91,6 +94,41 @@ class Frame:
     black_dn: NDArray[np.float64] | None = None
     saturation_dn: float | None = None
     exposure_s: float | None = None
+
+
+@dataclass(frozen=True)
+class ChannelLayout:
+    """Position of one colour in the frames.
+
+    `name` is "grey", "red", "green" or "blue", `plane_of_colour` the index of the colour in RGB frames. Of a mosaic
+    there is one lattice for each of its phases that has this colour.
+    """
+
+    name: str
+    plane_of_colour: int | None
+    lattices: tuple[Lattice, ...]
+
+    def of(self, pixels: NDArray[Any]) -> NDArray[Any]:
+        """Return the part of a frame (row, column[, colour]) that can hold this colour, (row, column)."""
+        return pixels if self.plane_of_colour is None else pixels[:, :, self.plane_of_colour]
+
+
+def layouts_of(frame: Frame, mosaic: Sequence[str] | None = None) -> list[ChannelLayout]:
+    """Return the colours of a frame; those of `mosaic`, if it is stated."""
+    mosaic, (height, width) = mosaic or frame.mosaic, frame.pixels_dn.shape[:2]
+    everything = Lattice((0, 0), (1, 1), (height, width))
+    if frame.pixels_dn.ndim == 3:
+        return [ChannelLayout(name, index, (everything,)) for index, name in enumerate(_RGB)]
+    if mosaic is None:
+        return [ChannelLayout("grey", None, (everything,))]
+    period = mosaic_period(mosaic)
+    shape = (height // period[0], width // period[1])
+    layouts = []
+    for letter in sorted(set("".join(mosaic)), key="RGB".find):
+        phases = [(r, c) for r, c in np.ndindex(*period) if mosaic[r][c] == letter]
+        lattices = tuple(Lattice(phase, period, shape) for phase in phases)
+        layouts.append(ChannelLayout(_COLOUR_NAMES.get(letter, letter), None, lattices))
+    return layouts
 
 
 def read_frame(

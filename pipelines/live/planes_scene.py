@@ -8,7 +8,7 @@ import numpy as np
 from faintfield.calib.lens import Lens
 from faintfield.calib.noise_model import NoiseModel
 from faintfield.pipelines.errors import BadValue, MissingFile
-from faintfield.pipelines.formats.frames import Frame, Lattice, mosaic_period
+from faintfield.pipelines.formats.frames import ChannelLayout, Frame, Lattice, mosaic_period
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, CameraPoses, read_geometry
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, FittedNoise, read_fitted_noise
 from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSetFile
@@ -16,7 +16,6 @@ from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.formats.sets.session_set import nominal_view, relative_to_axis, with_measured_geometry
 from faintfield.pipelines.live.planes_client import LiveOrder
 from faintfield.pipelines.planning.known import KnownLens, Sensor, calibration_file, known_lens, known_sensor
-from faintfield.pipelines.reconstruction.channels import ChannelLayout
 from faintfield.rig.plan import CapturePlan, PlannedFrame, planned_frames
 from faintfield.rig.session.session import FrozenPlan
 

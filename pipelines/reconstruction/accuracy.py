@@ -21,7 +21,7 @@ from faintfield.pipelines.formats.sets.ground_truth import (
     texture_and_region,
     true_plane,
 )
-from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
+from faintfield.pipelines.reconstruction.channels import load_channel
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
 from faintfield.pipelines.reconstruction.overview import OBJECT_REGION, brightness
 from faintfield.recon.metrics import mean_square_error, peak_snr_db
@@ -86,7 +86,7 @@ def _plane_errors(
 
 def _back_projections(noise_free: ElementalSet, depths: list[float]) -> dict[float, NDArray[np.floating]]:
     colours: dict[float, list[NDArray[np.floating]]] = {depth: [] for depth in depths}
-    for layout in channel_layouts(noise_free):
+    for layout in noise_free.layouts:
         images = load_channel(noise_free, layout)
         factory = OperatorFactory(noise_free, layout, images)
         for depth in depths:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from shutil import disk_usage
 from tempfile import TemporaryFile
@@ -14,14 +14,11 @@ from numpy.typing import NDArray
 
 from faintfield.calib.noise_model import NoiseModel
 from faintfield.pipelines.errors import BadValue, UnreadableImage, WrongBitDepth
-from faintfield.pipelines.formats.frames import RAW_SUFFIXES, Frame, Lattice, mosaic_period, read_frame
+from faintfield.pipelines.formats.frames import RAW_SUFFIXES, ChannelLayout, Frame, Lattice, read_frame
 from faintfield.pipelines.formats.large_arrays import Allocate, mapped
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.threads import map_in_threads
-
-_COLOUR_NAMES = {"R": "red", "G": "green", "B": "blue"}
-_RGB = ("red", "green", "blue")
 
 # Share of the free disk that decoded frames may take; the rest is for results, and for electrons if memory is short.
 SHARE_OF_DISK = 0.25
@@ -33,41 +30,9 @@ _MOST_KEPT = 256
 _NOISE_MAPS = ("offset_dn", "gain_dn_per_e", "read_noise_e", "dark_current_e_per_s")
 
 
-@dataclass(frozen=True)
-class ChannelLayout:
-    """Position of one colour in the frames.
-
-    `name` is "grey", "red", "green" or "blue", `plane_of_colour` the index of the colour in RGB frames. Of a mosaic
-    there is one lattice for each of its phases that has this colour.
-    """
-
-    name: str
-    plane_of_colour: int | None
-    lattices: tuple[Lattice, ...]
-
-    def of(self, pixels: NDArray[Any]) -> NDArray[Any]:
-        """Return the part of a frame (row, column[, colour]) that can hold this colour, (row, column)."""
-        return pixels if self.plane_of_colour is None else pixels[:, :, self.plane_of_colour]
-
-
 def channel_layouts(elemental_set: ElementalSet) -> list[ChannelLayout]:
     """Return the colours of a set, as its first frame has them."""
-    width, height = elemental_set.settings.camera.size_px
-    frame = elemental_set.read_frame(elemental_set.image_paths[0], (width, height))
-    mosaic = elemental_set.settings.camera.mosaic or frame.mosaic
-    everything = Lattice((0, 0), (1, 1), (height, width))
-    if frame.pixels_dn.ndim == 3:
-        return [ChannelLayout(name, index, (everything,)) for index, name in enumerate(_RGB)]
-    if mosaic is None:
-        return [ChannelLayout("grey", None, (everything,))]
-    period = mosaic_period(mosaic)
-    shape = (height // period[0], width // period[1])
-    layouts = []
-    for letter in sorted(set("".join(mosaic)), key="RGB".find):
-        phases = [(r, c) for r, c in np.ndindex(*period) if mosaic[r][c] == letter]
-        lattices = tuple(Lattice(phase, period, shape) for phase in phases)
-        layouts.append(ChannelLayout(_COLOUR_NAMES.get(letter, letter), None, lattices))
-    return layouts
+    return elemental_set.layouts
 
 
 def keeping_frames(elemental_set: ElementalSet, folder: Path) -> ElementalSet:

@@ -7,10 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray, ray_from_surface, transfer
-from faintfield.pipelines.formats.frames import Lattice
+from faintfield.pipelines.formats.frames import ChannelLayout, Lattice
 from faintfield.pipelines.formats.plane_poses import Place, TiltedPlane, depth_of
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
-from faintfield.pipelines.reconstruction.channels import ChannelLayout
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages, Image, binned
 from faintfield.recon.operator.geometry import DetectorMaps
@@ -30,13 +29,13 @@ def check_in_front(depth_mm: float) -> None:
         raise GeometryMismatch(f"a plane at {depth_mm} mm is not in front of the camera; depth_mm must be positive")
 
 
-def default_pitch_px(elemental_set: ElementalSet, layouts: list[ChannelLayout]) -> int:
+def default_pitch_px(elemental_set: ElementalSet) -> int:
     """Return the default distance of a plane's samples in detector pixels: 1 if the views can fill that.
 
     A view sees only some pixels in each colour of a mosaic; with fewer views than it takes to fill the gaps, the
     samples are a period of the mosaic apart.
     """
-    views = len(elemental_set.settings.view)
+    views, layouts = len(elemental_set.settings.view), elemental_set.layouts
     step = layouts[0].lattices[0].step
     fewest_per_sample = min(views * len(layout.lattices) / (step[0] * step[1]) for layout in layouts)
     return 1 if fewest_per_sample >= 1 else max(step)

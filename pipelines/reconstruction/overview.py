@@ -16,7 +16,7 @@ from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import Picture, contact_sheet, encoded, grey_levels, white_level
 from faintfield.pipelines.formats.results.figures import OVERVIEW_FILE, Brightness, Overview
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, in_units
-from faintfield.pipelines.reconstruction.channels import channel_layouts, checked_frame, lattice_noise, view_electrons
+from faintfield.pipelines.reconstruction.channels import checked_frame, lattice_noise, view_electrons
 from faintfield.recon.metrics import photons_from_linear_snr, photons_from_moments, snr_from_powers
 from faintfield.recon.threads import map_in_threads
 
@@ -93,7 +93,7 @@ def brightness_within(elemental_set: ElementalSet, region: Region | None, name: 
     """Measure the reference view over a region (row, column) called `name`; over the whole view if it is None."""
     has_reference = len(elemental_set.noise_reference) >= elemental_set.frames_per_view
     signal, reference = [], []
-    for layout in channel_layouts(elemental_set):
+    for layout in elemental_set.layouts:
         images = view_electrons(elemental_set, layout, elemental_set.frame_paths[elemental_set.reference_view])
         no_light = view_electrons(elemental_set, layout, elemental_set.noise_reference[: elemental_set.frames_per_view])
         for index, lattice in enumerate(layout.lattices):
@@ -144,7 +144,7 @@ def inspect_set(elemental_set: ElementalSet) -> tuple[Overview, dict[str, bytes]
 
     Every view is read, so that one that cannot be used is found before planes are made (InputError).
     """
-    size_px, layout = elemental_set.settings.camera.size_px, channel_layouts(elemental_set)[0]
+    size_px, layout = elemental_set.settings.camera.size_px, elemental_set.layouts[0]
     reference_path = elemental_set.image_paths[elemental_set.reference_view]
     reference = checked_frame(elemental_set, reference_path, layout).pixels_dn
     black, white = grey_scale_dn(reference)

@@ -32,7 +32,7 @@ from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, in_uni
 from faintfield.pipelines.formats.sets.ground_truth import read_truth
 from faintfield.pipelines.formats.units import StatedUnits
 from faintfield.pipelines.reconstruction.accuracy import assess, write_depth_errors
-from faintfield.pipelines.reconstruction.channels import SHARE_OF_DISK, channel_layouts
+from faintfield.pipelines.reconstruction.channels import SHARE_OF_DISK
 from faintfield.pipelines.reconstruction.depth.depth_map import kept_depth_map, write_depth_map
 from faintfield.pipelines.reconstruction.depth.search import check_overlap, check_views, depths_of_set
 from faintfield.pipelines.reconstruction.operators import default_pitch_px, plane_grid
@@ -149,8 +149,8 @@ def _make_planes(sweep: Sweep, folders: dict[Method, Path], out: Path, runner: R
 
 
 def _sweep(elemental_set: ElementalSet, folders: dict[Method, Path], request: Request) -> Sweep:
-    layouts = channel_layouts(elemental_set)
-    mm_per_depth = default_pitch_px(elemental_set, layouts) / elemental_set.settings.camera.fx_px
+    layouts = elemental_set.layouts
+    mm_per_depth = default_pitch_px(elemental_set) / elemental_set.settings.camera.fx_px
     places: list[Place] = [*request.depths_mm, *request.tilted]
     grids = {
         place: plane_grid(elemental_set, place, request.pitch_mm or depth_of(place) * mm_per_depth) for place in places

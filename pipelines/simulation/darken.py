@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from faintfield.pipelines.console import progress
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import write_json, writing_folder
+from faintfield.pipelines.formats.frames import ChannelLayout
 from faintfield.pipelines.formats.image_files import ONE_PIXEL, mask_picture, write_plane, write_png
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.sets.elemental_file import FILE_NAME, write_set
 from faintfield.pipelines.formats.sets.elemental_set import NOISE_REFERENCE, ElementalSet, load_set
-from faintfield.pipelines.reconstruction.channels import ChannelLayout, channel_layouts, checked_frame, lattice_noise
+from faintfield.pipelines.reconstruction.channels import checked_frame, lattice_noise
 from faintfield.pipelines.reconstruction.overview import OBJECT_REGION, brightness
 from faintfield.pipelines.simulation.options import DarkeningOptions
 from faintfield.pipelines.simulation.synthetic_set import stated_noise, write_exposures
@@ -44,7 +45,7 @@ class Darkened(msgspec.Struct, frozen=True):
 def darken_set(folder: Path, out: Path, options: DarkeningOptions, *, overwrite: bool = False) -> Darkened:
     """Expose each view of a bright set anew with few photons, and write the dark set; BadValue if none has the SNR."""
     bright = load_set(folder)
-    layouts = channel_layouts(bright)
+    layouts = bright.layouts
     light = _light(bright, bright.image_paths[bright.reference_view], layouts)
     region, scale_e = _region_and_scale(folder, light, options)
     photons = float(light[region].mean()) * scale_e / options.quantum_efficiency

@@ -16,7 +16,7 @@ from faintfield.calib.noise_model import Map, NoiseModel
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import sha256
-from faintfield.pipelines.formats.frames import Frame, read_frame
+from faintfield.pipelines.formats.frames import ChannelLayout, Frame, layouts_of, read_frame
 from faintfield.pipelines.formats.plane_poses import Place, TiltedPlane
 from faintfield.pipelines.formats.reading import is_file
 from faintfield.pipelines.formats.results.noise import NOISE_MAPS, FittedNoise, read_fitted_noise
@@ -96,6 +96,12 @@ class ElementalSet:
     def image_paths(self) -> list[Path]:
         """Path of the first frame of each view."""
         return [self.folder / view.image for view in self.settings.view]
+
+    @cached_property
+    def layouts(self) -> list[ChannelLayout]:
+        """Colours of the frames, as the first one has them."""
+        camera = self.settings.camera
+        return layouts_of(self.read_frame(self.image_paths[0], camera.size_px), camera.mosaic)
 
     @property
     def frames_per_view(self) -> int:

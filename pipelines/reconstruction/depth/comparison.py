@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.pipelines.console import inform, progress, working
+from faintfield.pipelines.formats.frames import ChannelLayout
 from faintfield.pipelines.formats.large_arrays import memory_or_file
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
-from faintfield.pipelines.reconstruction.channels import ChannelLayout, channel_layouts, load_channel
+from faintfield.pipelines.reconstruction.channels import load_channel
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid, seen_from
 from faintfield.recon.depth.agreement import (
     Agreement,
@@ -103,7 +104,7 @@ def binned_views(elemental_set: ElementalSet, middle_mm: float, out: Path, *, mi
     Pixels are added up in bins of at least `min_bins_px`, larger ones in low light at the depth `middle_mm`. Where that
     leaves many bins, the middle colour is enough.
     """
-    layouts = channel_layouts(elemental_set)
+    layouts = elemental_set.layouts
     middle = len(layouts) // 2
     images = load_channel(elemental_set, layouts[middle], memory_or_file(out))
     lattice, factory = layouts[middle].lattices[0], OperatorFactory(elemental_set, layouts[middle], images)

@@ -18,7 +18,7 @@ from faintfield.pipelines.console import inform, working
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.frames import Lattice
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
-from faintfield.pipelines.reconstruction.channels import channel_layouts, lattice_noise, view_electrons
+from faintfield.pipelines.reconstruction.channels import lattice_noise, view_electrons
 from faintfield.pipelines.reconstruction.depth.autofocus import overlap, views_of_search
 from faintfield.pipelines.reconstruction.depth.comparison import BETWEEN_PIXELS, between_pixels, check_places
 from faintfield.pipelines.reconstruction.operators import plane_grid, principal_shift, response_of
@@ -48,7 +48,7 @@ _COARSE, _TOO_COARSE = 3.5, 16.0
 def default_bins(elemental_set: ElementalSet) -> int:
     """Return the width in detector pixels of the bins: two, or more if views are large; whole periods of a mosaic."""
     width, height = elemental_set.settings.camera.size_px
-    period = int(np.lcm(*channel_layouts(elemental_set)[0].lattices[0].step))
+    period = int(np.lcm(*elemental_set.layouts[0].lattices[0].step))
     needed = int(np.ceil(np.sqrt(width * height / _MAX_PIXELS)))
     smallest = 2 if min(width, height) >= _MIN_BINNED_SIDE_PX else 1
     return -(-max(needed, smallest) // period) * period
@@ -60,7 +60,7 @@ def luminance(elemental_set: ElementalSet, bins: int) -> PinholeViews:
     The samples of the surface lie between the bins, see `between_pixels`.
     Each view is read by one thread. Raises WrongSize, WrongBitDepth or UnreadableImage for a frame that does not match.
     """
-    layouts = channel_layouts(elemental_set)
+    layouts = elemental_set.layouts
     parts = [(layout, lattice) for layout in layouts for lattice in layout.lattices]
     responses = [_response(elemental_set, lattice, bins) for _, lattice in parts]
     noises = [lattice_noise(elemental_set, lattice, None) for _, lattice in parts]

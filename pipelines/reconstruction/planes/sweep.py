@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.errors import FileFailed
+from faintfield.pipelines.formats.frames import ChannelLayout
 from faintfield.pipelines.formats.large_arrays import memory_or_file
 from faintfield.pipelines.formats.plane_poses import Place, TiltedPlane, depth_of
 from faintfield.pipelines.formats.results.plane_files import Origin, PlaneFiles
@@ -24,7 +25,7 @@ from faintfield.pipelines.formats.results.records import (
     PlaneRecord,
 )
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, in_units, light_per_e
-from faintfield.pipelines.reconstruction.channels import ChannelLayout, load_channel
+from faintfield.pipelines.reconstruction.channels import load_channel
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, blind_views
 from faintfield.pipelines.reconstruction.planes.penalised import Pilot, Solution
 from faintfield.pipelines.reconstruction.planes.solve import solve, solve_together

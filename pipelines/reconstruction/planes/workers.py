@@ -25,10 +25,10 @@ from numpy.typing import DTypeLike, NDArray
 from faintfield.calib.noise_model import NoiseModel
 from faintfield.pipelines.errors import ClusterFailed, WrongUsage, import_optional
 from faintfield.pipelines.formats.files import UNFINISHED, translated_write_errors
-from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.frames import ChannelLayout, read_frame
 from faintfield.pipelines.formats.large_arrays import mapped
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
-from faintfield.pipelines.reconstruction.channels import ChannelLayout, load_channel
+from faintfield.pipelines.reconstruction.channels import load_channel
 from faintfield.pipelines.reconstruction.planes.sweep import Channel, PlaneTask, Runner, do_task, run_serially
 from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.names import on_compiling

@@ -14,6 +14,7 @@ from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.errors import OutputExists
 from faintfield.pipelines.formats.files import remove, remove_leftovers, require_room
+from faintfield.pipelines.formats.frames import ChannelLayout
 from faintfield.pipelines.formats.large_arrays import memory_or_file
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.results.plane_files import read_current
@@ -28,12 +29,7 @@ from faintfield.pipelines.formats.results.surface import (
 )
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, in_units, light_per_e, unit_of_maps
 from faintfield.pipelines.reconstruction.accuracy import write_depth_errors
-from faintfield.pipelines.reconstruction.channels import (
-    SHARE_OF_DISK,
-    ChannelLayout,
-    channel_layouts,
-    load_channel,
-)
+from faintfield.pipelines.reconstruction.channels import SHARE_OF_DISK, load_channel
 from faintfield.pipelines.reconstruction.depth.autofocus import searched_range_mm
 from faintfield.pipelines.reconstruction.depth.search import (
     DepthSearch,
@@ -81,7 +77,7 @@ def reconstruct_surface(
     kept = read_current(out / SURFACE_FILE, SurfaceFileRecord, origin)
     if kept is not None:
         return kept.surface
-    layouts = channel_layouts(elemental_set)
+    layouts = elemental_set.layouts
     grid = plane_grid(elemental_set, 1.0)
     needed_bytes = _needed_bytes(grid.shape, len(layouts), proposal=request.solver.proposal)
     require_room(out, int(needed_bytes / (1 - SHARE_OF_DISK)))  # decoded frames take the rest

@@ -157,7 +157,7 @@ def test_samples_overlay_undistorted_pixels_of_reference_view(
 @pytest.mark.parametrize(("views", "pitch_px"), [(1, 2), (3, 2), (4, 1)])
 def test_few_mosaic_views_have_samples_per_period(views: int, pitch_px: int, make_set: SetMaker) -> None:
     elemental_set = load_set(make_set([np.zeros((4, 6), np.uint16)] * views, camera={"mosaic": BAYER}))
-    assert default_pitch_px(elemental_set, channel_layouts(elemental_set)) == pitch_px
+    assert default_pitch_px(elemental_set) == pitch_px
 
 
 def test_views_with_own_principal_points(make_set: SetMaker, edit: Edit) -> None:

@@ -10,8 +10,9 @@ import pytest
 import tifffile
 
 from faintfield.pipelines.arguments import SolverOptions
+from faintfield.pipelines.formats.frames import ChannelLayout
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
-from faintfield.pipelines.reconstruction.channels import ChannelLayout, channel_layouts, load_channel
+from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
 from faintfield.pipelines.reconstruction.planes import prior as prior_module
 from faintfield.pipelines.reconstruction.planes import sweep
