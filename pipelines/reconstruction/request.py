@@ -20,6 +20,7 @@ from faintfield.pipelines.formats.results.records import (
     ReconstructionRecord,
 )
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, plane_stem
+from faintfield.pipelines.formats.units import StatedUnits
 from faintfield.pipelines.reconstruction.depth.autofocus import (
     best_focus,
     found_range_mm,
@@ -282,11 +283,8 @@ def distinct_depths(depths: list[float], elemental_set: ElementalSet | None = No
         check_in_front(depth)
         other = by_name.setdefault(plane_stem(elemental_set, depth) if elemental_set else plane_name(depth), depth)
         if other != depth:
-            pair = (
-                elemental_set.depths_text(other, depth, join=" and ")
-                if elemental_set
-                else f"{other:g} and {depth:g} mm"
-            )
+            own = elemental_set.depths_text(other, depth, join=" and ") if elemental_set else None
+            pair = own or StatedUnits().depths_text([other, depth], " and ")
             apart = "0.1 mm apart" if pair.endswith(" mm") else "farther apart"
             raise WrongUsage(f"planes at {pair} would share a file name; keep them {apart}")
     return list(by_name.values())

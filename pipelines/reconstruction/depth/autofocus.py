@@ -129,11 +129,10 @@ def _narrowed(
         if np.count_nonzero(sure) < MIN_SAMPLES:
             raise _nothing(elemental_set, range_mm)
         first, last = np.quantile(found.index[sure], _RANGE_OF_SURE) + np.array([-_MARGIN_STEPS, _MARGIN_STEPS])
-        if len(ranges) == _SEARCHES or last - first > _SHRUNK_ENOUGH * _DEPTHS:
-            return ranges, views.bins_px, planes, found, significance
         inverse = np.interp([first, last], np.arange(_DEPTHS), 1 / np.asarray(depths_mm))
         narrower = float(1 / inverse[0]), float(1 / inverse[1])
-        if _moved_px(elemental_set, narrower) < _LEAST_MOVED_PX:
+        alike = last - first > _SHRUNK_ENOUGH * _DEPTHS or _moved_px(elemental_set, narrower) < _LEAST_MOVED_PX
+        if alike or len(ranges) == _SEARCHES:
             return ranges, views.bins_px, planes, found, significance
         ranges.append(narrower)
         views = views_of_search(elemental_set, ranges[-1], out)
