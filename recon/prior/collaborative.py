@@ -3,7 +3,6 @@
 from itertools import product
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,7 +10,7 @@ from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.scene_operator import SceneOperator
 from faintfield.recon.prior.collaborative_kernels import Transform, filter_rows
 from faintfield.recon.prior.evidence import Evidence, Noise, evidence_of_planes
-from faintfield.recon.threads import run_in_threads
+from faintfield.recon.threads import map_in_threads
 
 # Shape parameter of the Kaiser window that weights the samples of a patch.
 _KAISER_BETA = 2.0
@@ -42,13 +41,7 @@ class Patches(NamedTuple):
 
 
 def collaborative_wiener(
-    picture: Image,
-    pilot: Image,
-    noise: Noise,
-    patches: Patches | None = None,
-    *,
-    guide: Image | None = None,
-    workers: int | None = None,
+    picture: Image, pilot: Image, noise: Noise, patches: Patches | None = None, *, guide: Image | None = None
 ) -> NDArray[np.float32]:
     """Return a picture (row, column) without its noise, filtered in groups of patches that are alike in the guide.
 
@@ -66,29 +59,18 @@ def collaborative_wiener(
         Settings of the groups.
     guide : float array (row, column), optional
         A picture of the same scene in which alike patches are found; the pilot by default.
-    workers : int, optional
-        Number of threads; the result does not depend on it.
 
     Raises
     ------
     ValueError
         Shapes differ, the picture is smaller than a patch, or the size of a patch is not a multiple of four.
     """
-    (wiener,) = wiener_and_thresholded(
-        picture, pilot, noise, patches or Patches(), guide=guide, workers=workers, filters=1
-    )
+    (wiener,) = wiener_and_thresholded(picture, pilot, noise, patches or Patches(), guide=guide, filters=1)
     return wiener
 
 
 def wiener_and_thresholded(
-    picture: Image,
-    pilot: Image,
-    noise: Noise,
-    patches: Patches,
-    *,
-    guide: Image | None = None,
-    workers: int | None = None,
-    filters: int = 2,
+    picture: Image, pilot: Image, noise: Noise, patches: Patches, *, guide: Image | None = None, filters: int = 2
 ) -> list[NDArray[np.float32]]:
     """Return what `collaborative_wiener` returns, and the picture whose groups keep what stands out of the noise.
 
@@ -105,19 +87,16 @@ def wiener_and_thresholded(
     above, below = np.zeros((2, filters, *pilot.shape), np.float32)
     transform = _transform(noise.kernel, patches.size)
     rows, columns = (_corners(length, patches) for length in pilot.shape)
+    search = (patches.radius, patches.members, np.float32(_THRESHOLD))
 
-    def work(strips: list[NDArray[np.intp]]) -> None:
-        for strip in strips:
-            search = (patches.radius, patches.members, np.float32(_THRESHOLD))
-            filter_rows(picture, pilot, guide, variance, strip, columns, search, transform, above, below)
+    def work(strip: NDArray[np.intp]) -> None:
+        filter_rows(picture, pilot, guide, variance, strip, columns, search, transform, above, below)
 
     # Groups reach into the next strips, but no farther: the strips of one turn can be filtered at the same time
     strip_of_row = rows // (2 * patches.radius + patches.size)
     strips_of_all = [rows[strip_of_row == k] for k in range(strip_of_row[-1] + 1)]
-    for turn in range(min(2, len(strips_of_all))):
-        strips = strips_of_all[turn::2]
-        count = min(workers or int(numba.config.NUMBA_NUM_THREADS), len(strips))
-        run_in_threads(work, [strips[worker::count] for worker in range(count)])
+    for turn in (0, 1):
+        map_in_threads(work, strips_of_all[turn::2])
     for total, weight in zip(above, below, strict=True):
         np.copyto(total, pilot, where=weight == 0)
         np.divide(total, weight, out=total, where=weight > 0)

@@ -52,15 +52,15 @@ def filter_rows(picture, pilot, guide, variance, rows, columns, search, transfor
     size = transform.window.shape[0]
     distances = np.empty((columns.size, members), np.float32)
     places = np.empty((columns.size, members, 2), np.int32)
-    found = np.empty(columns.size, np.intp)
+    counts = np.empty(columns.size, np.intp)
     patches = np.empty((4, size * size * members), np.float32)
     for row in rows:
-        _find_alike(guide, row, columns, size, radius, distances, places, found)
+        _find_alike(guide, row, columns, size, radius, distances, places, counts)
         for k in range(columns.size):
             count = 1
-            while 2 * count <= found[k]:
+            while 2 * count <= counts[k]:
                 count *= 2
-            if found[k] > 0:
+            if counts[k] > 0:
                 _filter_group(picture, pilot, variance, places[k, :count], threshold, transform, patches, above, below)
 
 
@@ -71,11 +71,11 @@ def _outwards(step):
 
 
 @compiled
-def _find_alike(guide, row, columns, size, radius, distances, places, found):
+def _find_alike(guide, row, columns, size, radius, distances, places, counts):
     """Find the patches nearest to each reference patch of a row, by squared distance, nearest first."""
     height, width = guide.shape
     squares = np.empty(width, np.float32)
-    found[:] = 0
+    counts[:] = 0
     distances[:] = np.inf
     for vertical in range(2 * radius + 1):
         other = row + _outwards(vertical)
@@ -92,7 +92,7 @@ def _find_alike(guide, row, columns, size, radius, distances, places, found):
                     for j in range(index(size)):
                         distance += squares[index(column) + j]
                     if distance < distances[k, -1]:  # never for NaN
-                        _insert(distance, other, column + shift, distances, places, found, k)
+                        _insert(distance, other, column + shift, distances, places, counts, k)
 
 
 @compiled
@@ -113,10 +113,10 @@ def _sum_squares(guide, row, other, shift, start, stop, size, squares):
 
 
 @compiled
-def _insert(distance, row, column, distances, places, found, k):
+def _insert(distance, row, column, distances, places, counts, k):
     """Insert a patch into the list of those nearest to reference `k`, sorted by distance."""
     at = distances.shape[1] - 1
-    found[k] = min(found[k] + 1, at + 1)
+    counts[k] = min(counts[k] + 1, at + 1)
     while at > 0 and distances[k, at - 1] > distance:
         distances[k, at] = distances[k, at - 1]
         places[k, at, 0], places[k, at, 1] = places[k, at - 1, 0], places[k, at - 1, 1]

@@ -105,10 +105,9 @@ def cross_validated_weight(
     windows = windows_of(problem, MIN_VIEWS)
     if windows:
         # A dark window is solved with the light of the whole plane, as that will be
-        per_window = map_in_threads(lambda window: _folds_of(window, penalty, 1, level_e), windows)
-        folds = [fold for of_window in per_window for fold in of_window]
+        folds = map_in_threads(lambda window: Fold(window, penalty, 0, level_e), windows)
     else:
-        folds = _folds_of(problem, penalty, folds_to_predict(problem))
+        folds = [Fold(problem, penalty, number) for number in range(folds_to_predict(problem))]
     losses = _losses(folds, guess, apply=map_in_threads if windows else map)
     best = min(losses, key=losses.__getitem__)
     offset = _lowest_offset([losses.get(best + n) for n in (-1, 0, 1)])
@@ -117,10 +116,6 @@ def cross_validated_weight(
     passes = sum(fold.passes * fold.samples for fold in folds) / float(samples)
     weight = guess * _CANDIDATE_RATIO ** (best + offset)
     return CrossValidatedWeight(weight, candidates, passes, None if windows else folds[0].solutions[best])
-
-
-def _folds_of(problem: SceneProblem, penalty: Penalty, count: int, level_e: float | None = None) -> list["Fold"]:
-    return [Fold(problem, penalty, n, level_e) for n in range(min(count, _folds(len(problem.operator.seeing_views))))]
 
 
 def folds_to_predict(problem: SceneProblem) -> int:

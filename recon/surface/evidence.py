@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,7 +12,7 @@ from faintfield.recon.operator.surface_operator import SurfaceOperator
 from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.solver.proximal import DualField
 from faintfield.recon.surface.pinhole_views import UNKNOWN, PinholeViews, gather, gaussian
-from faintfield.recon.threads import run_in_threads
+from faintfield.recon.threads import map_in_threads
 
 # Weights of total variation in units of the noise: of the light at each depth, and of the light of the surface.
 _OF_DEPTH, _OF_SURFACE = 0.6, 1.15
@@ -163,14 +162,12 @@ class DepthEvidence:
     def _of_all_depths(self, ratios: Callable[[float], list[Image]], count: int) -> list[Image]:
         """Return the results of a function of each depth (row, column, depth), per unit of the noise's variance."""
         volumes = [np.empty((*self.variance.shape, len(self.inverse_depths)), np.float32) for _ in range(count)]
-        workers = int(numba.config.NUMBA_NUM_THREADS)
 
-        def work(first: int) -> None:
-            for number in range(first, len(self.inverse_depths), workers):
-                for volume, found in zip(volumes, ratios(float(self.inverse_depths[number])), strict=True):
-                    volume[:, :, number] = found / self.variance
+        def work(number: int) -> None:
+            for volume, found in zip(volumes, ratios(float(self.inverse_depths[number])), strict=True):
+                volume[:, :, number] = found / self.variance
 
-        run_in_threads(work, range(workers))
+        map_in_threads(work, range(len(self.inverse_depths)))
         return volumes
 
     def _denoised(self, sum_e: Image, count: Image, strength: float, workers: int | None = 1) -> Image:

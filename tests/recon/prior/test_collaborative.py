@@ -1,5 +1,6 @@
 """The collaborative filters against slow ones in numpy."""
 
+import numba
 import numpy as np
 import pytest
 from scipy.fft import dctn, idctn
@@ -99,17 +100,21 @@ def pictures(shape: tuple[int, int], seed: int) -> tuple[Image, Image, Noise]:
         ((12, 12), Patches(12, 6, 18, 64)),  # a single patch
     ],
 )
-def test_filters_agree_with_slow_ones(shape: tuple[int, int], patches: Patches) -> None:
-    """Also where no view sees a sample, whose data are no numbers; any number of workers gives the same bits."""
+def test_filters_agree_with_slow_ones(
+    shape: tuple[int, int], patches: Patches, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where no view sees a sample, whose data are no numbers; any number of threads gives the same bits."""
     y, pilot, noise = pictures(shape, 8)
     noise.variance[: shape[0] // 3, -2:] = np.inf
     noise.variance[-1, 0] = np.inf
     y[noise.variance == np.inf] = np.nan
-    both = wiener_and_thresholded(y, pilot, noise, patches, workers=2)
+    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 2)
+    both = wiener_and_thresholded(y, pilot, noise, patches)
     for result, expected in zip(both, slow_filters(y, pilot, noise, patches), strict=True):
         assert result.dtype == np.float32
         np.testing.assert_allclose(result, expected, atol=1e-5 * np.abs(y[np.isfinite(y)]).max())
-    np.testing.assert_array_equal(both[0], collaborative_wiener(y, pilot, noise, patches, workers=5))
+    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 5)
+    np.testing.assert_array_equal(both[0], collaborative_wiener(y, pilot, noise, patches))
 
 
 def test_guide_decides_which_patches_are_alike() -> None:
@@ -118,7 +123,7 @@ def test_guide_decides_which_patches_are_alike() -> None:
     noise.variance[:16, -3:] = np.inf
     guide[:16, -3:] = np.nan
     patches = Patches(8, 5, 4, 16)
-    both = wiener_and_thresholded(y, pilot, noise, patches, guide=guide, workers=2)
+    both = wiener_and_thresholded(y, pilot, noise, patches, guide=guide)
     unguided = slow_filters(y, pilot, noise, patches)
     for result, expected, without in zip(both, slow_filters(y, pilot, noise, patches, guide), unguided, strict=True):
         np.testing.assert_allclose(result, expected, atol=1e-5 * np.abs(y).max())

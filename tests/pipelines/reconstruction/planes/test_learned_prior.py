@@ -48,7 +48,7 @@ def known_of(light_e: Image, seed: int, views: int = 25, read_noise_e: float = 3
     plane = solve(operator, images, "pmlem", SolverOptions(penalty_weight=0.9 * views**0.5 / read_noise_e)).plane
     noise = noise_of_back_projection(operator, images, plane)
     pilot, picture = operator.adjoint_of_forward(plane) / operator.coverage(), back_projection(operator, images)
-    patches = collaborative_wiener(picture, pilot, noise, Patches(8, 4, 16, 64), workers=1)
+    patches = collaborative_wiener(picture, pilot, noise, Patches(8, 4, 16, 64))
     return Known(picture, pilot, patches, noise, back_projection(operator, ElementalImages(light)))
 
 
