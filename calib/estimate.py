@@ -1,9 +1,9 @@
-"""A measured value with its standard error and interval, and the goodness of fit of a series, as records have them."""
+"""Measured values with their errors, the goodness of fit of a series, and figures of a stage, as records have them."""
 
 from typing import Literal
 
 import numpy as np
-from msgspec import Struct
+from msgspec import Struct, field
 
 _NO_SPREAD = "the values are not much likelier with a spread, so that none was fitted; record more darks"
 
@@ -62,6 +62,58 @@ class SeriesGoodness(Struct, frozen=True, omit_defaults=True):
     rows: float | None = None
     columns: float | None = None
     by_frame: float | None = None
+
+
+class StageFigure(Struct, frozen=True):
+    """A figure of the stage with its standard error, or the reason why there is none."""
+
+    value: float | None
+    sigma: float | None = None
+    why: str | None = None
+
+
+class StageReport(Struct, frozen=True):
+    """Errors of the stage that its owner may want to correct.
+
+    Attributes
+    ----------
+    pitch_x_mm, pitch_y_mm, scale_x, scale_y : StageFigure
+        Distance between neighbouring nodes along a row and along a column, and its ratio to the commanded one.
+    squareness_rad : StageFigure
+        Angle between the axes minus a right angle.
+    backlash_x_mm, backlash_y_mm : StageFigure
+        Distance along the axis from the position of a node approached in the positive direction to its position when
+        approached in the negative direction. The stage falls short by half of it either way.
+    tilt_rad : StageFigure
+        Angle between the reference camera's axis and the normal of the grid.
+    node_residual_rms_mm, residuals_mm : StageFigure, list of (float, float, float)
+        Rms distance of the nodes from the regular grid that fits best, in three dimensions; the residual of each node
+        along the grid's x, y and normal.
+    warnings : list of str
+        Nodes far from their places; otherwise scale errors too large for a stage.
+    """
+
+    pitch_x_mm: StageFigure
+    pitch_y_mm: StageFigure
+    scale_x: StageFigure
+    scale_y: StageFigure
+    squareness_rad: StageFigure
+    backlash_x_mm: StageFigure
+    backlash_y_mm: StageFigure
+    tilt_rad: StageFigure
+    node_residual_rms_mm: StageFigure
+    residuals_mm: list[tuple[float, float, float]]
+    warnings: list[str] = field(name="doubts")
+
+
+class Repeatability(Struct, frozen=True):
+    """Standard deviation of the gantry's position at a node between sweeps, per axis, and its standard error.
+
+    It is zero if the corners' noise explains all differences.
+    """
+
+    sd_mm: float
+    se_mm: float
 
 
 def interval(value: float, se: float, quantile: float = NORMAL_QUANTILE, *, positive: bool = False) -> Estimate:

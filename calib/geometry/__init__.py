@@ -3,14 +3,13 @@
 from faintfield.calib.geometry.acceptance import rms_over_views, transfer_sigma_at
 from faintfield.calib.geometry.calibrate import GeometrySettings, calibrate_geometry
 from faintfield.calib.geometry.observations import BoardObservation, Node, Target
-from faintfield.calib.geometry.rig_geometry import BoardPose, Repeatability, RigGeometry
+from faintfield.calib.geometry.rig_geometry import BoardPose, RigGeometry
 
 __all__ = [
     "BoardObservation",
     "BoardPose",
     "GeometrySettings",
     "Node",
-    "Repeatability",
     "RigGeometry",
     "Target",
     "calibrate_geometry",

@@ -20,9 +20,10 @@ from scipy.optimize import minimize_scalar
 
 from faintfield.calib.board import Board
 from faintfield.calib.errors import NotIdentifiable
+from faintfield.calib.estimate import Repeatability
 from faintfield.calib.geometry.bundle import Bundle, load_mrcal
 from faintfield.calib.geometry.observations import Observations
-from faintfield.calib.geometry.rig_geometry import HomingShift, Repeatability
+from faintfield.calib.geometry.rig_geometry import HomingShift
 
 # Eigenvalues of K below this multiple of the largest are left out: the fit absorbs those directions of the gantry's
 # errors, so that the residuals contain nothing of them.

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from faintfield.calib.estimate import Repeatability
 from faintfield.calib.geometry.observations import Node, Target
 from faintfield.calib.homography import rotation_matrix
 from faintfield.calib.lens import Lens
@@ -21,17 +22,6 @@ class BoardPose:
 
     target: Target
     rt_ref_board: NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Repeatability:
-    """Standard deviation of the gantry's position at a node between sweeps, per axis, and its standard error.
-
-    It is zero if the corners' noise explains all differences.
-    """
-
-    sd_mm: float
-    se_mm: float
 
 
 @dataclass(frozen=True)

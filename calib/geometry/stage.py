@@ -1,11 +1,11 @@
 """Diagnose the stage from the poses: scale, squareness, backlash, tilt, and residuals of the nodes."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from faintfield.calib.estimate import StageFigure, StageReport
 from faintfield.calib.geometry.observations import Node
 from faintfield.calib.geometry.rig_geometry import RigGeometry
 
@@ -23,50 +23,6 @@ _REWEIGHTINGS = 50  # of the least absolute distances
 _MAX_SCALE_ERROR, _SCALE_SIGMAS = 0.005, 4.0
 
 _DIFFERENCE = 1e-6  # step of the central differences, in mm or in units of the solution
-
-
-@dataclass(frozen=True)
-class StageEstimate:
-    """A value with its standard error, or the reason why there is none."""
-
-    value: float | None
-    sigma: float | None = None
-    why: str | None = None
-
-
-@dataclass(frozen=True)
-class StageReport:
-    """Errors of the stage that its owner may want to correct.
-
-    Attributes
-    ----------
-    pitch_x_mm, pitch_y_mm, scale_x, scale_y : StageEstimate
-        Distance between neighbouring nodes along a row and along a column, and its ratio to the commanded one.
-    squareness_rad : StageEstimate
-        Angle between the axes minus a right angle.
-    backlash_x_mm, backlash_y_mm : StageEstimate
-        Distance along the axis from the position of a node approached in the positive direction to its position when
-        approached in the negative direction. The stage falls short by half of it either way.
-    tilt_rad : StageEstimate
-        Angle between the reference camera's axis and the normal of the grid.
-    node_residual_rms_mm, residuals_mm : StageEstimate, list of (float, float, float)
-        Rms distance of the nodes from the regular grid that fits best, in three dimensions; the residual of each node
-        along the grid's x, y and normal.
-    warnings : list of str
-        Nodes far from their places; otherwise scale errors too large for a stage.
-    """
-
-    pitch_x_mm: StageEstimate
-    pitch_y_mm: StageEstimate
-    scale_x: StageEstimate
-    scale_y: StageEstimate
-    squareness_rad: StageEstimate
-    backlash_x_mm: StageEstimate
-    backlash_y_mm: StageEstimate
-    tilt_rad: StageEstimate
-    node_residual_rms_mm: StageEstimate
-    residuals_mm: list[tuple[float, float, float]]
-    warnings: list[str] = field(default_factory=list)
 
 
 def approach_directions(visits: Sequence[tuple[Node, int]]) -> dict[Node, tuple[float, float]]:
@@ -110,8 +66,8 @@ def stage_report(
     """
     design, backlash_terms = _design(geometry, directions)
     if np.linalg.matrix_rank(design[:, :3]) < 3:
-        none = StageEstimate(None, None, "the nodes lie on one line; take at least 2 x 2")
-        return StageReport(none, none, none, none, none, none, none, none, none, [])
+        none = StageFigure(None, None, "the nodes lie on one line; take at least 2 x 2")
+        return StageReport(none, none, none, none, none, none, none, none, none, [], [])
     grid = _Grid(design, geometry)
     pitches = [_pitch(grid, axis) for axis in (0, 1)]
     scales = [_scale(pitch, pitch_mm) for pitch in pitches]
@@ -131,7 +87,7 @@ def stage_report(
     )
 
 
-def _scale_warnings(scales: Sequence[StageEstimate]) -> list[str]:
+def _scale_warnings(scales: Sequence[StageFigure]) -> list[str]:
     """Return a warning for each axis along which the scale error is too large for a stage."""
     warnings = []
     for axis, scale in zip(_AXES, scales, strict=True):
@@ -186,7 +142,7 @@ class _Grid:
         spread = np.kron(solver, np.eye(3))
         self._covariance = spread @ (measured + scatter * np.eye(len(measured))) @ spread.T
 
-    def estimate(self, figure: Callable[[Array], float]) -> StageEstimate:
+    def estimate(self, figure: Callable[[Array], float]) -> StageFigure:
         """Return a function of the terms with the standard error that their covariance implies."""
         slopes = np.empty(self.solution.size)
         for index in range(self.solution.size):
@@ -196,12 +152,12 @@ class _Grid:
             moved.flat[index] -= 2 * _DIFFERENCE
             slopes[index] = (ahead - figure(moved)) / (2 * _DIFFERENCE)
         variance = float(slopes @ self._covariance @ slopes)
-        return StageEstimate(figure(self.solution), float(np.sqrt(max(variance, 0.0))))
+        return StageFigure(figure(self.solution), float(np.sqrt(max(variance, 0.0))))
 
-    def residual_rms_mm(self) -> StageEstimate:
+    def residual_rms_mm(self) -> StageFigure:
         """Return the rms distance of the nodes from the grid."""
         rms_mm = float(np.sqrt(3 * (self.residuals**2).sum() / self._freedom))
-        return StageEstimate(rms_mm, float(rms_mm / np.sqrt(2 * self._freedom)))
+        return StageFigure(rms_mm, float(rms_mm / np.sqrt(2 * self._freedom)))
 
 
 def _design(geometry: RigGeometry, directions: dict[Node, tuple[float, float]]) -> tuple[Array, list[int | None]]:
@@ -222,13 +178,13 @@ def _design(geometry: RigGeometry, directions: dict[Node, tuple[float, float]]) 
     return np.column_stack(terms), backlash_terms
 
 
-def _pitch(grid: _Grid, axis: int) -> StageEstimate:
+def _pitch(grid: _Grid, axis: int) -> StageFigure:
     return grid.estimate(lambda s: float(np.linalg.norm(s[1 + axis])))
 
 
-def _backlash(grid: _Grid, axis: int, term: int | None) -> StageEstimate:
+def _backlash(grid: _Grid, axis: int, term: int | None) -> StageFigure:
     if term is None:
-        return StageEstimate(
+        return StageFigure(
             None,
             None,
             f"nothing tells it along {_AXES[axis]}: nodes were approached from one side, or the side goes with the "
@@ -237,10 +193,10 @@ def _backlash(grid: _Grid, axis: int, term: int | None) -> StageEstimate:
     return grid.estimate(lambda s: float(s[term] @ s[1 + axis] / np.linalg.norm(s[1 + axis])))
 
 
-def _scale(pitch: StageEstimate, pitch_mm: float | None) -> StageEstimate:
+def _scale(pitch: StageFigure, pitch_mm: float | None) -> StageFigure:
     if pitch_mm is None or pitch.value is None or pitch.sigma is None:
-        return StageEstimate(None, None, "what the stage was told is not known; give pitch_mm")
-    return StageEstimate(pitch.value / pitch_mm, pitch.sigma / pitch_mm)
+        return StageFigure(None, None, "what the stage was told is not known; give pitch_mm")
+    return StageFigure(pitch.value / pitch_mm, pitch.sigma / pitch_mm)
 
 
 def _squareness_rad(solution: Array) -> float:

@@ -9,18 +9,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.calib.estimate import Estimate
+from faintfield.calib.estimate import Estimate, StageFigure, StageReport
 from faintfield.pipelines.formats.files import file_within, sha256
 from faintfield.pipelines.formats.provenance import Provenance
 from faintfield.pipelines.formats.reading import read_content
-from faintfield.pipelines.formats.results.geometry import (
-    GEOMETRY_PAGE,
-    GeometryRecord,
-    LensRecord,
-    StageFigure,
-    StageRecord,
-    read_geometry,
-)
+from faintfield.pipelines.formats.results.geometry import GEOMETRY_PAGE, GeometryRecord, LensRecord, read_geometry
 from faintfield.pipelines.formats.results.noise import NoiseRecord, read_noise
 from faintfield.pipelines.formats.units import MAX_PREVIEW_BYTES
 from faintfield.pipelines.pages.page import INK, Row, blank_drawing, figure, fixed, ink, smaller_uri, svg, template
@@ -79,7 +72,7 @@ def geometry_page(geometry: GeometryRecord, limits: "GeometrySettings") -> str:
     )
 
 
-def stage_rows(stage: StageRecord) -> list[Row]:
+def stage_rows(stage: StageReport) -> list[Row]:
     """Return the table of the stage."""
     return [_row(getattr(stage, name), words, unit, factor) for name, words, unit, factor in _FIGURES]
 

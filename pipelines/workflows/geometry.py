@@ -12,6 +12,7 @@ from msgspec import UNSET
 
 from faintfield.calib.detection import BoardCorners, detect_boards
 from faintfield.calib.errors import TooFewViews
+from faintfield.calib.estimate import Repeatability, StageReport
 from faintfield.calib.geometry import (
     BoardObservation,
     BoardPose,
@@ -24,7 +25,7 @@ from faintfield.calib.geometry import (
 )
 from faintfield.calib.geometry.bundle import load_mrcal
 from faintfield.calib.geometry.rig_geometry import HomingShift
-from faintfield.calib.geometry.stage import StageReport, approach_directions, stage_report
+from faintfield.calib.geometry.stage import approach_directions, stage_report
 from faintfield.calib.noise.strips import usable_cores
 from faintfield.pipelines.arguments import LensName
 from faintfield.pipelines.console import inform, progress, working
@@ -43,8 +44,6 @@ from faintfield.pipelines.formats.results.geometry import (
     HomingRecord,
     LensRecord,
     NodeRecord,
-    RepeatabilityRecord,
-    StageRecord,
     write_geometry,
 )
 from faintfield.pipelines.formats.sets.board_set import BoardSet, BoardView, load_board_set
@@ -68,8 +67,8 @@ class GeometrySummary(msgspec.Struct, frozen=True):
     outliers: int
     holdout_ratio: float | None
     transfer_sigma_px: dict[str, float]
-    repeatability: RepeatabilityRecord | None
-    stage: StageRecord
+    repeatability: Repeatability | None
+    stage: StageReport
 
 
 def measure_stage(
@@ -165,9 +164,9 @@ def _record(board_set: BoardSet, rig: RigGeometry, stage: StageReport, options: 
         holdout_ratio=rig.holdout_ratio,
         warnings=[*rig.warnings, *_homing_warnings(board_set, rig)],
         transfer_sigma_px=transfers_px,
-        repeatability=msgspec.convert(rig.repeatability, RepeatabilityRecord | None, from_attributes=True),
+        repeatability=rig.repeatability,
         boards=[_board_record(board_set, pose, rig.warp_mm.tolist()) for pose in rig.boards],
-        stage=msgspec.convert(stage, StageRecord, from_attributes=True),
+        stage=stage,
         **provenance("geometry", options, dict(board_set.input_hashes())).parts(),
     )
 

@@ -13,6 +13,7 @@ import numpy as np
 from msgspec import UNSET, Meta, Struct, UnsetType
 from numpy.typing import NDArray
 
+from faintfield.calib.estimate import Repeatability, StageReport
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.files import exclusive, remove, remove_leftovers, sha256, write_record, write_whole
@@ -100,13 +101,6 @@ class PosesOfSession(CameraPoses, frozen=True, kw_only=True):
     inputs: dict[str, str] = {}
 
 
-class RepeatabilityRecord(Struct, frozen=True):
-    """Repeatability of the gantry at a node in another sweep: standard deviation per axis, and its error."""
-
-    sd_mm: float
-    se_mm: float
-
-
 class BoardRecord(Struct, frozen=True):
     """A board as it stood during a sweep, with what is printed on it and how far it bulges along x and y.
 
@@ -124,30 +118,6 @@ class BoardRecord(Struct, frozen=True):
     rt_ref_board: Pose
     warp_mm: tuple[float, float]
     homing: int | UnsetType = UNSET
-
-
-class StageFigure(Struct, frozen=True):
-    """A figure of the stage with its standard error, or the reason why there is none."""
-
-    value: float | None
-    sigma: float | None = None
-    why: str | None = None
-
-
-class StageRecord(Struct, frozen=True):
-    """Scale, squareness, backlash and tilt of the stage; `residuals_mm` (x, y, normal) are of the nodes in order."""
-
-    pitch_x_mm: StageFigure
-    pitch_y_mm: StageFigure
-    scale_x: StageFigure
-    scale_y: StageFigure
-    squareness_rad: StageFigure
-    backlash_x_mm: StageFigure
-    backlash_y_mm: StageFigure
-    tilt_rad: StageFigure
-    node_residual_rms_mm: StageFigure
-    residuals_mm: list[tuple[float, float, float]]
-    warnings: list[str] = msgspec.field(name="doubts")
 
 
 class GeometryOptions(Struct, frozen=True):
@@ -172,9 +142,9 @@ class GeometryRecord(CameraPoses, frozen=True, kw_only=True):
     holdout_ratio: float | None
     warnings: list[str] = msgspec.field(name="doubts")
     transfer_sigma_px: dict[str, float]
-    repeatability: RepeatabilityRecord | None
+    repeatability: Repeatability | None
     boards: list[BoardRecord]
-    stage: StageRecord
+    stage: StageReport
     command: str
     options: GeometryOptions
     inputs: dict[str, str]
