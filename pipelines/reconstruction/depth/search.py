@@ -19,7 +19,7 @@ from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.frames import Lattice
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.channels import lattice_noise, view_electrons
-from faintfield.pipelines.reconstruction.depth.autofocus import overlap, views_of_search
+from faintfield.pipelines.reconstruction.depth.autofocus import overlap, searched_range_mm, views_of_search
 from faintfield.pipelines.reconstruction.depth.comparison import BETWEEN_PIXELS, between_pixels, check_places
 from faintfield.pipelines.reconstruction.operators import plane_grid, principal_shift, response_of
 from faintfield.recon.errors import GeometryMismatch, NothingInFocus
@@ -194,15 +194,16 @@ class DepthSearch:
     estimate: SurfaceEstimate
 
 
-def depths_of_set(
-    elemental_set: ElementalSet, range_mm: tuple[float, float], out: Path, *, find_range: bool = False
-) -> DepthSearch:
-    """Return the depth of each pixel of the reference view in a range, or in that of the scene, found in it first.
+def depths_of_set(elemental_set: ElementalSet, range_mm: tuple[float, float] | None, out: Path) -> DepthSearch:
+    """Return the depth of each pixel of the reference view in a range, by default in that of the scene.
 
     `out` is for a temporary file. Raises GeometryMismatch if the range is too wide, or views, poses and range do not
     fit together, and NothingInFocus if nothing is found, or shuffled views agree as well.
     """
     bins, grid = default_bins(elemental_set), plane_grid(elemental_set, 1.0)
+    arrangement = elemental_set.settings.arrangement
+    find_range = range_mm is None and (arrangement is None or arrangement.disparity_range_px is None)
+    range_mm = range_mm or searched_range_mm(elemental_set)
     views = luminance(elemental_set, bins)
     near, far = 1 / range_mm[0], 1 / range_mm[1]
     with naming_range(elemental_set, far, near):

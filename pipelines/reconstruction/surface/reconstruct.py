@@ -30,7 +30,6 @@ from faintfield.pipelines.formats.results.surface import (
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, in_units, light_per_e, unit_of_maps
 from faintfield.pipelines.reconstruction.accuracy import write_depth_errors
 from faintfield.pipelines.reconstruction.channels import SHARE_OF_DISK, load_channel
-from faintfield.pipelines.reconstruction.depth.autofocus import searched_range_mm
 from faintfield.pipelines.reconstruction.depth.search import (
     DepthSearch,
     check_overlap,
@@ -81,14 +80,11 @@ def reconstruct_surface(
     grid = plane_grid(elemental_set, 1.0)
     needed_bytes = _needed_bytes(grid.shape, len(layouts), proposal=request.solver.proposal)
     require_room(out, int(needed_bytes / (1 - SHARE_OF_DISK)))  # decoded frames take the rest
-    range_mm, arrangement = request.range_mm(elemental_set), elemental_set.settings.arrangement
-    find_range = range_mm is None and (arrangement is None or arrangement.disparity_range_px is None)
-    if range_mm is None:
-        range_mm = searched_range_mm(elemental_set)
-    else:
+    range_mm = request.range_mm(elemental_set)
+    if range_mm is not None:
         check_overlap(elemental_set, range_mm)
     remove_leftovers(out)
-    search = depths_of_set(elemental_set, range_mm, out, find_range=find_range)
+    search = depths_of_set(elemental_set, range_mm, out)
     far, near = float(search.compared[0]), float(search.compared[-1])
     with naming_range(elemental_set, far, near):
         lights = {
