@@ -229,11 +229,10 @@ def resolve(
     disparities = {elemental_set.depth_of_disparity(disparity_px): disparity_px for disparity_px in in_px}
     depths, found, swept_mm = [*in_mm, *disparities], None, list[float]()
     if selection.auto:
-        range_mm = (min(depths), max(depths)) if depths else None
-        if earlier is None:
-            found = best_focus(elemental_set, out, range_mm)
-        else:
-            found = _found_earlier(earlier, range_mm or searched_range_mm(elemental_set))
+        near_mm, far_mm = (min(depths), max(depths)) if depths else searched_range_mm(elemental_set)
+        found = earlier.best_focus if earlier else best_focus(elemental_set, out, (near_mm, far_mm))
+        if found and found.searched_mm[0] != (near_mm, far_mm):  # that of an earlier result was another search
+            found = None
         depths, disparities = found.depth_mm if found else [], {}
     if selection.auto_sweep:
         if earlier is None:
@@ -253,13 +252,6 @@ def resolve(
         found=found,
         auto_sweep=len(swept_mm) if selection.auto_sweep else UNSET,
     )
-
-
-def _found_earlier(earlier: ReconstructionRecord, range_mm: tuple[float, float]) -> BestFocusRecord | None:
-    """Return the depths of an earlier search of a range, None if that of a result was another."""
-    found = earlier.best_focus
-    near_mm, far_mm = sorted(range_mm)
-    return found if found and found.searched_mm[0] == (near_mm, far_mm) else None
 
 
 def _refuse_mm(selection: Selection, elemental_set: ElementalSet) -> None:
