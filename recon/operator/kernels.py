@@ -102,20 +102,9 @@ class PixelModel(NamedTuple):
 # One long function: its loops share some twenty pointers and counts, which would have to be passed for every block.
 @compiled
 def sweep(
-    operation,
-    planes,
-    expected_images,
-    accumulator,
-    images,
-    image_of_view,
-    pixels,
-    geometry,
-    hiding,
-    space,
-    views,
-    worker,
-    workers,
-):
+    operation, planes, expected_images, accumulator, images, image_of_view, pixels, geometry, hiding, space,
+    views, worker, workers,
+):  # fmt: skip
     """Process a worker's share of the detector pixels of `views`; return their negative log-likelihood.
 
     Parameters
