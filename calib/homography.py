@@ -139,9 +139,9 @@ def transfer_sigma_px(
     for view, (rt, covariance) in enumerate(zip(np.asarray(rt_cam_ref, float), covariances, strict=True)):
         slope = _transfer_derivative(lens, rt, rt_ref_plane, points)
         variances = np.einsum("pai,ij,paj->p", slope, covariance, slope)
-        seen_at = transfer(lens, rt, rt_ref_plane, points)
-        seen = ((seen_at >= -0.5) & (seen_at <= np.array(lens.size_px) - 0.5)).all(axis=1)
-        sigma_px[view, seen] = np.sqrt(np.maximum(variances[seen], 0))
+        images_px = transfer(lens, rt, rt_ref_plane, points)
+        visible = ((images_px >= -0.5) & (images_px <= np.array(lens.size_px) - 0.5)).all(axis=1)
+        sigma_px[view, visible] = np.sqrt(np.maximum(variances[visible], 0))
     return sigma_px
 
 

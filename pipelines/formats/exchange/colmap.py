@@ -7,7 +7,7 @@ are this project's. Poses are `x_cam = R(q) x_world + t` with q = (w, x, y, z), 
 import io
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
@@ -48,71 +48,51 @@ _MAX_BYTES = 256_000_000
 MODEL_FILES = [f"{part}{suffix}" for part in ("cameras", "images", "points3D") for suffix in (".bin", ".txt")]
 
 
-@dataclass(frozen=True)
-class ColmapImage:
-    """One image: its file's name, its camera's number, and its pose (6,), Rodrigues rad and the model's unit."""
-
-    name: str
-    camera: int
-    rt_cam_world: NDArray[np.float64]
+# Name, number of the camera, and pose of an image, Rodrigues rad and the model's unit.
+type _Image = tuple[str, int, NDArray[np.float64]]
 
 
-@dataclass(frozen=True)
-class ColmapModel:
-    """A sparse model without its points."""
+def read_model(folder: Path, pictures: Path | None = None) -> list[PosedImage]:
+    """Return the images of a model with their lenses and poses, in its own unit: of its binary files where it has both.
 
-    lenses: dict[int, Lens]
-    images: list[ColmapImage]
-
-
-def read_model(folder: Path) -> ColmapModel:
-    """Read cameras and images, binary where there are both.
+    Names of images count from the folder `pictures`, by default from that of the model.
 
     Raises
     ------
     MissingFile
         The folder holds neither cameras.bin nor cameras.txt, or no images beside them.
     BadValue
-        A file is damaged, an image's camera is missing, or a camera's model has no counterpart here.
+        A file is damaged, an image's camera is missing, a camera's model has no counterpart here, or a name leads out
+        of the folder.
     """
-    cameras, images = model_files(folder)
+    cameras, images = _model_files(folder)
     read_cameras, read_images = _READERS[cameras.suffix]
     try:
-        model = ColmapModel(read_cameras(cameras), read_images(images))
+        lenses, entries = read_cameras(cameras), read_images(images)
     except (struct.error, ValueError, LookupError, OverflowError) as failure:
         raise BadValue(f"{folder}: is not a COLMAP model that can be read ({failure}); export it again") from failure
-    for image in model.images:
-        if image.camera not in model.lenses:
+    for name, camera, _ in entries:
+        if camera not in lenses:
             raise BadValue(
-                f"{images}: {image.name} was taken with camera {image.camera}, and {cameras.name} has "
-                f"{', '.join(map(str, model.lenses)) or 'none'}; export the whole model"
+                f"{images}: {name} was taken with camera {camera}, and {cameras.name} has "
+                f"{', '.join(map(str, lenses)) or 'none'}; export the whole model"
             )
-    return model
+    place = pictures or folder
+    return [PosedImage(inside(place, name, f"{images}: name"), lenses[camera], rt) for name, camera, rt in entries]
 
 
 def import_model(src: Path, out: Path, options: ImportOptions) -> ImportedSet:
     """Make an elemental set of a model and its images."""
-    model, files, folder = read_model(src), list(model_files(src)), options.images or src
-    images = [
-        PosedImage(inside(folder, image.name, f"{files[1]}: name"), model.lenses[image.camera], image.rt_cam_world)
-        for image in model.images
-    ]
-    return import_posed(out, files, images, options, "import colmap")
+    return import_posed(out, _model_files(src), read_model(src, options.images), options, "import colmap")
 
 
 def export_model(set_path: Path, out: Path, *, binary: bool, overwrite: bool) -> ExportedSet:
     """Write the lens and poses of a set or session as a model without points."""
-
-    def write(folder: Path, views: list[PosedImage]) -> None:
-        cameras = {lens: number for number, lens in enumerate(dict.fromkeys(view.lens for view in views), start=1)}
-        images = [ColmapImage(str(view.path), cameras[view.lens], view.rt_cam_world) for view in views]
-        write_model(folder, ColmapModel({number: lens for lens, number in cameras.items()}, images), binary=binary)
-
-    return export_posed(set_path, out, "mm", MODEL_FILES if overwrite else (), write)
+    return export_posed(set_path, out, "mm", MODEL_FILES if overwrite else (), partial(write_model, binary=binary))
 
 
-def model_files(folder: Path) -> tuple[Path, Path]:
-    """Return the files of a model that are read, its cameras and its images: binary where there are both."""
+def _model_files(folder: Path) -> tuple[Path, Path]:
+    """Return the files of cameras and images that are read: binary where there are both."""
     for suffix in (".bin", ".txt"):
         cameras, images = folder / f"cameras{suffix}", folder / f"images{suffix}"
         if is_file(cameras):
@@ -122,28 +102,30 @@ def model_files(folder: Path) -> tuple[Path, Path]:
     raise MissingFile(f"{folder}: holds no cameras.bin or cameras.txt; name the folder of a COLMAP sparse model")
 
 
-def write_model(folder: Path, model: ColmapModel, *, binary: bool) -> None:
+def write_model(folder: Path, views: Sequence[PosedImage], *, binary: bool) -> None:
     """Write cameras, images and an empty list of points, in text or binary."""
-    cameras = [(number, *_camera(lens)) for number, lens in model.lenses.items()]
-    images = [(number, image, _pose_numbers(image)) for number, image in enumerate(model.images, start=1)]
+    numbers = {lens: number for number, lens in enumerate(dict.fromkeys(view.lens for view in views), start=1)}
+    cameras = [(number, *_camera(lens)) for lens, number in numbers.items()]
+    images = [
+        (number, _pose_numbers(view.rt_cam_world), numbers[view.lens], str(view.path))
+        for number, view in enumerate(views, start=1)
+    ]
     if binary:
         content = struct.pack("<Q", len(cameras))
         for number, name, width, height, parameters in cameras:
             content += struct.pack(f"<iiQQ{len(parameters)}d", number, _NUMBERS[name], width, height, *parameters)
         write_whole(folder / "cameras.bin", content)
         content = struct.pack("<Q", len(images))
-        for number, image, pose in images:
-            content += struct.pack("<i7di", number, *pose, image.camera)
-            content += image.name.encode() + b"\0" + struct.pack("<Q", 0)
+        for number, pose, camera, name in images:
+            content += struct.pack("<i7di", number, *pose, camera) + name.encode() + b"\0" + struct.pack("<Q", 0)
         write_whole(folder / "images.bin", content)
         write_whole(folder / "points3D.bin", struct.pack("<Q", 0))
         return
-    spaced = [image.name for image in model.images if len(image.name.split()) > 1]
-    if spaced:
+    if spaced := [name for *_, name in images if len(name.split()) > 1]:
         raise BadValue(f"'{spaced[0]}': has a space, where COLMAP ends a name in a text model; use --binary")
-    lines = [f"{number} {name} {w} {h} {' '.join(map(repr, numbers))}\n" for number, name, w, h, numbers in cameras]
+    lines = [f"{number} {kind} {w} {h} {' '.join(map(repr, values))}\n" for number, kind, w, h, values in cameras]
     write_whole(folder / "cameras.txt", "".join(lines))
-    lines = [f"{number} {' '.join(map(repr, pose))} {i.camera} {i.name}\n\n" for number, i, pose in images]
+    lines = [f"{number} {' '.join(map(repr, pose))} {camera} {name}\n\n" for number, pose, camera, name in images]
     write_whole(folder / "images.txt", "".join(lines))
     write_whole(folder / "points3D.txt", "")
 
@@ -170,9 +152,9 @@ def _pose(numbers: Sequence[float]) -> NDArray[np.float64]:
     return np.append(Rotation.from_quat([x, y, z, w]).as_rotvec(), translation)
 
 
-def _pose_numbers(image: ColmapImage) -> list[float]:
-    x, y, z, w = Rotation.from_rotvec(image.rt_cam_world[:3]).as_quat().tolist()
-    return [w, x, y, z, *image.rt_cam_world[3:].tolist()]
+def _pose_numbers(rt_cam_world: NDArray[np.float64]) -> list[float]:
+    x, y, z, w = Rotation.from_rotvec(rt_cam_world[:3]).as_quat().tolist()
+    return [w, x, y, z, *rt_cam_world[3:].tolist()]
 
 
 def _model_name(path: Path, model: str | int) -> str:
@@ -200,14 +182,14 @@ def _cameras_text(path: Path) -> dict[int, Lens]:
     return lenses
 
 
-def _images_text(path: Path) -> list[ColmapImage]:
+def _images_text(path: Path) -> list[_Image]:
     images = []
     for line in _lines(path)[::2]:  # every other line lists points, and may be empty
         if line.strip():
             _, *numbers, camera, name = line.split(maxsplit=9)
             if len(numbers) != 7:
                 raise ValueError(f"an image has {len(numbers)} numbers of its pose, 7 are expected")
-            images.append(ColmapImage(name, int(camera), _pose([float(text) for text in numbers])))
+            images.append((name, int(camera), _pose([float(text) for text in numbers])))
     return images
 
 
@@ -222,7 +204,7 @@ def _cameras_binary(path: Path) -> dict[int, Lens]:
     return lenses
 
 
-def _images_binary(path: Path) -> list[ColmapImage]:
+def _images_binary(path: Path) -> list[_Image]:
     images = []
     content = read_content(path, _MAX_BYTES)
     file = io.BytesIO(content)
@@ -234,7 +216,7 @@ def _images_binary(path: Path) -> list[ColmapImage]:
         points = int(_take(file, "Q")[0])
         if file.seek(points * struct.calcsize("<ddq"), io.SEEK_CUR) > len(content):
             raise ValueError(f"{name} states {points} points, more than the file holds")
-        images.append(ColmapImage(name, int(camera), _pose(numbers)))
+        images.append((name, int(camera), _pose(numbers)))
     return images
 
 

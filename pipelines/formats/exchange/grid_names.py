@@ -245,8 +245,8 @@ def _fields_of_one_number(names: Sequence[str], numbers: Sequence[str], varying:
 
 def _places(names: Sequence[str], texts: Sequence[dict[str, str]]) -> Places:
     """Return the numbers of all names by field; refuse those that are too large."""
-    stated = [(name, *item) for name, fields in zip(names, texts, strict=True) for item in fields.items()]
-    for name, field, text in stated:
+    entries = [(name, *item) for name, fields in zip(names, texts, strict=True) for item in fields.items()]
+    for name, field, text in entries:
         if not abs(float(text)) < _MAX_NUMBER:
             raise BadValue(
                 f"{name}: its name has the number {text}, beyond {_MAX_NUMBER:g}, for {field}; correct it, give --rows "

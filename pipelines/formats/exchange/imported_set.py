@@ -101,8 +101,8 @@ def import_posed(
         replace(image, rt_cam_world=image.rt_cam_world * scale, node=node)
         for image, node in zip(posed, _nodes(posed), strict=True)
     ]
-    for image, stated in zip(images, posed, strict=True):
-        _check_image(image, stated)
+    for image, original in zip(images, posed, strict=True):
+        _check_image(image, original)
     index = _reference(images, options.reference)
     write_imported_set(
         out,
@@ -139,13 +139,13 @@ def export_posed(
     return ExportedSet(str(out), len(views), unit)
 
 
-def _check_image(image: PosedImage, stated: PosedImage) -> None:
+def _check_image(image: PosedImage, original: PosedImage) -> None:
     """Refuse an image that is missing, and a pose that is not finite or too large, in the words of the model."""
     if not is_file(image.path):
         raise MissingFile(f"{image.path}: has a pose but is missing; put it there, or name its folder with --images")
     if not (np.abs(image.rt_cam_world) <= np.repeat([MAX_ANGLE_RAD, MAX_LENGTH_MM], 3)).all():
         raise BadValue(
-            f"{image.path}: its pose {stated.rt_cam_world.tolist()} is not finite, or beyond {MAX_ANGLE_RAD:g} rad "
+            f"{image.path}: its pose {original.rt_cam_world.tolist()} is not finite, or beyond {MAX_ANGLE_RAD:g} rad "
             f"or {MAX_LENGTH_MM:g} mm; calibrate again, or remove it"
         )
 
@@ -153,18 +153,18 @@ def _check_image(image: PosedImage, stated: PosedImage) -> None:
 def _reference(images: Sequence[PosedImage], name: str | None) -> int:
     """Return the index of the image asked for, or of the one nearest to the middle of all cameras."""
     if name is not None:
-        found = [index for index, image in enumerate(images) if image.path.name == Path(name).name]
-        if not found:
+        matches = [index for index, image in enumerate(images) if image.path.name == Path(name).name]
+        if not matches:
             raise BadValue(f"--reference {name}: is none of the {len(images)} images with a pose; name one of them")
-        return found[0]
+        return matches[0]
     centres = np.array([-rotation_matrix(i.rt_cam_world).T @ i.rt_cam_world[3:] for i in images])
     return int(np.argmin(np.linalg.norm(centres - centres.mean(axis=0), axis=1)))
 
 
 def _nodes(images: Sequence[PosedImage]) -> Sequence[tuple[int, int] | None]:
     """Return the rows and columns in names such as view_r3_c12.tiff; None for each if the names are not of a grid."""
-    found = [re.search(r"r([0-9]{1,5})_c([0-9]{1,5})$", image.path.stem) for image in images]
-    nodes = [(int(numbers[1]), int(numbers[2])) for numbers in found if numbers is not None]
+    matches = [re.search(r"r([0-9]{1,5})_c([0-9]{1,5})$", image.path.stem) for image in images]
+    nodes = [(int(numbers[1]), int(numbers[2])) for numbers in matches if numbers is not None]
     return nodes if len(set(nodes)) == len(images) else [None] * len(images)
 
 
@@ -201,10 +201,10 @@ def write_imported_set(
     first = read_picture(path)
     _check_lenses([image.lens for image in images], path, first)
     exposure_s = options.exposure_s or first.exposure_s or exif_exposure_s(path)
-    stated = options if isinstance(options, GridOptions) else GridOptions()
-    if exposure_s is None and stated.dark_current_e_per_s:
+    sensor = options if isinstance(options, GridOptions) else GridOptions()
+    if exposure_s is None and sensor.dark_current_e_per_s:
         raise BadValue(
-            f"{path}: states no exposure, without which {stated.dark_current_e_per_s:g} dark electrons per second mean "
+            f"{path}: states no exposure, without which {sensor.dark_current_e_per_s:g} dark electrons per second mean "
             "nothing; give --exposure-s"
         )
     tone = tone_of(path, first, options)
@@ -215,12 +215,12 @@ def write_imported_set(
             for image in progress(images, "copying pictures")
         ]
         lossy = inputs[-1].suffix.lower() in _LOSSY_SUFFIXES
-        complete, origin = complete_noise(stated, Pictures(folder, views, first, tone, lossy))
+        complete, origin = complete_noise(sensor, Pictures(folder, views, first, tone, lossy))
         settings = ElementalSetFile(
             format=1,
             exposure_s=exposure_s,
             reference_view=reference,
-            units=msgspec.structs.replace(units, light=light_unit(stated, tone)),
+            units=msgspec.structs.replace(units, light=light_unit(sensor, tone)),
             arrangement=arrangement,
             camera=Camera(lens.size_px, lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, lens.distortion),
             noise=complete,

@@ -133,25 +133,25 @@ def _lens(content: _Transforms, frame: _Frame, image: Path, sizes: dict[Path, tu
     `sizes` keeps the size of the first picture, which is read if the file states none.
     """
     own = {name: value for name, value in msgspec.structs.asdict(frame).items() if value is not None}
-    stated = msgspec.structs.asdict(content) | own
-    model = stated["camera_model"]
+    values = msgspec.structs.asdict(content) | own
+    model = values["camera_model"]
     fisheye = frame.is_fisheye or content.is_fisheye
-    if model not in _MODELS or fisheye or stated["k4"]:
-        kind = "k4" if stated["k4"] else model if model not in _MODELS else "is_fisheye"
+    if model not in _MODELS or fisheye or values["k4"]:
+        kind = "k4" if values["k4"] else model if model not in _MODELS else "is_fisheye"
         raise ValueError(f"its lens has no counterpart here ({kind}); undistort the images to a pinhole camera")
-    width, height = stated["w"], stated["h"]
+    width, height = values["w"], values["h"]
     if width is None or height is None:
         if not sizes:
             sizes[image] = read_frame(image).pixels_dn.shape[1::-1]
         width, height = next(iter(sizes.values()))
     if not float(width).is_integer() or not float(height).is_integer():
         raise ValueError(f"w, h = {width:g}, {height:g} are no whole numbers of pixels")
-    fx_px, fy_px = (_focal_px(stated, *names) for names in ((width, "fl_x", "x"), (height, "fl_y", "y")))
+    fx_px, fy_px = (_focal_px(values, *names) for names in ((width, "fl_x", "x"), (height, "fl_y", "y")))
     if fx_px is None:
         raise ValueError("states neither fl_x nor camera_angle_x")
-    cx_px = width / 2 if stated["cx"] is None else stated["cx"]
-    cy_px = height / 2 if stated["cy"] is None else stated["cy"]
-    distortion = tuple(stated[name] or 0.0 for name in ("k1", "k2", "p1", "p2", "k3"))
+    cx_px = width / 2 if values["cx"] is None else values["cx"]
+    cy_px = height / 2 if values["cy"] is None else values["cy"]
+    distortion = tuple(values[name] or 0.0 for name in ("k1", "k2", "p1", "p2", "k3"))
     return Lens(
         (int(width), int(height)),
         fx_px,
@@ -162,10 +162,10 @@ def _lens(content: _Transforms, frame: _Frame, image: Path, sizes: dict[Path, tu
     )
 
 
-def _focal_px(stated: dict[str, Any], size: float, name: str, axis: str) -> float | None:
+def _focal_px(values: dict[str, Any], size: float, name: str, axis: str) -> float | None:
     """Return the focal length that is stated, or that of a picture that spans the angle that is stated."""
-    focal_px: float | None = stated[name]
-    angle = stated[f"camera_angle_{axis}"]
+    focal_px: float | None = values[name]
+    angle = values[f"camera_angle_{axis}"]
     if focal_px is not None or angle is None:
         return focal_px
     if not 0 < angle < math.pi:
@@ -185,11 +185,11 @@ def _write_transforms(folder: Path, views: list[PosedImage]) -> None:
         _Frame(
             file_path=str(view.path),
             transform_matrix=_matrix(view.rt_cam_world),
-            **({} if shared is not None else _stated(view.lens)),
+            **({} if shared is not None else _intrinsics(view.lens)),
         )
         for view in views
     ]
-    whole = {"camera_model": _WRITTEN_MODEL} if shared is None else _stated(shared)
+    whole = {"camera_model": _WRITTEN_MODEL} if shared is None else _intrinsics(shared)
     write_json(folder / FILE_NAME, _Transforms(**whole, frames=frames))
 
 
@@ -199,8 +199,8 @@ def _matrix(rt_cam_world: NDArray[np.float64]) -> list[_Row]:
     return [(a, b, c, d) for a, b, c, d in [*rows, [0.0, 0.0, 0.0, 1.0]]]
 
 
-def _stated(lens: Lens) -> dict[str, Any]:
+def _intrinsics(lens: Lens) -> dict[str, Any]:
     k1, k2, p1, p2, k3 = [*lens.distortion, *[0.0] * 5][:5]
-    stated: dict[str, Any] = {"camera_model": _WRITTEN_MODEL, "w": lens.size_px[0], "h": lens.size_px[1]}
-    stated |= {"fl_x": lens.fx_px, "fl_y": lens.fy_px, "cx": lens.cx_px + _HALF_PX, "cy": lens.cy_px + _HALF_PX}
-    return stated | {"k1": k1, "k2": k2, "p1": p1, "p2": p2} | ({"k3": k3} if k3 else {})
+    values: dict[str, Any] = {"camera_model": _WRITTEN_MODEL, "w": lens.size_px[0], "h": lens.size_px[1]}
+    values |= {"fl_x": lens.fx_px, "fl_y": lens.fy_px, "cx": lens.cx_px + _HALF_PX, "cy": lens.cy_px + _HALF_PX}
+    return values | {"k1": k1, "k2": k2, "p1": p1, "p2": p2} | ({"k3": k3} if k3 else {})

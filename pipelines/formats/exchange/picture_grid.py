@@ -65,7 +65,7 @@ def import_pictures(src: Path, out: Path, options: GridOptions) -> ImportedGrid:
     own_scale = pitch_mm is None and fx_px is None and disparity_px is None
     if described is not None:
         pitch_mm, fx_px, disparity_px = described.scale(pitch_mm, fx_px, disparity_px)
-    stated = Orientation(options.transpose, options.flip_rows, options.flip_columns)
+    prescribed = Orientation(options.transpose, options.flip_rows, options.flip_columns)
     with _unpacked(src, options, described.size if described else None) as views:
         for remark in views.remarks:
             inform(remark)
@@ -74,7 +74,7 @@ def import_pictures(src: Path, out: Path, options: GridOptions) -> ImportedGrid:
         white = float(first.saturation_dn or np.iinfo(first.pixels_dn.dtype).max)
         grid, arrangement = arrange_grid(
             views,
-            stated if stated != Orientation() else None,
+            prescribed if prescribed != Orientation() else None,
             white=white if views.dn_per_value is None else np.inf,  # floats state no white
             size_px=(width, height),
             aligned=bool(disparity_px),

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from faintfield.pipelines.commands.exports import export_colmap
 from faintfield.pipelines.commands.imports import import_colmap
 from faintfield.pipelines.errors import BadValue
-from faintfield.pipelines.formats.exchange.colmap import ColmapImage, ColmapModel, read_model, write_model
-from faintfield.pipelines.formats.exchange.imported_set import relative
+from faintfield.pipelines.formats.exchange.colmap import read_model, write_model
+from faintfield.pipelines.formats.exchange.imported_set import PosedImage, relative
 from faintfield.pipelines.formats.exchange.options import ImportOptions
 from faintfield.pipelines.formats.files import sha256
 from faintfield.pipelines.formats.sets.elemental_set import load_set
@@ -120,24 +120,23 @@ STORED = Path(__file__).parents[1] / "colmap"
 @pytest.mark.parametrize("kind", ["text", "binary"])
 def test_stored_models_see_as_colmap_does(kind: str) -> None:
     """COLMAP's library sees the points of its model half a pixel apart from us."""
-    truth, model = json.loads((STORED / "seen.json").read_text()), read_model(STORED / kind)
-    assert [image.name for image in model.images] == list(truth["seen"])
-    for image in model.images:
+    truth, images = json.loads((STORED / "seen.json").read_text()), read_model(STORED / kind, Path())
+    assert [str(image.path) for image in images] == list(truth["seen"])
+    for image in images:
         turn, shift = Rotation.from_rotvec(image.rt_cam_world[:3]), image.rt_cam_world[3:]
-        pixels = model.lenses[image.camera].project(turn.apply(truth["points"]) + shift)
-        np.testing.assert_allclose(pixels + 0.5, truth["seen"][image.name], atol=1e-9, err_msg=image.name)
+        pixels = image.lens.project(turn.apply(truth["points"]) + shift)
+        np.testing.assert_allclose(pixels + 0.5, truth["seen"][str(image.path)], atol=1e-9, err_msg=str(image.path))
 
 
 def test_model_becomes_an_elemental_set(tmp_path: Path) -> None:
     """One camera of the stored model, its images in a folder below, its unit a metre."""
-    model = read_model(STORED / "text")
-    chosen = [image for image in model.images if image.camera in (4, 5)]
-    lone = ColmapModel({4: model.lenses[4]}, [replace(image, camera=4) for image in chosen])
+    chosen = [image for image in read_model(STORED / "text", Path()) if image.path.stem[-1] in "45"]
+    lone = [replace(image, lens=chosen[0].lens) for image in chosen]
     (tmp_path / "model").mkdir()
     write_model(tmp_path / "model", lone, binary=True)
     for image in chosen:
-        (tmp_path / image.name).parent.mkdir(exist_ok=True)
-        cv2.imwrite(str(tmp_path / image.name), np.zeros((480, 640), np.uint16))
+        (tmp_path / image.path).parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / image.path), np.zeros((480, 640), np.uint16))
     options = ImportOptions(images=tmp_path, mm_per_unit=1000, reference="radial r4.png", exposure_s=1)
     import_colmap(tmp_path / "model", tmp_path / "set", options=options)
     elemental_set = load_set(tmp_path / "set")
@@ -147,7 +146,7 @@ def test_model_becomes_an_elemental_set(tmp_path: Path) -> None:
     assert elemental_set.settings.units.depth == "mm"
     export_colmap(tmp_path / "set", tmp_path / "back", binary=True)
     back = read_model(tmp_path / "back")
-    np.testing.assert_allclose([image.rt_cam_world for image in back.images], [np.zeros(6), expected], atol=1e-9)
+    np.testing.assert_allclose([image.rt_cam_world for image in back], [np.zeros(6), expected], atol=1e-9)
 
 
 def test_impossible_models_are_refused(tmp_path: Path) -> None:
@@ -164,12 +163,12 @@ def test_impossible_models_are_refused(tmp_path: Path) -> None:
 
 def test_equal_names_of_images_are_refused(tmp_path: Path) -> None:
     """They would be copied over one another."""
-    lens = read_model(STORED / "text").lenses[1]
-    images = [ColmapImage(f"{side}/0.png", 1, np.zeros(6)) for side in ("left", "right")]
+    lens = read_model(STORED / "text")[0].lens
+    images = [PosedImage(Path(side, "0.png"), lens, np.zeros(6)) for side in ("left", "right")]
     (tmp_path / "model").mkdir()
-    write_model(tmp_path / "model", ColmapModel({1: lens}, images), binary=False)
+    write_model(tmp_path / "model", images, binary=False)
     for image in images:
-        (tmp_path / image.name).parent.mkdir()
-        cv2.imwrite(str(tmp_path / image.name), np.zeros((480, 640), np.uint16))
+        (tmp_path / image.path).parent.mkdir()
+        cv2.imwrite(str(tmp_path / image.path), np.zeros((480, 640), np.uint16))
     with pytest.raises(BadValue, match=r"right/0\.png: would become 0\.png"):
         import_colmap(tmp_path / "model", tmp_path / "set", options=ImportOptions(images=tmp_path))
