@@ -82,31 +82,33 @@ def require_determined(
 
 def find_shortcomings(geometry: RigGeometry, observations: Observations, depth_mm: float) -> list[str]:
     """Return what the set lacks, and for each what to add."""
-    found = []
+    shortcomings = []
     boards = geometry.boards
     nearest_mm = min(float(board.rt_ref_board[5]) for board in boards)
     if len(boards) < _MIN_BOARDS:
-        found.append(
+        shortcomings.append(
             f"{len(boards)} board pose(s) only: show at least {_MIN_BOARDS}, better 6, tilted by 20 to 40 degrees"
         )
     # The angle between a board and the detector
     cosine = min(abs(rotation_matrix(board.rt_ref_board)[2, 2]) for board in boards)
     tilt_rad = float(np.arccos(min(cosine, 1.0)))
     if tilt_rad < _MIN_TILT_RAD:
-        found.append(
+        shortcomings.append(
             f"no board is tilted by more than {np.degrees(tilt_rad):.0f} degrees: "
             "tilt some by 20 to 40 degrees, about both axes"
         )
     if nearest_mm > _MAX_DISTANCE_OVER_DEPTH * depth_mm:
-        found.append(f"the nearest board stands at {nearest_mm:.0f} mm: bring some to about {depth_mm:g} mm")
+        shortcomings.append(f"the nearest board stands at {nearest_mm:.0f} mm: bring some to about {depth_mm:g} mm")
     if len(geometry.nodes) < _MIN_NODES:
-        found.append(f"{len(geometry.nodes)} node(s) only: take at least {_MIN_NODES}")
+        shortcomings.append(f"{len(geometry.nodes)} node(s) only: take at least {_MIN_NODES}")
     pixels = observations.pixels[observations.weights > 0]
     cells = np.clip((pixels / geometry.lens.size_px * _COVERAGE_CELLS).astype(int), 0, _COVERAGE_CELLS - 1)
     coverage = len(np.unique(cells, axis=0)) / _COVERAGE_CELLS**2
     if coverage < _MIN_COVERAGE:
-        found.append(f"corners cover {coverage:.0%} of the image: move boards into its edges, or take larger ones")
-    return found
+        shortcomings.append(
+            f"corners cover {coverage:.0%} of the image: move boards into its edges, or take larger ones"
+        )
+    return shortcomings
 
 
 def inconsistent_views(bundle: Bundle, observations: Observations) -> list[str]:

@@ -5,7 +5,7 @@ It begins with the focal length that fits best of many, and with poses along a t
 
 import heapq
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
@@ -168,7 +168,8 @@ def solve_again(
 
 def _inputs(problem: BundleProblem) -> dict[str, Any]:
     observations = problem.observations
-    focal_px, rt_cam_ref, rt_ref_board = initialize(observations, problem.size_px, problem.square_mm)
+    focal_px = _focal_by_trial(problem)
+    rt_cam_ref, rt_ref_board = _initial_poses(problem, focal_px)
     model = LENS_MODELS[problem.lens_model]
     width, height = problem.size_px
     intrinsics = np.zeros((1, load_mrcal().lensmodel_num_params(model)))
@@ -231,49 +232,43 @@ def _polish(inputs: dict[str, Any]) -> None:
             break
 
 
-def initialize(
-    observations: Observations, size_px: tuple[int, int], square_mm: float
-) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
-    """Return the focal length that fits single views best, and poses along the tree of the best-fitting views.
-
-    The lens is a pinhole whose principal point is the middle of the detector. The poses of nodes and boards, (node, 6)
-    and (target, 6), are rt_cam_ref and rt_ref_board, Rodrigues rad and mm.
-    """
-    focal_px = _focal_by_trial(observations, size_px, square_mm)
-    matrix = _matrix(focal_px, size_px)
-    poses = [_pose(observations, view, matrix, square_mm) for view in range(len(observations.node_of))]
-    camera_from_ref, ref_from_board = _tree(observations, [pose for pose, _ in poses], [error for _, error in poses])
+def _initial_poses(problem: BundleProblem, focal_px: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return rt_cam_ref (node, 6) and rt_ref_board (target, 6) along the tree of the best-fitting views."""
+    observations = problem.observations
+    poses, errors = zip(*(_pose(problem, view, focal_px) for view in range(len(observations.node_of))), strict=True)
     rt_cam_ref, rt_ref_board = (
         np.array([_rt(transforms[index]) for index in range(len(transforms))])
-        for transforms in (camera_from_ref, ref_from_board)
+        for transforms in _tree(observations, poses, errors)
     )
-    return focal_px, rt_cam_ref, rt_ref_board
+    return rt_cam_ref, rt_ref_board
 
 
-def _focal_by_trial(observations: Observations, size_px: tuple[int, int], square_mm: float) -> float:
+def _focal_by_trial(problem: BundleProblem) -> float:
     """Return the focal length at which single views, each with a pose of its own, have the least reprojection error."""
+    observations = problem.observations
     counts = (observations.weights > 0).sum(axis=(1, 2))
     views = np.argsort(-counts, kind="stable")
     # The best views of every target, since a board that faces the camera does not determine the focal length.
     per_target = [views[observations.target_of[views] == target] for target in range(len(observations.targets))]
     ranked = zip_longest(*(of_target.tolist() for of_target in per_target))
     chosen = [view for rank in ranked for view in rank if view is not None][:_MAX_FOCAL_VIEWS]
-    errors = [
-        sum(_pose(observations, view, _matrix(focal, size_px), square_mm)[1] ** 2 for view in chosen)
-        for focal in _FOCAL_WIDTHS * size_px[0]
-    ]
-    return float(_FOCAL_WIDTHS[int(np.argmin(errors))] * size_px[0])
+    focal_px = _FOCAL_WIDTHS * problem.size_px[0]
+    errors = [sum(_pose(problem, view, focal)[1] ** 2 for view in chosen) for focal in focal_px]
+    return float(focal_px[int(np.argmin(errors))])
 
 
-def _pose(
-    observations: Observations, view: int, matrix: NDArray[np.float64], square_mm: float
-) -> tuple[Transform, float]:
-    """Return the transform from board to camera that fits one view, and its rms reprojection error in pixels."""
+def _pose(problem: BundleProblem, view: int, focal_px: float) -> tuple[Transform, float]:
+    """Return the transform from board to camera that fits one view, and its rms reprojection error in pixels.
+
+    The lens is a pinhole whose principal point is the middle of the detector.
+    """
+    observations, (width, height) = problem.observations, problem.size_px
     row, column = np.nonzero(observations.weights[view] > 0)
-    points = np.column_stack([column, row, np.zeros(len(row))]) * square_mm
+    points = np.column_stack([column, row, np.zeros(len(row))]) * problem.square_mm
     pixels = np.ascontiguousarray(observations.pixels[view, row, column])
-    found, rotations, translations, errors = cv2.solvePnPGeneric(points, pixels, matrix, None, flags=cv2.SOLVEPNP_IPPE)
-    if not found:
+    matrix = np.array([[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1]])
+    solved, rotations, translations, errors = cv2.solvePnPGeneric(points, pixels, matrix, None, flags=cv2.SOLVEPNP_IPPE)
+    if not solved:
         return np.eye(4), np.inf
     best = int(np.argmin(np.ravel(errors)))
     pose = np.eye(4)
@@ -283,7 +278,7 @@ def _pose(
 
 
 def _tree(
-    observations: Observations, poses: list[Transform], errors: list[float]
+    observations: Observations, poses: Sequence[Transform], errors: Sequence[float]
 ) -> tuple[dict[int, Transform], dict[int, Transform]]:
     """Return the transforms (camera from ref, ref from board), found from the reference along the best views."""
     camera_from_ref, ref_from_board = {0: np.eye(4)}, dict[int, Transform]()
@@ -306,11 +301,6 @@ def _tree(
         for other in reached:
             heapq.heappush(waiting, (errors[other], other))
     return camera_from_ref, ref_from_board
-
-
-def _matrix(focal_px: float, size_px: tuple[int, int]) -> NDArray[np.float64]:
-    width, height = size_px
-    return np.array([[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1]])
 
 
 def _rt(transform: Transform) -> NDArray[np.float64]:

@@ -114,17 +114,17 @@ def _misplaced_nodes(geometry: RigGeometry) -> list[str]:
         distances = np.linalg.norm(centres_mm - grid @ solution, axis=1)
     places = grid @ solution
     pitch_mm = float(np.linalg.norm(solution[1:], axis=1).min())
-    found = []
+    warnings = []
     for index in np.flatnonzero(distances > _MAX_NODE_ERROR * pitch_mm).tolist():
         away = np.linalg.norm(places - centres_mm[index], axis=1)
         there = int(np.argmin(away))
         known = there != index and away[there] < _MAX_NODE_ERROR * pitch_mm
         where = f", where node {nodes[there]} belongs" if known else ""
-        found.append(
+        warnings.append(
             f"node {nodes[index]} lies {distances[index]:.1f} mm from its place{where}: check the node of its images, "
             "and whether the stage lost steps"
         )
-    return found
+    return warnings
 
 
 class _Grid:

@@ -196,7 +196,7 @@ def _refuse_unfit(inspection: GridInspection, paths: Sequence[Path], *, prescrib
             "their names, by --pattern, or by --rows and --columns"
         )
     (least, largest), orientation = inspection.range_px, inspection.orientation
-    if inspection.undecided and not prescribed and not (aligned and not orientation.opposed):
+    if inspection.undecided and not (aligned and not orientation.opposed):
         options, other = _options(orientation), _options(orientation.turned())
         remedy = f"{other}, or --disparity-px if they are aligned on a plane nearer than the scene"
         if orientation.opposed:
