@@ -167,16 +167,16 @@ def homing_shifts(
     for before, after in chain.from_iterable(map(pairwise, by_board.values())):
         pairs.setdefault((targets[before].homing, targets[after].homing), []).append((before, after))
     first = bundle.state_slices()["boards"].start
-    found = []
-    for (one, other), of_boards in sorted(pairs.items()):
+    shifts = []
+    for (before, after), of_boards in sorted(pairs.items()):
         shift, jacobian = np.zeros(3), np.zeros((3, len(covariance)))
         for indices in of_boards:
             for index, sign in zip(indices, (1, -1), strict=True):
                 point, slope = _point(bundle.rt_ref_board[index], middles_mm[targets[index].board])
                 shift += sign * point / len(of_boards)
                 jacobian[:, first + 6 * index : first + 6 * index + 6] += sign * slope / len(of_boards)
-        found.append(HomingShift(one, other, shift, jacobian @ covariance @ jacobian.T))
-    return found
+        shifts.append(HomingShift(before, after, shift, jacobian @ covariance @ jacobian.T))
+    return shifts
 
 
 def _point(rt: NDArray[np.float64], at_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

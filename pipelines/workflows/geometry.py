@@ -108,12 +108,12 @@ def _observe(board_set: BoardSet) -> tuple[list[BoardObservation], tuple[int, in
     first = views[0].image()
     size_px = first.shape[1], first.shape[0]
 
-    def seen_in(view: BoardView) -> list[BoardCorners]:
+    def detect(view: BoardView) -> list[BoardCorners]:
         return detect_boards(first if view is views[0] else view.image(size_px), boards)
 
-    found = read_ahead(views, seen_in, usable_cores())
-    per_view = list(progress(found, "looking for boards", len(views)))
-    _inform_of_found(per_view)
+    detections = read_ahead(views, detect, usable_cores())
+    per_view = list(progress(detections, "looking for boards", len(views)))
+    _inform_of_boards(per_view)
     observations = [
         BoardObservation(
             view.node, Target(seen.board, view.sweep, view.homing), seen.corners, seen.pixels, seen.sigma_px
@@ -132,7 +132,7 @@ def _observe(board_set: BoardSet) -> tuple[list[BoardObservation], tuple[int, in
     return observations, size_px
 
 
-def _inform_of_found(per_view: list[tuple[BoardView, list[BoardCorners]]]) -> None:
+def _inform_of_boards(per_view: list[tuple[BoardView, list[BoardCorners]]]) -> None:
     """Name views without boards, and prints in the older layout."""
     empty = [view.node for view, seen in per_view if not any(len(board.corners) for board in seen)]
     if empty:
