@@ -81,7 +81,7 @@ class TestRun:
     def test_exactly_dependent_steps_run_again(self, session: Path) -> None:
         assert steps_run(session, PLANE) == []
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("faintfield.pipelines.workflows.reconstruct.write_report", REFUSE)
+            patch.setattr("faintfield.pipelines.pages.report.write_report", REFUSE)
             with pytest.raises(BadValue, match="begun"):
                 steps_run(session, OTHER_PLANE)
         assert steps_run(session, OTHER_PLANE) == ["report"], "that of the earlier planes is outdated"

@@ -60,7 +60,7 @@ def test_interrupt_leaves_no_page_of_earlier_surface(
 
     with monkeypatch.context() as patch:
         interrupt = mock.Mock(side_effect=KeyboardInterrupt)
-        patch.setattr("faintfield.pipelines.workflows.reconstruct.write_report", interrupt)
+        patch.setattr("faintfield.pipelines.pages.report.write_report", interrupt)
         with pytest.raises(KeyboardInterrupt):
             steps_run(session, OTHER_RANGE)
     assert not (session / "reconstructions" / "report.html").exists()
