@@ -168,6 +168,10 @@ class CapturePlan(Struct, frozen=True, forbid_unknown_fields=True):
         """Return the size of all frames on disk."""
         return self.frame_count() * self.frame_bytes
 
+    def wanted_room_bytes(self) -> int:
+        """Return the free room on disk that a capture should have: frames taken again keep their earlier file."""
+        return round(1.5 * self.disk_bytes())
+
     def path(self) -> tuple[Point, ...]:
         """Return all points of the stage's path in order, turning points included."""
         targets = [stop.target for step in self.steps for stop in self.stops_of(step)]

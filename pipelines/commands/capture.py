@@ -13,7 +13,8 @@ from faintfield.pipelines.planning.options import PlanOptions
 if TYPE_CHECKING:
     from faintfield.pipelines.formats.board_pdf import BoardSheets
     from faintfield.pipelines.planning.prediction import PredictionRecord
-    from faintfield.pipelines.workflows.capture import Captured, RigCheck
+    from faintfield.pipelines.workflows.capture import Captured
+    from faintfield.pipelines.workflows.check import RigCheck
     from faintfield.pipelines.workflows.verify import Verified
 
 _PLAN = PlanOptions()
@@ -54,7 +55,7 @@ def check(rig: Path, /, *, remember: bool = False, session: Path | None = None) 
     session
         Folder of a session: also say which settings have changed since it was begun, and whether it can be resumed.
     """
-    from faintfield.pipelines.workflows.capture import check_rig
+    from faintfield.pipelines.workflows.check import check_rig
 
     return check_rig(rig, remember, session)
 

@@ -1,8 +1,7 @@
 """Run a guided capture: survey the rig, plan or resume the session, and show it in the terminal and on the page."""
 
-import shutil
 import signal
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import FrameType
@@ -13,23 +12,19 @@ from faintfield.pipelines.console import console, inform, progress
 from faintfield.pipelines.errors import InputError, UnknownFormat
 from faintfield.pipelines.formats.files import require_room
 from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.live.capture_page import serve_page
 from faintfield.pipelines.live.panel import CapturePanel, SessionFrames
 from faintfield.pipelines.live.planes_client import LiveOrder, live_planes
 from faintfield.pipelines.live.terminal import TerminalView
 from faintfield.rig.cameras.protocol import Pixels
-from faintfield.rig.capture.guide import format_duration
+from faintfield.rig.capture.guide import format_capture_duration
 from faintfield.rig.capture.loop import Capture
-from faintfield.rig.capture.survey import Survey, survey
+from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import CameraError, CaptureStopped
-from faintfield.rig.plan import CapturePlan
 from faintfield.rig.session.resume import adopt_settings, check_same_rig, open_session
 from faintfield.rig.session.session import FrozenPlan, has_session, is_sealed, read_plan
 from faintfield.rig.settings import RigSettings
-from faintfield.rig.stages.protocol import StageSettings
-
-# Frames that are taken again keep their earlier file: ask for half as much room again.
-_ROOM_FACTOR = 1.5
 
 
 def capture_session(
@@ -72,8 +67,8 @@ def _plan_session(settings: RigSettings, folder: Path) -> FrozenPlan:
     rig = survey(open_rig(settings), settings)
     for warning in rig.stage.warnings:
         inform(f"warning: {warning}")
-    require_room(folder, needed_bytes(rig.plan))
-    inform(f"{rig.plan.frame_count()} frames, {_format_duration(rig.duration_s, settings.stage)}")
+    require_room(folder, rig.plan.wanted_room_bytes())
+    inform(f"{rig.plan.frame_count()} frames, {format_capture_duration(rig.duration_s, settings.stage)}")
     return FrozenPlan(rig.plan, settings)
 
 
@@ -83,8 +78,6 @@ def _open_page(panel: CapturePanel, stack: ExitStack, frames: SessionFrames, ord
     if planes is not None:
         panel.on_change.append(planes.note_change)
     try:
-        from faintfield.pipelines.live.capture_page import serve_page  # slow: imports a web server
-
         address = stack.enter_context(serve_page(panel, frames, planes))
     except (OSError, RuntimeError) as failure:
         if not (panel.unattended or console.is_terminal):
@@ -125,36 +118,3 @@ def _stop_on_interrupt(panel: CapturePanel) -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-def needed_bytes(plan: CapturePlan) -> int:
-    """Return the free room on disk that a capture should have."""
-    return round(_ROOM_FACTOR * plan.disk_bytes())
-
-
-def _format_duration(duration_s: float, stage: StageSettings) -> str:
-    clock = " by the simulated stage's clock, far less by yours" if stage.simulated else ""
-    return f"{format_duration(duration_s)} without prompts{clock}"
-
-
-def survey_lines(rig: Survey, stage: StageSettings, rig_file: Path) -> list[str]:
-    """Return a line each about stage, camera, plan and the disk of the rig.toml."""
-    plan, travel = rig.plan, rig.stage.travel_mm
-    size_mb, need_mb = plan.disk_bytes() / 1e6, needed_bytes(plan) / 1e6
-    free_mb = shutil.disk_usage(rig_file.absolute().parent).free / 1e6
-    return [
-        f"stage: {rig.stage.firmware}, travel {travel}; all {len(plan.path())} points of the path are allowed",
-        f"camera: {rig.camera.name}; all exposure times are offered",
-        f"plan: {plan.frame_count()} frames in {len(plan.steps)} steps, {_format_duration(rig.duration_s, stage)}",
-        f"disk: {size_mb:.0f} MB of frames; {need_mb:.0f} MB are wanted, {free_mb:.0f} MB are free",
-    ]
-
-
-def changed_settings(stored: Mapping[str, str], present: Mapping[str, str]) -> list[str]:
-    """Return a warning for each setting of the stage that differs from the stored one."""
-    return [
-        f"the stage's {key} was {stored.get(key, 'absent')} when stored and is {present.get(key, 'absent')} now; "
-        "set it back, or store it with --remember"
-        for key in sorted(stored.keys() | present.keys())
-        if stored.get(key) != present.get(key)
-    ]

@@ -14,7 +14,7 @@ from faintfield.rig.plan import PlannedFrame, StepKind
 from faintfield.rig.session.session import Session
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.motion import one_sided_path, path_duration_s
-from faintfield.rig.stages.protocol import Point
+from faintfield.rig.stages.protocol import Point, StageSettings
 
 if TYPE_CHECKING:  # views of a capture need no drivers
     from faintfield.rig.devices import Rig
@@ -139,6 +139,12 @@ def format_duration(duration_s: float) -> str:
         return f"about {max(1, round(duration_s))} s"
     minutes = round(duration_s / 60)
     return f"about {minutes} min" if minutes < 90 else f"about {minutes // 60} h {minutes % 60:02d} min"
+
+
+def format_capture_duration(duration_s: float, stage: StageSettings) -> str:
+    """Return the duration of a capture without prompts, and by which clock if the stage is simulated."""
+    clock = " by the simulated stage's clock, far less by yours" if stage.simulated else ""
+    return f"{format_duration(duration_s)} without prompts{clock}"
 
 
 # Time in s of a stop besides motion and rest, and of a frame besides exposure and readout, until one has been measured:
