@@ -16,7 +16,7 @@ import msgspec
 
 from faintfield.pipelines.errors import BadValue, CannotWrite, DiskFull, MissingFile, OutputBusy, OutputExists
 from faintfield.pipelines.formats.provenance import with_digest
-from faintfield.pipelines.formats.reading import MAX_TEXT_BYTES, naming_unreadable
+from faintfield.pipelines.formats.reading import MAX_TEXT_BYTES, is_folder, naming_unreadable
 from faintfield.pipelines.formats.units import json_of
 from faintfield.rig import files as rig_files
 
@@ -280,10 +280,31 @@ class Hashes:
 
 
 def files_below(directory: Path, name: str) -> list[Path]:
-    """Return the files of a name in a folder and down to three folders below it, in order; no link out of it counts."""
+    """Return the files of a name in a folder and down to three folders below it, in order; no link out of it counts.
+
+    The name may be a pattern. Raises MissingFile if a folder cannot be listed: what it holds would go unnoticed.
+    """
     whole = directory.resolve()
-    found = {path for level in range(_MAX_LEVELS_BELOW + 1) for path in directory.glob("*/" * level + name)}
+    folders, found = [directory], list[Path]()
+    for _ in range(_MAX_LEVELS_BELOW + 1):
+        entries = [entry for folder in folders for entry in _list_folder(folder)]
+        found += [Path(entry) for entry in entries if fnmatchcase(entry.name, name)]
+        folders = [Path(entry) for entry in entries if _is_folder(entry)]
     return sorted(path for path in found if path.resolve().is_relative_to(whole))
+
+
+def folders_in(folder: Path) -> list[Path]:
+    """Return the folders in a folder, in order; MissingFile if it cannot be listed."""
+    return sorted(Path(entry) for entry in _list_folder(folder) if _is_folder(entry))
+
+
+def _list_folder(folder: Path) -> list[os.DirEntry[str]]:
+    with naming_unreadable(folder, "make it readable, or move it away"), os.scandir(folder) as entries:
+        return list(entries)
+
+
+def _is_folder(entry: os.DirEntry[str]) -> bool:
+    return is_folder(Path(entry)) if entry.is_symlink() else entry.is_dir()
 
 
 def file_within(folder: Path, name: str) -> Path:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.estimate import Estimate, StageFigure, StageReport
-from faintfield.pipelines.formats.files import file_within, sha256
+from faintfield.pipelines.formats.files import file_within, folders_in, sha256
 from faintfield.pipelines.formats.provenance import Provenance
 from faintfield.pipelines.formats.reading import read_content
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_PAGE, GeometryRecord, LensRecord, read_geometry
@@ -218,7 +218,7 @@ type GeometrySection = Section[GeometryRecord]
 
 def find_calibration(directory: Path, name: str) -> Path | None:
     """Return a calibration's file: in the folder, else in one of the two above it, else in a folder within it."""
-    folders = [directory, *list(directory.resolve().parents)[:2], *sorted(p for p in directory.glob("*") if p.is_dir())]
+    folders = [directory, *list(directory.resolve().parents)[:2], *folders_in(directory)]
     return next((folder / name for folder in folders if (folder / name).is_file()), None)
 
 

@@ -154,15 +154,7 @@ def propose(
     regions = [regions_of(*of_plane) for of_plane in zip(operator.planes_of(samples), evidences, strict=True)]
     totals: list[list[Scores]] = [[] for _ in evidences]
     for number in range(max(_MIN_FOLDS, folds_to_predict(problem))):
-        fold = Fold(problem, Penalty(), number)
-        planes = fold.solve(penalty_weight, samples, problem.dual()).plane
-        known = evidence_of_planes(operator, problem.images, planes, fold.training, other_colours=other_colours)
-        truths = evidence_of_planes(operator, problem.images, planes, fold.validation)
-        made = [list(candidates(evidence).values()) for evidence in known]
-        found = [
-            [scores(pictures, truth.picture, truth.coverage * share) for share in shares.values()]
-            for pictures, truth, shares in zip(made, truths, regions, strict=True)
-        ]
+        found = _fold_scores(problem, samples, penalty_weight, number, candidates, regions, other_colours)
         totals = [
             [a + b for a, b in zip(total, more, strict=True)] if total else more
             for total, more in zip(totals, found, strict=True)
@@ -186,6 +178,29 @@ def regions_of(plane: Image, evidence: Evidence) -> Regions:
         "dark, detail": (1 - lit) * detail,
         "dark, smooth": (1 - lit) * (1 - detail),
     }
+
+
+def _fold_scores(
+    problem: SceneProblem,
+    samples: Image,
+    penalty_weight: float,
+    number: int,
+    candidates: Candidates,
+    regions: list[Regions],
+    other_colours: Image | None,
+) -> list[list[Scores]]:
+    """Return the scores of each plane's candidates from the training views of a fold, by region."""
+    operator, fold = problem.operator, Fold(problem, Penalty(), number)
+    planes = fold.solve(penalty_weight, samples, problem.dual()).plane
+    training, validation = fold.training, fold.validation
+    del fold  # which holds as much as the candidates take
+    known = evidence_of_planes(operator, problem.images, planes, training, other_colours=other_colours)
+    made = [list(candidates(evidence).values()) for evidence in known]
+    truths = evidence_of_planes(operator, problem.images, planes, validation)
+    return [
+        [scores(pictures, truth.picture, truth.coverage * share) for share in shares.values()]
+        for pictures, truth, shares in zip(made, truths, regions, strict=True)
+    ]
 
 
 def _proposal(

@@ -79,8 +79,8 @@ def calls_on(bench: Bench, name: str, kind: str, words: str) -> list[int]:
 @pytest.mark.parametrize("error", ["EACCES", "EIO"])
 @pytest.mark.parametrize(
     ("kind", "words"),
-    [("open", "/.parts/"), ("status", "/noise_reference.tiff")],
-    ids=["a colour that was just written", "a frame that a set may lack"],
+    [("open", "/.parts/"), ("status", "/noise_reference.tiff"), ("list", "/out")],
+    ids=["a colour that was just written", "a frame that a set may lack", "a folder of results"],
 )
 def test_unreadable_file_is_not_taken_for_absent(bench: Bench, kind: str, words: str, error: str) -> None:
     for nth in calls_on(bench, "reconstruct", kind, words):
