@@ -1,7 +1,6 @@
 """The samples of planes, and the operator H of a plane or of several, from the poses, lens and response of a set."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +14,7 @@ from faintfield.recon.likelihood.images import ElementalImages, Image, binned
 from faintfield.recon.operator.geometry import DetectorMaps
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.occlusion import Occluders
-from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.operator.plane_operator import OperatorOptions, PlaneOperator
 from faintfield.recon.operator.scene_operator import SceneOperator
 from faintfield.recon.operator.surface_operator import SurfaceOperator
 
@@ -129,7 +128,7 @@ class OperatorFactory:
         self._poses, self._principal_shift = elemental_set.poses_rt_cam_ref, principal_shift(elemental_set)
         self._shared = self._of_views(len(self._poses), None if images is None else images.valid)
 
-    def _of_views(self, count: int, valid: NDArray[np.bool_] | None) -> dict[str, Any]:
+    def _of_views(self, count: int, valid: NDArray[np.bool_] | None) -> OperatorOptions:
         return {"valid": valid, "lattice_of_view": np.tile(np.arange(self._phases), count)}
 
     def at(
