@@ -9,7 +9,7 @@ from scipy import stats
 
 from faintfield.calib.estimate import SeriesGoodness
 from faintfield.calib.noise.flats import Saturation
-from faintfield.calib.noise.likelihood.gaussian import NoiseFit, level_variances_dn2
+from faintfield.calib.noise.likelihood.gaussian_fit import NoiseFit, level_variances_dn2
 from faintfield.calib.noise.likelihood.moments import Moments
 from faintfield.calib.noise.likelihood.response import UNKNOWN_BEND_SE, charge_dn, charge_slope
 from faintfield.calib.noise.scatter import flat_variances_of_nodes, light_signal

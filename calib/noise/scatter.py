@@ -12,7 +12,7 @@ from dataclasses import astuple, replace
 import numpy as np
 from scipy import stats
 
-from faintfield.calib.noise.likelihood.gaussian import (
+from faintfield.calib.noise.likelihood.gaussian_fit import (
     GaussianProblem,
     NoiseFit,
     dark_variances_dn2,

@@ -11,7 +11,7 @@ from enum import StrEnum
 import numpy as np
 
 from faintfield.calib.noise.likelihood.exact import censored_start, fit_exact, gaussian_start
-from faintfield.calib.noise.likelihood.gaussian import NoiseFit, dark_variances_dn2, flat_variances_dn2
+from faintfield.calib.noise.likelihood.gaussian_fit import NoiseFit, dark_variances_dn2, flat_variances_dn2
 from faintfield.calib.noise.likelihood.marginal import Counts
 from faintfield.calib.noise.likelihood.moments import Moments, gather_moments
 from faintfield.calib.noise.likelihood.response import MEASURED_BEND_SE, UNKNOWN_BEND_SE, choose_bends

@@ -8,7 +8,7 @@ from scipy import stats
 from scipy.optimize import minimize_scalar
 
 from faintfield.calib.estimate import Estimate, interval
-from faintfield.calib.noise.likelihood.gaussian import NoiseFit
+from faintfield.calib.noise.likelihood.gaussian_fit import NoiseFit
 from faintfield.calib.noise.likelihood.moments import Moments
 from faintfield.calib.noise.series import Series
 from faintfield.calib.noise.strips import Array

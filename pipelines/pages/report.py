@@ -34,7 +34,7 @@ from faintfield.pipelines.pages.report_pictures import plane_sections
 from faintfield.pipelines.pages.report_planes import error_sections, method_title, read_planes
 from faintfield.pipelines.pages.report_sets import SetSection, set_sections
 from faintfield.pipelines.pages.report_surface import depth_sections, surface_sections
-from faintfield.pipelines.pages.report_viewer import viewer_of
+from faintfield.pipelines.pages.viewer_data import viewer_of
 
 
 class Fact(NamedTuple):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines import pages
 from faintfield.pipelines.pages.page import smaller_uri
-from faintfield.pipelines.pages.report_viewer import pack
+from faintfield.pipelines.pages.viewer_data import pack
 from tests.end_to_end.browser import Tab, decoded
 
 FOLDERS = {"back-projection": "backprojection", "PMLEM (one-step-late, TV)": "pmlem-osl"}

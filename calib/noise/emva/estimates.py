@@ -12,7 +12,7 @@ from scipy import stats
 from faintfield.calib.estimate import NORMAL_QUANTILE, Estimate, interval, root
 from faintfield.calib.noise.emva.nonuniformity import nonuniformity, temporal_noise
 from faintfield.calib.noise.flats import Saturation
-from faintfield.calib.noise.likelihood.gaussian import (
+from faintfield.calib.noise.likelihood.gaussian_fit import (
     NoiseFit,
     flat_variances_dn2,
     level_variances_dn2,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from faintfield.calib.errors import NotIdentifiable, PoorFit
-from faintfield.calib.noise.likelihood.gaussian import Bend, NoiseFit, flat_log_likelihood
+from faintfield.calib.noise.likelihood.gaussian_fit import Bend, NoiseFit, flat_log_likelihood
 from faintfield.calib.noise.likelihood.marginal import PARAMETERS, Counts, MarginalLikelihood
 from faintfield.calib.noise.likelihood.moments import Moments
 from faintfield.calib.noise.strips import Array, Mask

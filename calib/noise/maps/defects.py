@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from faintfield.calib.noise.maps.read_noise import PixelReadNoise
+from faintfield.calib.noise.maps.read_noise_map import PixelReadNoise
 from faintfield.calib.noise.series import Series, robust_sigma
 from faintfield.calib.noise.strips import Array, Map, Mask, map_of
 

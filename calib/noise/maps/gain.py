@@ -18,7 +18,7 @@ import numpy as np
 from faintfield.calib.noise.likelihood.response import charge_dn, charge_slope
 from faintfield.calib.noise.likelihood.rounding import ROUNDING_DN2
 from faintfield.calib.noise.maps.photo_response import Response
-from faintfield.calib.noise.maps.read_noise import kept_of
+from faintfield.calib.noise.maps.read_noise_map import kept_of
 from faintfield.calib.noise.maps.seams import Seam, find_seams, share_of_seam
 from faintfield.calib.noise.series import Series
 from faintfield.calib.noise.strips import Array, Map, Mask, map_of, maps_of, mean_over, total_of, variance_over

@@ -18,7 +18,7 @@ from faintfield.calib.noise.likelihood.response import charge_dn, charge_slope
 from faintfield.calib.noise.maps.defects import noisy_pixels, telegraph_pixels, variance_ratio
 from faintfield.calib.noise.maps.gain import PixelGain, gain_of_regions, measure_gain, photon_transfer
 from faintfield.calib.noise.maps.photo_response import Response, measure_response
-from faintfield.calib.noise.maps.read_noise import PixelReadNoise, measure_read_noise
+from faintfield.calib.noise.maps.read_noise_map import PixelReadNoise, measure_read_noise
 from faintfield.calib.noise.maps.seams import Seam, find_seams
 from faintfield.calib.noise.series import Series
 from faintfield.calib.noise.series_fit import NoiseLikelihood, SeriesFit

@@ -22,7 +22,7 @@ from faintfield.pipelines.formats.sets.elemental_file import Noise, View
 from faintfield.pipelines.formats.units import LightUnit
 
 if TYPE_CHECKING:
-    from faintfield.calib.noise.views import ViewNoise
+    from faintfield.calib.noise.noise_from_views import ViewNoise
 
 type Tone = Literal["linear", "srgb"]
 
@@ -201,7 +201,7 @@ def _assumed(options: GridOptions, tone: Tone) -> tuple[float, float]:
 
 
 def _estimate_noise(options: GridOptions, pictures: Pictures) -> "ViewNoise":
-    from faintfield.calib.noise.views import compared_blocks, estimate_view_noise  # loads much that is used here only
+    from faintfield.calib.noise.noise_from_views import compared_blocks, estimate_view_noise  # loads much that is used here only
 
     first, saturation_dn = pictures.first, pictures.saturation_dn
     generator = np.random.default_rng(1)

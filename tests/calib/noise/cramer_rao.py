@@ -1,6 +1,6 @@
 """The Cramér–Rao bound: the smallest errors with which an unbiased method can measure a sensor from given frames.
 
-The log-likelihood of `calib.noise.likelihood.gaussian` is linear in the sufficient statistics: its Hessian at their
+The log-likelihood of `calib.noise.likelihood.gaussian_fit` is linear in the sufficient statistics: its Hessian at their
 expected values is exactly the Fisher information. Nothing is sampled.
 """
 
@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.calib.noise.likelihood.gaussian import main_quantities, negative_log_likelihood
+from faintfield.calib.noise.likelihood.gaussian_fit import main_quantities, negative_log_likelihood
 from faintfield.calib.noise.likelihood.moments import Moments, SeriesMoments
 from faintfield.calib.noise.likelihood.rounding import ROUNDING_DN2
 

@@ -12,7 +12,7 @@ from faintfield.calib.noise.likelihood.response import quantum_efficiency
 from faintfield.calib.noise.maps.defects import outlying_pixels
 from faintfield.calib.noise.maps.measure import LinePattern, line_pattern, pixel_levels
 from faintfield.calib.noise.maps.photo_response import Response, _kept_share, measure_response, running_mean
-from faintfield.calib.noise.maps.read_noise import PixelReadNoise, kept_of, measure_read_noise
+from faintfield.calib.noise.maps.read_noise_map import PixelReadNoise, kept_of, measure_read_noise
 from faintfield.calib.noise.maps.seams import find_seams, share_of_seam
 from tests.calib.noise import darkroom
 from tests.calib.noise.darkroom import darks, specimen, with_flats

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from faintfield.calib.estimate import Estimate
 from faintfield.calib.noise import Conditions, Series, calibrate, measure_series
-from faintfield.calib.noise.likelihood.gaussian import NoiseFit
+from faintfield.calib.noise.likelihood.gaussian_fit import NoiseFit
 from faintfield.calib.noise.likelihood.moments import gather_moments
 from faintfield.calib.noise.likelihood.response import Light
 from faintfield.calib.noise.scatter import trend_dn2, without_odd

@@ -9,7 +9,7 @@ from scipy import stats
 
 from faintfield.calib.noise import calibrate
 from faintfield.calib.noise.likelihood.exact import _flat_part, _in_gaussian_terms
-from faintfield.calib.noise.likelihood.gaussian import Bend, NoiseFit
+from faintfield.calib.noise.likelihood.gaussian_fit import Bend, NoiseFit
 from faintfield.calib.noise.likelihood.marginal import (
     DARK_LOG_WEIGHTS,
     DARK_NODES,

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from faintfield.calib.noise import Series, calibrate
-from faintfield.calib.noise.likelihood.gaussian import (
+from faintfield.calib.noise.likelihood.gaussian_fit import (
     GaussianProblem,
     NoiseFit,
     main_quantities,

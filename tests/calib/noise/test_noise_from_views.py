@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from faintfield.calib.errors import NotIdentifiable
-from faintfield.calib.noise.views import ViewBlocks, ViewNoise, compared_blocks, estimate_view_noise
+from faintfield.calib.noise.noise_from_views import ViewBlocks, ViewNoise, compared_blocks, estimate_view_noise
 
 type Array = NDArray[np.float64]
 

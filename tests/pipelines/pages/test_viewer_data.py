@@ -16,7 +16,7 @@ from faintfield.pipelines.formats.image_files import Spacing, write_plane
 from faintfield.pipelines.formats.results.records import Method, PlaneRecord
 from faintfield.pipelines.pages.report_pictures import PlaneSections
 from faintfield.pipelines.pages.report_planes import Plane
-from faintfield.pipelines.pages.report_viewer import UNKNOWN_LEVEL, Fineness, Packed, ViewerPicture, pack, viewer_of
+from faintfield.pipelines.pages.viewer_data import UNKNOWN_LEVEL, Fineness, Packed, ViewerPicture, pack, viewer_of
 from tests.pipelines.conftest import run_undrawn
 from tests.pipelines.forms import read_record
 
