@@ -201,7 +201,8 @@ def _assumed(options: GridOptions, tone: Tone) -> tuple[float, float]:
 
 
 def _estimate_noise(options: GridOptions, pictures: Pictures) -> "ViewNoise":
-    from faintfield.calib.noise.noise_from_views import compared_blocks, estimate_view_noise  # loads much that is used here only
+    # Loads much that is used here only.
+    from faintfield.calib.noise.noise_from_views import compared_blocks, estimate_view_noise
 
     first, saturation_dn = pictures.first, pictures.saturation_dn
     generator = np.random.default_rng(1)
