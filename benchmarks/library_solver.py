@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.recon.likelihood.images import ElementalImages, Image
-from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.operator.single_plane import PlaneOperator
 
 _NORM_OF_GRADIENT = 8**0.5
 _STEPS = 4000

@@ -13,7 +13,7 @@ import numpy as np
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.metrics import mean_square_error, signal_scale_for_snr
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.operator.single_plane import PlaneOperator
 from faintfield.recon.solver.data_fit import DataFit
 from faintfield.recon.solver.initialization import smooth_start, universal_penalty_weight
 from faintfield.recon.solver.penalties import Penalty, PenaltyName

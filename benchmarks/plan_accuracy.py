@@ -24,7 +24,7 @@ from faintfield.calib.noise_model import NoiseModel
 from faintfield.recon.likelihood.images import ElementalImages, Image, select_likelihood
 from faintfield.recon.metrics import signal_scale_for_snr
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.operator.single_plane import PlaneOperator
 from faintfield.recon.prediction import depth_sigma_mm, information_of_views, sample_sigma_e, smallest_contrast
 from faintfield.recon.solver.data_fit import DataFit
 from faintfield.recon.solver.initialization import back_projection, smooth_start

@@ -11,8 +11,8 @@ from faintfield.calib.lens import Lens
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.occlusion import Occluders
-from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.operator.scene_operator import SceneOperator
+from faintfield.recon.operator.single_plane import PlaneOperator
 from faintfield.rig.plan import nominal_poses_rt_cam_ref
 
 DEPTH_MM = 500.0

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from benchmarks.library_solver import LibraryProblem, installed_solvers, iterates_of
 from benchmarks.problem import BenchmarkProblem
 from faintfield.recon.likelihood.images import ElementalImages, Image
-from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.operator.single_plane import PlaneOperator
 from faintfield.recon.solver.data_fit import DataFit
 from faintfield.recon.solver.initialization import smooth_start, universal_penalty_weight
 from faintfield.recon.solver.one_step_late import pmlem_one_step_late

@@ -26,7 +26,7 @@ from faintfield.pipelines.reconstruction.planes.solve import solve
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.metrics import signal_scale_for_snr
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.operator.single_plane import PlaneOperator
 from faintfield.recon.solver.initialization import well_seen_samples
 from faintfield.rig.simulation.experiment import paper_experiment
 from faintfield.rig.simulation.scene import TexturedPlane, render

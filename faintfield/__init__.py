@@ -22,7 +22,7 @@ _MODULES = {
     "MotionLimits": "rig.stages.protocol",
     "OutsideTravel": "rig.errors",
     "PlaneGrid": "recon.operator.grid",
-    "PlaneOperator": "recon.operator.plane_operator",
+    "PlaneOperator": "recon.operator.single_plane",
     "Point": "rig.stages.protocol",
     "ReconstructionError": "recon.errors",
     "RigError": "rig.errors",
@@ -75,7 +75,7 @@ if TYPE_CHECKING:  # type checkers and editors read these lines; a test compares
     from faintfield.recon.errors import ReconstructionError as ReconstructionError
     from faintfield.recon.likelihood.images import ElementalImages as ElementalImages
     from faintfield.recon.operator.grid import PlaneGrid as PlaneGrid
-    from faintfield.recon.operator.plane_operator import PlaneOperator as PlaneOperator
+    from faintfield.recon.operator.single_plane import PlaneOperator as PlaneOperator
     from faintfield.recon.solver.data_fit import DataFit as DataFit
     from faintfield.recon.solver.initialization import back_projection as back_projection
     from faintfield.recon.solver.initialization import smooth_start as smooth_start

@@ -14,7 +14,7 @@ def compile_kernels(*dtypes: str) -> None:
     import numpy as np  # here, because importing the package should cost nothing
 
     from faintfield.recon.operator.grid import PlaneGrid
-    from faintfield.recon.operator.plane_operator import PlaneOperator
+    from faintfield.recon.operator.single_plane import PlaneOperator
     from faintfield.recon.operator.surface_operator import SurfaceOperator
     from faintfield.recon.prior.collaborative import collaborative_wiener
     from faintfield.recon.prior.evidence import Noise

@@ -13,7 +13,7 @@ from faintfield.pipelines.reconstruction.planes.solve import solve
 from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.metrics import signal_scale_for_snr
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.operator.single_plane import PlaneOperator
 from faintfield.recon.prior.collaborative import Patches, collaborative_wiener, wiener_and_thresholded
 from faintfield.recon.prior.evidence import noise_of_back_projection
 from faintfield.recon.solver.initialization import back_projection, smooth_start, universal_penalty_weight

@@ -10,7 +10,7 @@ from scipy.signal import fftconvolve
 
 from faintfield.calib.errors import CopiedFrame, NotIdentifiable, TooFewFrames
 from faintfield.calib.estimate import Estimate, SeriesGoodness
-from faintfield.calib.noise.emva.estimates import estimate_all
+from faintfield.calib.noise.emva.conversion import estimate_all
 from faintfield.calib.noise.flats import Saturation, check_flat_levels, find_saturation
 from faintfield.calib.noise.likelihood.marginal import Counts, mass_function
 from faintfield.calib.noise.maps.defects import hot_pixels, outlying_pixels, variance_ratio
@@ -25,8 +25,8 @@ from faintfield.calib.noise.misfit import (
     series_goodness,
     transfer_points,
 )
+from faintfield.calib.noise.sensor_fit import MAX_TABLE_WIDTH_DN, NoiseLikelihood, SeriesFit, collect_counts, fit_series
 from faintfield.calib.noise.series import Series
-from faintfield.calib.noise.series_fit import MAX_TABLE_WIDTH_DN, NoiseLikelihood, SeriesFit, collect_counts, fit_series
 from faintfield.calib.noise.strips import Array, Mask
 from faintfield.calib.noise.temperature import settle_temperature, with_doubling_error
 from faintfield.calib.noise_model import BentResponse, Map, NoiseModel

@@ -13,8 +13,8 @@ from faintfield.calib.noise.likelihood.gaussian_fit import NoiseFit, level_varia
 from faintfield.calib.noise.likelihood.moments import Moments
 from faintfield.calib.noise.likelihood.response import UNKNOWN_BEND_SE, charge_dn, charge_slope
 from faintfield.calib.noise.scatter import flat_variances_of_nodes, light_signal
+from faintfield.calib.noise.sensor_fit import NoiseLikelihood, SeriesFit
 from faintfield.calib.noise.series import Series
-from faintfield.calib.noise.series_fit import NoiseLikelihood, SeriesFit
 from faintfield.calib.noise.strips import Array
 
 # The series contradict the model if a departure has at most this probability, or exceeds this many standard errors, and

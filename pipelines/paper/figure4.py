@@ -25,7 +25,7 @@ from faintfield.pipelines.reconstruction.planes.solve import solve
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.metrics import mean_square_error, signal_scale_for_snr
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.operator.single_plane import PlaneOperator
 from faintfield.recon.solver.initialization import back_projection
 from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
 from faintfield.rig.simulation.objects import sailing_boat, shaded_ball, toy_airplane, toy_truck

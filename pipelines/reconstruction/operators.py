@@ -14,8 +14,8 @@ from faintfield.recon.likelihood.images import ElementalImages, Image, binned
 from faintfield.recon.operator.geometry import DetectorMaps
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.occlusion import Occluders
-from faintfield.recon.operator.plane_operator import OperatorOptions, PlaneOperator
 from faintfield.recon.operator.scene_operator import SceneOperator
+from faintfield.recon.operator.single_plane import OperatorOptions, PlaneOperator
 from faintfield.recon.operator.surface_operator import SurfaceOperator
 
 # Limit of the samples of a plane: one seen at a grazing angle would have most of its samples far away.

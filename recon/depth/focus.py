@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from faintfield.recon.depth.agreement import Agreement, DepthEstimate
 from faintfield.recon.likelihood.images import ElementalImages, Image, blurred
-from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.operator.scene_operator import SceneOperator
+from faintfield.recon.operator.single_plane import PlaneOperator
 from faintfield.recon.solver.initialization import back_projection
 
 # Spacings of the blurs, of standard deviations 1 and 4 samples, that limit the detail: finer is noise, coarser is blur.

@@ -28,7 +28,7 @@ class SceneOperator:
     all four samples around its point exist; otherwise its weights on that plane are zero.
 
     *Samples* are an array of the shape `samples_shape`: those of all planes, one after the other. Methods that take
-    `views` use all views by default. `recon.operator.plane_operator.PlaneOperator` is the scene of one plane.
+    `views` use all views by default. `recon.operator.single_plane.PlaneOperator` is the scene of one plane.
 
     Parameters
     ----------

@@ -9,8 +9,8 @@ from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.operator.geometry import DetectorMaps, check_lattices
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.placement import UNSEEN
-from faintfield.recon.operator.plane_operator import OperatorOptions, PlaneOperator
 from faintfield.recon.operator.relief import draw_relief
+from faintfield.recon.operator.single_plane import OperatorOptions, PlaneOperator
 
 
 def homographies_of_surface(ray_from_surface: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

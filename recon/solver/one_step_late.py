@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from faintfield.recon.errors import NotConverged
 from faintfield.recon.likelihood.images import ElementalImages, Image
-from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.operator.single_plane import PlaneOperator
 from faintfield.recon.solver.initialization import well_seen_samples
 from faintfield.recon.solver.penalties import total_variation_gradient
 

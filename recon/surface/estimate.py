@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from faintfield.recon.errors import NothingInFocus
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.numba_tools import compiled
-from faintfield.recon.solver.cross_validation import MIN_VIEWS, validation_views
+from faintfield.recon.solver.penalty_weight import MIN_VIEWS, validation_views
 from faintfield.recon.surface.confidence import confidence
 from faintfield.recon.surface.edges import moved_edges
 from faintfield.recon.surface.evidence import DepthEvidence, Explained, Halves

@@ -11,8 +11,8 @@ from contextlib import suppress
 from operator import truediv
 
 from faintfield.rig.errors import StageError, StageTimeout, WrongFirmware
-from faintfield.rig.stages import grbl_failures as failures
-from faintfield.rig.stages import grbl_messages as grbl
+from faintfield.rig.stages import grbl_alarms as failures
+from faintfield.rig.stages import grbl_lines as grbl
 from faintfield.rig.stages.motion import timeout_s
 from faintfield.rig.stages.protocol import AnswerTime, AxisIndex, Identity, Point
 from faintfield.rig.stages.transport import LineTransport, Ok, motion_words, read_twice, restart_failure

@@ -9,7 +9,7 @@ from contextlib import suppress
 from itertools import count
 
 from faintfield.rig.errors import StageAlarm, StageLost, StageRejected, StageTimeout, WrongFirmware
-from faintfield.rig.stages import marlin_messages as marlin
+from faintfield.rig.stages import marlin_lines as marlin
 from faintfield.rig.stages.motion import timeout_s
 from faintfield.rig.stages.protocol import AnswerTime, AxisIndex, Box, Identity, Point
 from faintfield.rig.stages.transport import LineTransport, Ok, motion_words, read_twice, restart_failure

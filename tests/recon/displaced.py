@@ -7,8 +7,8 @@ import numpy as np
 
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.operator.scene_operator import SceneOperator
+from faintfield.recon.operator.single_plane import PlaneOperator
 from faintfield.recon.solver.pmlem import PmlemIterate
 
 SHAPE = (96, 112)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from faintfield.calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray
 from faintfield.calib.lens import Lens
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.operator.single_plane import PlaneOperator
 
 DISTORTIONS: list[tuple[float, ...]] = [
     (),

@@ -5,8 +5,8 @@ import pytest
 from numpy.typing import NDArray
 
 from faintfield.recon.likelihood.images import ElementalImages, Image
-from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.operator.scene_operator import SceneOperator
+from faintfield.recon.operator.single_plane import PlaneOperator
 
 # Numbers are of order one and sums have a few hundred terms
 _ROUNDING = 1e-12

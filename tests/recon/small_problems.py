@@ -15,8 +15,8 @@ from scipy.special import gammaln
 from faintfield.recon.likelihood.images import ElementalImages, Image, LikelihoodName, PixelLikelihood
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.occlusion import Occluders
-from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.operator.scene_operator import SceneOperator
+from faintfield.recon.operator.single_plane import PlaneOperator
 from faintfield.recon.solver.data_fit import SceneProblem
 from tests.recon.displaced import pixel_rays, views_displaced_by
 

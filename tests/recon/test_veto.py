@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.metrics import signal_scale_for_snr
-from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.operator.single_plane import PlaneOperator
 from faintfield.recon.prior.evidence import evidence_of_planes
-from faintfield.recon.solver.cross_validation import cross_validated_weight
 from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.solver.initialization import mean_light_e, universal_penalty_weight
 from faintfield.recon.solver.penalties import Penalty
+from faintfield.recon.solver.penalty_weight import cross_validated_weight
 from faintfield.recon.solver.pmlem import pmlem
 from tests.recon.displaced import noisy_images, run_until, views_displaced_by
 

@@ -20,8 +20,8 @@ from faintfield.calib.noise.maps.gain import PixelGain, gain_of_regions, measure
 from faintfield.calib.noise.maps.photo_response import Response, measure_response
 from faintfield.calib.noise.maps.read_noise_map import PixelReadNoise, measure_read_noise
 from faintfield.calib.noise.maps.seams import Seam, find_seams
+from faintfield.calib.noise.sensor_fit import NoiseLikelihood, SeriesFit
 from faintfield.calib.noise.series import Series
-from faintfield.calib.noise.series_fit import NoiseLikelihood, SeriesFit
 from faintfield.calib.noise.strips import Array, Map, Mask, map_of, maps_of, mean_over, new_map, total_of
 
 # A step of the offsets is named from this fraction of the read noise, telegraph pixels from this share of all.

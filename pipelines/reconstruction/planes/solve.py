@@ -20,7 +20,7 @@ from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages, select_likelihood
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.occlusion import opacity
-from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.operator.single_plane import PlaneOperator
 from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.solver.initialization import (
     back_projection,

@@ -33,7 +33,7 @@ from faintfield.recon.depth.focus import FocusMeasure, focus_measure, sharp_dept
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.operator.single_plane import PlaneOperator
 
 # Does the tasks of a set in any order, with a folder for temporary files; yields each when saved, with its messages.
 type Runner = Callable[[ElementalSet, Path, Sequence[PlaneTask]], Generator[tuple[PlaneTask, list[str]]]]

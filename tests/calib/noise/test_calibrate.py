@@ -7,7 +7,7 @@ import pytest
 
 from faintfield.calib.errors import CalibrationError, CopiedFrame, NotIdentifiable, TooFewFrames
 from faintfield.calib.noise import Conditions, NoiseCalibration, calibrate, measure_series
-from faintfield.calib.noise.series_fit import NoiseLikelihood
+from faintfield.calib.noise.sensor_fit import NoiseLikelihood
 from tests.calib.noise.darkroom import EXPOSURES_S, dark_series, darks, expose, flat_series, specimen, with_flats
 
 IN_ELECTRONS = ("gain_dn_per_e", "read_noise_e", "dark_current_e_per_s", "dsnu_e", "dcnu_e_per_s")

@@ -14,7 +14,7 @@ from faintfield.recon.depth.focus import (
     sharp_depths_mm,
 )
 from faintfield.recon.likelihood.images import ElementalImages
-from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.operator.single_plane import PlaneOperator
 from faintfield.recon.solver.initialization import back_projection
 from tests.recon.displaced import views_displaced_by
 

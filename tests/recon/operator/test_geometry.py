@@ -12,7 +12,7 @@ from faintfield.calib.lens import Lens
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.operator.geometry import DetectorMaps, scene_geometry, window_geometry
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.operator.single_plane import PlaneOperator
 from faintfield.recon.operator.surface_operator import SurfaceOperator
 from tests.recon.displaced import pixel_rays
 from tests.recon.operator_cases import FACING_AT_500_MM, Case, cases

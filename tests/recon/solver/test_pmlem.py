@@ -11,7 +11,7 @@ import pytest
 from faintfield.recon.errors import NotConverged
 from faintfield.recon.likelihood.images import ElementalImages, Image, LikelihoodName, PixelLikelihood
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.operator.single_plane import PlaneOperator
 from faintfield.recon.solver.data_fit import DataFit
 from faintfield.recon.solver.initialization import smooth_start
 from faintfield.recon.solver.penalties import Penalty, differences

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from faintfield.calib.homography import plane_from_ray
 from faintfield.calib.lens import Lens
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.operator.single_plane import PlaneOperator
 from faintfield.rig.simulation.optics import SimulatedOptics
 from faintfield.rig.simulation.scene import RenderedView, TexturedPlane, render
 

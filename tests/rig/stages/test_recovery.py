@@ -10,8 +10,8 @@ from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.grblhal import SimulatedGrblHal
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.stages.gantry import Gantry
-from faintfield.rig.stages.grbl_failures import alarm_failure, error_failure, state_failure
-from faintfield.rig.stages.grbl_messages import Report
+from faintfield.rig.stages.grbl_alarms import alarm_failure, error_failure, state_failure
+from faintfield.rig.stages.grbl_lines import Report
 from faintfield.rig.stages.protocol import Point
 from tests.faults.stage_faults import lose_steps, restart_unseen, stick
 from tests.rig.stages.benches import Controller, Traffic, diagonal, firmware, homed

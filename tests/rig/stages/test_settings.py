@@ -3,8 +3,8 @@
 import pytest
 
 from faintfield.rig.errors import WrongFirmware
-from faintfield.rig.stages import marlin_messages as marlin
-from faintfield.rig.stages.grbl_messages import GrblSettings
+from faintfield.rig.stages import marlin_lines as marlin
+from faintfield.rig.stages.grbl_lines import GrblSettings
 from faintfield.rig.stages.protocol import Box, Identity, MotionLimits
 
 GRBL = {

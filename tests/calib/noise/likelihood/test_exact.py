@@ -19,7 +19,7 @@ from faintfield.calib.noise.likelihood.marginal import (
     mass_function,
 )
 from faintfield.calib.noise.likelihood.moments import Moments, SeriesMoments
-from faintfield.calib.noise.series_fit import NoiseLikelihood
+from faintfield.calib.noise.sensor_fit import NoiseLikelihood
 from tests.calib.noise.darkroom import EXPOSURES_S, TRUTH, dark_series, expose, specimen
 from tests.calib.noise.likelihood.slopes import slopes
 

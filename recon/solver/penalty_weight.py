@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import Image
-from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.operator.single_plane import PlaneOperator
 from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.solver.initialization import mean_light_e
 from faintfield.recon.solver.penalties import Penalty

@@ -1,7 +1,7 @@
 """Explain alarms, errors and states of GRBL and grblHAL: meaning, remedy, and whether the position is kept."""
 
 from faintfield.rig.errors import StageAlarm, StageRejected
-from faintfield.rig.stages.grbl_messages import Report
+from faintfield.rig.stages.grbl_lines import Report
 
 # The only alarm that keeps the position; that of a grblHAL which has started and must be homed.
 SOFT_LIMIT_ALARM, HOMING_REQUIRED_ALARM = 2, 11

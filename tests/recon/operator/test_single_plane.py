@@ -15,7 +15,7 @@ from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.placement import EDGE_TOLERANCE
-from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.operator.single_plane import PlaneOperator
 from tests.recon.operator_cases import FACING_AT_500_MM, Case, cases
 from tests.recon.operator_contract import check_linear_operator, dense_matrix
 

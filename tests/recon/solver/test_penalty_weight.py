@@ -5,11 +5,11 @@ import pytest
 from numpy.typing import NDArray
 
 from faintfield.recon.likelihood.images import ElementalImages, Image, PixelLikelihood
-from faintfield.recon.solver import cross_validation
-from faintfield.recon.solver.cross_validation import cross_validated_weight, validation_views
+from faintfield.recon.solver import penalty_weight
 from faintfield.recon.solver.data_fit import DataFit, SceneProblem
 from faintfield.recon.solver.initialization import smooth_start, universal_penalty_weight
 from faintfield.recon.solver.penalties import Penalty
+from faintfield.recon.solver.penalty_weight import cross_validated_weight, validation_views
 from faintfield.recon.solver.pmlem import pmlem
 from tests.recon.displaced import dark_views, pieces, run_until, views_displaced_by
 
@@ -62,8 +62,8 @@ def test_windows_choose_nearly_the_weight_of_whole(monkeypatch: pytest.MonkeyPat
     problem = SceneProblem(operator, images)
     guess = universal_penalty_weight(operator, images, smooth_start(operator, images))
     whole = cross_validated_weight(problem, guess, Penalty())
-    monkeypatch.setattr(cross_validation, "SIDE", 32)
-    monkeypatch.setattr(cross_validation, "_MIN_SAMPLES", 4_096)
+    monkeypatch.setattr(penalty_weight, "SIDE", 32)
+    monkeypatch.setattr(penalty_weight, "_MIN_SAMPLES", 4_096)
     parts = cross_validated_weight(problem, guess, Penalty(), level_e=float(truth.mean()))
     assert whole.solution is not None
     assert parts.solution is None
@@ -125,15 +125,15 @@ def problem_of(shape: tuple[int, int], right: NDArray[np.float64] = FEW_SAMPLES)
 
 @pytest.fixture
 def small_windows(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cross_validation, "SIDE", 8)
-    monkeypatch.setattr(cross_validation, "_MIN_SAMPLES", 8 * 8 * 6)
+    monkeypatch.setattr(penalty_weight, "SIDE", 8)
+    monkeypatch.setattr(penalty_weight, "_MIN_SAMPLES", 8 * 8 * 6)
 
 
 @pytest.mark.usefixtures("small_windows")
 def test_windows_are_spread_and_do_not_meet() -> None:
     problem = problem_of((64, 96))
     used = np.zeros((64, 96), int)
-    for window in cross_validation.windows_of(problem, 4):
+    for window in penalty_weight.windows_of(problem, 4):
         column, row = np.array(window.operator.grids[0].origin_mm).astype(int)
         assert window.operator.grids[0].shape == (8, 8)
         assert window.images is problem.images
@@ -150,7 +150,7 @@ def test_windows_are_spread_and_do_not_meet() -> None:
 @pytest.mark.usefixtures("small_windows")
 @pytest.mark.parametrize(("shape", "least"), [((64, 11), 0), ((19, 20), 0), ((2000, 16), 11), ((16, 2000), 11)])
 def test_only_large_planes_have_windows(shape: tuple[int, int], least: int) -> None:
-    count = len(cross_validation.windows_of(problem_of(shape), 4))
+    count = len(penalty_weight.windows_of(problem_of(shape), 4))
     assert count >= least
     assert (count == 0) == (least == 0)
 
@@ -159,7 +159,7 @@ def test_only_large_planes_have_windows(shape: tuple[int, int], least: int) -> N
 def test_windows_with_few_views_are_left_out() -> None:
     shifts = np.where(np.arange(9) < 6, 60.0, FEW_SAMPLES)  # six of nine views see only the right
     columns = [
-        window.operator.grids[0].origin_mm[0] for window in cross_validation.windows_of(problem_of((64, 96), shifts), 4)
+        window.operator.grids[0].origin_mm[0] for window in penalty_weight.windows_of(problem_of((64, 96), shifts), 4)
     ]
     assert columns
     assert min(columns) >= 60

@@ -22,7 +22,7 @@ from faintfield.calib.noise.likelihood.moments import Moments
 from faintfield.calib.noise.likelihood.response import charge_dn, fitted_linearity, quantum_efficiency
 from faintfield.calib.noise.maps.photo_response import Response
 from faintfield.calib.noise.misfit import series_goodness
-from faintfield.calib.noise.series_fit import NoiseLikelihood, SeriesFit
+from faintfield.calib.noise.sensor_fit import NoiseLikelihood, SeriesFit
 from faintfield.calib.noise.strips import Array, map_of
 
 # Largest relative standard error of the gain, without which no quantity in electrons has a value.

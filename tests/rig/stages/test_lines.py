@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from faintfield.rig.stages import grbl_messages as grbl
-from faintfield.rig.stages import marlin_messages as marlin
+from faintfield.rig.stages import grbl_lines as grbl
+from faintfield.rig.stages import marlin_lines as marlin
 from faintfield.rig.stages.transport import Ok, Unknown
 
 GRBL_LINES = [

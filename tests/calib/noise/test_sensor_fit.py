@@ -6,11 +6,11 @@ from scipy import stats
 
 from faintfield.calib.estimate import NORMAL_QUANTILE, interval, root
 from faintfield.calib.noise import Conditions, calibrate, measure_series
-from faintfield.calib.noise.emva.estimates import _in_electrons, _levels_quantile, _why_no_current, _why_no_gain
+from faintfield.calib.noise.emva.conversion import _in_electrons, _levels_quantile, _why_no_current, _why_no_gain
 from faintfield.calib.noise.likelihood.gaussian_fit import NoiseFit
 from faintfield.calib.noise.likelihood.marginal import Counts
 from faintfield.calib.noise.likelihood.moments import Moments, SeriesMoments
-from faintfield.calib.noise.series_fit import NoiseLikelihood, _shared_noise_dn2, choose_likelihood
+from faintfield.calib.noise.sensor_fit import NoiseLikelihood, _shared_noise_dn2, choose_likelihood
 from tests.calib.noise.darkroom import dark_series, darks, flat_series, specimen
 
 NAMES = ("offset_dn", "log_read_dn2", "dsnu_dn2", "jitter_dn2", "dark_signal_dn_per_s", "log_gain")
