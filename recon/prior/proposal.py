@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from faintfield.recon.likelihood.images import Image, blurred
 from faintfield.recon.operator.occlusion import opacity
 from faintfield.recon.prior.evidence import Evidence, evidence_of_planes
-from faintfield.recon.solver.cross_validation import Fold, folds_to_predict
 from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.solver.penalties import Penalty, differences
+from faintfield.recon.solver.penalty_weight import Fold, folds_to_predict
 from faintfield.recon.solver.proximal import DualField
 from faintfield.recon.solver.uncertainty import Answers, Expected, LocalProblem, UsualErrors, Weights
 
@@ -32,6 +32,10 @@ _DETAIL_SHARE, _CHANGE_BLUR, _DETAIL_BLUR = 0.15, (1, 1), (1, 1, 2)
 # What a plane has beyond its blurred self counts where its square exceeds this share of the noise's variance. Chosen on
 # the scenes of `CHOSEN_ON` in benchmarks/uncertainty.py; the blur of that square.
 _SHARP_SHARE, _SHARP_BLUR = 0.1, (1,)
+
+# The penalty weight about a proposal over that of total variation. With 1, the data bring back single bright samples of
+# noise where the proposal is right. Chosen on the scenes of `CHOSEN_ON` in benchmarks/uncertainty.py.
+WEIGHT_ABOUT_PROPOSAL = 1.2
 
 # Candidates of one plane by name, all as blurred as the evidence.
 type Candidates = Callable[[Evidence], dict[str, Image]]

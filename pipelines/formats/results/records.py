@@ -100,13 +100,15 @@ class PriorRecord(Struct, frozen=True, kw_only=True):
     """Proposal of a prior for a plane, and its change by the data.
 
     `mixture` has the weights of the candidates by region, with or without light and detail. `moved_sigma` is the root
-    mean square of plane less proposal, in standard deviations of the back-projection's noise. `no_network`
-    says why the trained network has no part in it, `left_out` why the plane is that of total variation instead.
+    mean square of plane less proposal, in standard deviations of the back-projection's noise, and `penalty_weight` the
+    weight of their differences. `no_network` says why the trained network has no part in it, `left_out` why the plane
+    is that of total variation instead.
     """
 
     name: str
     mixture: dict[str, dict[str, float]] | UnsetType = UNSET
     moved_sigma: float | UnsetType = UNSET
+    penalty_weight: float | UnsetType = UNSET
     no_network: str | UnsetType = UNSET
     left_out: str | UnsetType = UNSET
 

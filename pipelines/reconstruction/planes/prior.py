@@ -14,8 +14,15 @@ from faintfield.pipelines.reconstruction.planes.penalised import Objective, Solu
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.prior.collaborative import patch_candidates
 from faintfield.recon.prior.evidence import Evidence, evidence_of_planes, misfits
-from faintfield.recon.prior.proposal import Candidates, PlaneProposal, ProposalAnswers, propose, regions_of
-from faintfield.recon.solver.cross_validation import MIN_VIEWS
+from faintfield.recon.prior.proposal import (
+    WEIGHT_ABOUT_PROPOSAL,
+    Candidates,
+    PlaneProposal,
+    ProposalAnswers,
+    propose,
+    regions_of,
+)
+from faintfield.recon.solver.penalty_weight import MIN_VIEWS
 from faintfield.recon.solver.uncertainty import Answers, LocalProblem
 
 
@@ -23,7 +30,7 @@ def with_prior(objective: Objective, solutions: Sequence[Solution]) -> list[Solu
     """Return planes under the prior of the options, given those of total variation.
 
     The proposal x̂ is a mixture of candidates chosen by held-out views. What is returned is the certified optimum of
-    `min L(f) + β TV(f − x̂)` over f ≥ 0, with the β of total variation: where the data contradict the proposal, they
+    `min L(f) + 1.2 β TV(f − x̂)` over f ≥ 0, with the β of total variation: where the data contradict the proposal, they
     win. Its record says how far they moved it. Standard deviations are added where the options ask for them.
     """
     found: list[Solution] = list(solutions)
@@ -77,9 +84,11 @@ def _about_proposals(
         return "total variation predicts held-out views best"
     proposed = operator.samples_of([proposal.picture for proposal in proposals])
     dual = replace(objective.posed.dual(), proposal=proposed)
-    record, found = certified(objective, np.maximum(proposed, 1e-3 * objective.start), weight, dual)
+    start = np.maximum(proposed, 1e-3 * objective.start)
+    record, found = certified(objective, start, WEIGHT_ABOUT_PROPOSAL * weight, dual)
     record = structs.replace(
         record,
+        penalty_weight=first.penalty_weight,
         penalty_weight_chosen=first.penalty_weight_chosen,
         penalty_weight_curve=first.penalty_weight_curve,
         passes_before=(first.passes_before or 0) + first.passes,
@@ -119,6 +128,7 @@ def _solution(
         name=options.prior or "tv",
         mixture=proposal.mixture,
         moved_sigma=rms,
+        penalty_weight=WEIGHT_ABOUT_PROPOSAL * (record.penalty_weight or 0.0),
         no_network=UNSET if no_network is None else no_network,
     )
     if options.proposal:
