@@ -15,11 +15,12 @@ _BLOCK = re.compile(
     r"(?<=<!-- results: made by docs/collect_results.py -->\n).*?(?=<!-- end of results -->)", re.DOTALL
 )
 _METHODS = {
-    "backprojection": "mean of the views",
-    "mlem": "MLEM",
-    "pmlem-osl": "PMLEM, the paper's one-step-late iteration",
-    "pmlem": "PMLEM, to its optimum",
+    ("backprojection", None): "mean of the views",
+    ("pmlem-osl", "tv"): "PMLEM, the paper's one-step-late iteration",
+    ("pmlem", "tv"): "PMLEM, total variation alone, to its optimum",
+    ("occlusion", "auto"): "**PMLEM, both planes together, with occlusion**",
 }
+_ERRORS = {"mse_texture": "object at {:g} mm", "mse_plane": "whole plane at {:g} mm"}
 _NOISE = {
     "gain_dn_per_e": ("gain", "DN/e⁻"),
     "read_noise_e": ("read noise", "e⁻"),
@@ -32,7 +33,8 @@ def collect(demo: Path) -> dict[str, Any]:
     metrics = json.loads((demo / "metrics.json").read_text())
     made = json.loads(next(demo.rglob("reconstruction.json")).read_text())
     planes = [
-        {**{key: row[key] for key in ("depth_mm", "method", "poses")}, "mse_bright": float(f"{row['mse_bright']:.3g}")}
+        {key: row.get(key) for key in ("depth_mm", "method", "prior", "poses")}
+        | {key: float(f"{row[key]:.3g}") for key in _ERRORS}
         for row in metrics["planes"]
     ]
     results = {
@@ -54,21 +56,20 @@ def collect(demo: Path) -> dict[str, Any]:
 def table(results: dict[str, Any]) -> str:
     """Return the results as a Markdown table and a sentence."""
     depths = sorted({row["depth_mm"] for row in results["planes"]})
+    columns = [(key, depth) for key in _ERRORS for depth in depths]
     lines = [
         f"| mean square error at SNR {results['snr']:g}, {results['photons_per_px']:g} photons per pixel | "
-        + " | ".join(f"{depth:g} mm" for depth in depths)
+        + " | ".join(_ERRORS[key].format(depth) for key, depth in columns)
         + " |",
-        "|---|" + "---|" * len(depths),
+        "|---|" + "---|" * len(columns),
     ]
-    rows = sorted(results["planes"], key=lambda row: list(_METHODS).index(row["method"]))
-    for method, poses in dict.fromkeys((row["method"], row["poses"]) for row in rows):
-        of_depth = {
-            row["depth_mm"]: f"{row['mse_bright']:.4f}"
-            for row in results["planes"]
-            if (row["method"], row["poses"]) == (method, poses)
-        }
-        cells = " | ".join(of_depth.get(depth, "–") for depth in depths)
-        lines.append(f"| {_METHODS[method]}, {poses} poses | {cells} |")
+    by_kind: dict[tuple[str, str], dict[float, dict[str, Any]]] = {}
+    for row in sorted(results["planes"], key=lambda row: list(_METHODS).index((row["method"], row["prior"]))):
+        kind = (_METHODS[row["method"], row["prior"]], row["poses"])
+        by_kind.setdefault(kind, {})[row["depth_mm"]] = row
+    for (method, poses), of_depth in by_kind.items():
+        cells = " | ".join(f"{of_depth[depth][key]:.4f}" if depth in of_depth else "–" for key, depth in columns)
+        lines.append(f"| {method}, {poses} poses | {cells} |")
     measured = [
         f"{words} {known['value']:g} ± {known['se']:.1g} {unit} (true: {known['truth']:g})"
         for name, (words, unit) in _NOISE.items()

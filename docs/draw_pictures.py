@@ -15,7 +15,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import cv2
 import numpy as np
+from matplotlib import colormaps
+from numpy.typing import NDArray
 from PIL import Image
 
 from faintfield.pipelines.formats.frames import read_frame
@@ -25,7 +28,8 @@ from tests.end_to_end.browser import Tab, open_browser
 _PICTURES = Path(__file__).parent / "pictures"
 _WHITE_E = 1.5
 _TRUCK, _AIRPLANE = "plane_00500.0.tiff", "plane_00700.0.tiff"
-_PENALISED = ("pmlem", "pmlem-osl")
+# Depths whose colours are the ends of the scale, and the least probability of a depth that is shown.
+_DEPTHS_MM, _SURE = (450.0, 750.0), 0.8
 _WIDTH_PX = 1000
 _PAGES = (("report", "report.html", 1250), ("stage", "geometry.html", 1250))
 
@@ -37,19 +41,25 @@ _LAYOUTS = (("wipe", "Wipe", 0.42), ("pair", "Side by side", 0.5), ("all", "All"
 
 
 def draw_planes(demo: Path) -> None:
-    """Draw one dark view next to both planes, as the mean of all views and by PMLEM, on one grey scale."""
+    """Draw a dark view and both planes; below, the mean of all views, the surface, and its sure depths."""
     view = read_frame(_first(demo, "*_dark_scene_*_r3_c3_*.tiff")).pixels_dn
     black, white = np.quantile(view, (0.001, 0.999))
-    penalised = next(method for method in _PENALISED if _found(demo, f"{method}/{_TRUCK}"))
-    planes = [
-        grey_levels(read_frame(_first(demo, f"{method}/{name}")).pixels_dn, _WHITE_E)
-        for name in (_TRUCK, _AIRPLANE)
-        for method in ("backprojection", penalised)
-    ]
-    one_view = grey_levels(view, float(white), float(black))
-    write_png(
-        _PICTURES / "demo.png", shrunk(contact_sheet([one_view, *planes[:2], one_view, *planes[2:]], 3), _WIDTH_PX)
+    names = (f"occlusion/{_TRUCK}", f"occlusion/{_AIRPLANE}", f"backprojection/{_TRUCK}", "surface/picture.tiff")
+    light = [grey_levels(read_frame(_first(demo, name)).pixels_dn, _WHITE_E) for name in names]
+    grey = [grey_levels(view, float(white), float(black)), *light]
+    pictures = [cv2.cvtColor(picture, cv2.COLOR_GRAY2RGB) for picture in grey] + [_depth_where_sure(demo)]
+    write_png(_PICTURES / "demo.png", shrunk(contact_sheet(pictures, 3), _WIDTH_PX))
+
+
+def _depth_where_sure(demo: Path) -> NDArray[np.uint8]:
+    """Return the depth of the surface in colours, dark grey where it is not sure."""
+    depth_mm, probability = (
+        read_frame(_first(demo, f"surface/{name}.tiff")).pixels_dn for name in ("depth_mm", "depth_confidence")
     )
+    near_mm, far_mm = _DEPTHS_MM
+    colours = colormaps["viridis"](np.clip((depth_mm - near_mm) / (far_mm - near_mm), 0, 1))[..., :3]
+    sure = (np.nan_to_num(probability) >= _SURE)[..., None]
+    return np.where(sure, 255 * colours, 40).astype(np.uint8)
 
 
 def draw_noise_page(demo: Path) -> None:

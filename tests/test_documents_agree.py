@@ -25,7 +25,7 @@ def test_figures_of_readme_are_the_results() -> None:
     readme = (_ROOT / "README.md").read_text()
     results = json.loads((_ROOT / "docs" / "results.json").read_text())
     assert script.filled(readme, results) == readme
-    results["planes"][0]["mse_bright"] += 0.5
+    results["planes"][0]["mse_texture"] += 0.5
     assert script.filled(readme, results) != readme
 
 

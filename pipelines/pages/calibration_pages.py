@@ -53,6 +53,9 @@ _NOISE_ROWS = (
 # The largest deviation is drawn at most this long, as a share of the pitch, so that it stays within its cell.
 _MAX_DRAWN_SHARE = 0.35
 
+# Quality of the noise page as WebP, on a scale to 100.
+_QUALITY = 80
+
 # Rotations are shown in mrad from here on, in µrad below.
 _COARSE_RAD = 1e-4
 
@@ -225,10 +228,13 @@ def find_calibration(directory: Path, name: str) -> Path | None:
 def noise_section(directory: Path, path: Path, inputs: Set[str]) -> NoiseSection:
     """Return the section of a noise.json; `inputs` are the SHA-256 of the files that the planes were made from."""
     record = read_noise(path)
-    pages = [file_within(path.parent, page.name) for page in sorted(path.parent.glob("noise_page*.png"))]
+    files = [file_within(path.parent, page.name) for page in sorted(path.parent.glob("noise_page*.png"))]
+    pages: list[tuple[str, str | None]] = [
+        (_link(directory, file), smaller_uri(read_content(file, MAX_PREVIEW_BYTES), _QUALITY)) for file in files
+    ]
     return Section(
         **_origin(directory, path, inputs),
-        pages=[(_link(directory, page), smaller_uri(read_content(page, MAX_PREVIEW_BYTES))) for page in pages],
+        pages=pages,
         made=record.provenance,
         record=record,
         rows=[

@@ -79,9 +79,9 @@ def write_report(directory: Path, *, noise: Path | None = None, geometry: Path |
     facts.append(_poses(of_geometry, errors.geometry_off, units))
     facts += _noise(of_noise, the_set)
     if shown.best and (best := errors.of(shown.best)):
-        values = ", ".join(figure(row.mse_bright) for row in best)
+        values = ", ".join(figure(row.mse_texture) for row in best)
         depths = format_depths(units, *(row.depth_mm for row in best))
-        facts.append(Fact("Mean square error", values, f"at {depths}; objects 0…1, truth: plenty of light"))
+        facts.append(Fact("Mean square error", values, f"against the object, 0…1, at {depths}"))
     page = template("report.html").render(
         title=_title(directory, results, surfaces),
         units=units,

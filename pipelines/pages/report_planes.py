@@ -120,7 +120,7 @@ def _existing(path: Path) -> Path:
 def column_titles(planes: list[Plane]) -> dict[str, str]:
     """Return the title of each column: the method, with the poses or the set's folder if these differ."""
     columns = {plane.column: plane for plane in planes}
-    kinds = {(plane.method, plane.poses) for plane in columns.values()}
+    kinds = {(method_title(plane.records), plane.poses) for plane in columns.values()}
     poses_differ = len(kinds) == len(columns) and len({plane.poses for plane in planes}) > 1
     titles = {}
     for column, plane in columns.items():
@@ -152,7 +152,8 @@ def place_name(units: StatedUnits, depth: float, name: str) -> str:
 class ErrorSections:
     """Part of the page about errors: of each plane, after the title of its method, and of the measured poses.
 
-    `by_poses` holds the errors (bright) by poses, after depth, object and method; `pose_kinds` are its poses in order.
+    `by_poses` holds the errors against the object by poses, after depth, object and method; `pose_kinds` are its poses
+    in order.
     """
 
     metrics: list[tuple[str, PlaneErrors]]
@@ -173,7 +174,7 @@ def error_sections(directory: Path, planes: Sequence[Plane]) -> ErrorSections:
     rows = [(_title_of(errors, planes), errors) for metrics in all_metrics for errors in metrics.planes]
     by_place: dict[tuple[float, str, str], dict[Poses, float]] = {}
     for title, errors in rows:
-        by_place.setdefault((errors.depth_mm, errors.object, title), {})[errors.poses] = errors.mse_bright
+        by_place.setdefault((errors.depth_mm, errors.object, title), {})[errors.poses] = errors.mse_texture
     return ErrorSections(
         rows,
         next((metrics.geometry for metrics in all_metrics if metrics.geometry is not UNSET), None),
@@ -183,8 +184,9 @@ def error_sections(directory: Path, planes: Sequence[Plane]) -> ErrorSections:
 
 
 def _is_of(errors: PlaneErrors, plane: Plane) -> bool:
-    """Compare errors with a plane's method and poses; poses that a set states match those of any kind."""
-    return errors.method == plane.method and plane.poses in ("stated", errors.poses)
+    """Compare errors with a plane's method, prior and poses; poses that a set states match those of any kind."""
+    same_prior = errors.prior in (UNSET, plane.records[0].prior_name)
+    return errors.method == plane.method and same_prior and plane.poses in ("stated", errors.poses)
 
 
 def _title_of(errors: PlaneErrors, planes: Sequence[Plane]) -> str:

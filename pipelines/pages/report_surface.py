@@ -10,10 +10,13 @@ from faintfield.pipelines.formats.reading import read_content
 from faintfield.pipelines.formats.results.records import DepthMapRecord, ReconstructionRecord, preview_name
 from faintfield.pipelines.formats.results.surface import HeldOutRecord, SurfaceFileRecord, SurfaceRecord
 from faintfield.pipelines.formats.units import MAX_PREVIEW_BYTES, StatedUnits, units_of
-from faintfield.pipelines.pages.page import data_uri, figure
+from faintfield.pipelines.pages.page import data_uri, figure, smaller_uri
 
 # Kinds of films that browsers play.
 _FILMS = (".webp", ".png")
+
+# Quality of the previews as WebP, on a scale to 100: those of noise would take a tenth of the page without losses.
+_QUALITY = 75
 
 # A gain over planes that counts, in standard errors.
 _SIGNIFICANT = 3.0
@@ -99,7 +102,7 @@ def _figures(folder: Path, surface: SurfaceRecord, units: StatedUnits) -> list[F
     right = f"Probability that the {quantity} is right within {_tolerance(surface)}"
     light = "1 = white" if units.light == "relative" else units.light_symbol
     noise = "Standard deviation of the light of each sample by noise, if its depth is right"
-    known = f"Where each sample is, {measured}; hatched where that is not known"
+    known = f"Where each sample is, {measured}; hatched where that is not sure"
     entries: list[tuple[str | UnsetType, str, str]] = [
         (surface.picture, "Sharp everywhere.", "One picture from all views, as the reference camera would see it"),
         (surface.depth, f"{quantity.capitalize()}, {unit}.", known),
@@ -122,7 +125,11 @@ def _figures(folder: Path, surface: SurfaceRecord, units: StatedUnits) -> list[F
 
 
 def _embedded(path: Path) -> str | None:
-    return data_uri(read_content(path, MAX_PREVIEW_BYTES), path.suffix) if path.is_file() else None
+    if not path.is_file():
+        return None
+    content = read_content(path, MAX_PREVIEW_BYTES)
+    # Films are animations, which OpenCV's still pictures would lose
+    return data_uri(content, path.suffix) if path.name.startswith("parallax") else smaller_uri(content, _QUALITY)
 
 
 def _rows(surface: SurfaceRecord) -> list[tuple[str, str, str]]:

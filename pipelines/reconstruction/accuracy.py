@@ -1,18 +1,19 @@
 """Errors of planes, depth maps and surfaces, where a set brings its truth."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
 import numpy as np
+from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.files import remove, write_record
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.results.figures import Metrics, PhotonsRecord, PlaneErrors, SnrRecord
-from faintfield.pipelines.formats.results.records import Method, Poses
+from faintfield.pipelines.formats.results.records import Method, PlaneRecord, Poses
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, in_units, load_set
 from faintfield.pipelines.formats.sets.ground_truth import (
     Truth,
@@ -34,14 +35,17 @@ _RIGHT = 0.02
 
 
 def assess(
-    elemental_set: ElementalSet, planes: Mapping[tuple[Method, float], Path], truth_in: Path | None = None
+    elemental_set: ElementalSet,
+    planes: Mapping[tuple[Method, float], Path],
+    records: Iterable[PlaneRecord],
+    truth_in: Path | None = None,
 ) -> Metrics | None:
     """Return the errors of planes, by method and depth in mm; None without truth, or without planes at its objects.
 
-    The object is scaled to 0…1. `mse_bright` compares with the back-projection of the noise-free set (what more light
-    would have shown), and `mse_texture` with the true texture, both where the object is visible. `mse_plane` compares
+    The object is scaled to 0…1. `mse_texture` compares with the true texture, and `mse_bright` with the back-projection
+    of the noise-free set (what more light would have shown), both where the object is visible. `mse_plane` compares
     with the texture over the whole plane, zero beside the object, and so counts most of the blur of others. `truth_in`
-    is the folder of the truth, by default that of the set.
+    is the folder of the truth, by default that of the set. The `records` of the planes say which prior they have.
     """
     folder = truth_in or elemental_set.folder
     truth = read_truth(folder)
@@ -50,10 +54,11 @@ def assess(
         return None
     noise_free = load_set(folder / truth.noise_free)
     bright = _back_projections(noise_free, depths)
+    priors = {(record.method, record.depth_mm): record.prior_name for record in reversed(list(records))}
     rows = [
-        _plane_errors(folder, elemental_set.poses, truth, method, depth, read_frame(path).pixels_dn, bright[depth])
-        for (method, depth), path in planes.items()
-        if depth in depths
+        _plane_errors(folder, elemental_set.poses, truth, of, path, bright[of[1]], priors.get(of, UNSET))
+        for of, path in planes.items()
+        if of[1] in depths
     ]
     return Metrics(
         planes=[in_units(elemental_set, row) for row in rows if row is not None],
@@ -64,8 +69,15 @@ def assess(
 
 
 def _plane_errors(
-    folder: Path, poses: Poses, truth: Truth, method: Method, depth: float, plane: NDArray[Any], bright: NDArray[Any]
+    folder: Path,
+    poses: Poses,
+    truth: Truth,
+    of: tuple[Method, float],
+    path: Path,
+    bright: NDArray[Any],
+    prior: str | UnsetType,
 ) -> PlaneErrors | None:
+    (method, depth), plane = of, read_frame(path).pixels_dn
     at_depth = true_plane(truth, depth)
     assert at_depth is not None
     texture, region = texture_and_region(folder, at_depth)
@@ -75,6 +87,7 @@ def _plane_errors(
     return PlaneErrors(
         depth_mm=depth,
         method=method,
+        prior=prior,
         poses=truth.poses if poses == "stated" else poses,
         object=at_depth.name,
         mse_bright=error,

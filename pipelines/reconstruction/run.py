@@ -83,7 +83,7 @@ def reconstruct_set(elemental_set: ElementalSet, out: Path, request: Request, ru
     if depth_map is not None:
         for folder in folders.values():
             write_depth_errors(elemental_set, folder, depth_map.file, depth_map.unit)
-    metrics = assess(elemental_set, sweep.written)
+    metrics = assess(elemental_set, sweep.written, sweep.records)
     remove(out / METRICS_FILE)  # of earlier planes
     if metrics:
         write_record(out / METRICS_FILE, metrics)

@@ -3,7 +3,6 @@
 import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import get_args
 
 import cv2
 import msgspec
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.noise_model import NoiseModel
-from faintfield.pipelines.arguments import Method, SolverOptions
+from faintfield.pipelines.arguments import Method
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.exchange.imported_set import relative
 from faintfield.pipelines.formats.files import check_free, write_json, write_record
@@ -19,7 +18,8 @@ from faintfield.pipelines.formats.results.figures import METRICS_FILE, GeometryE
 from faintfield.pipelines.formats.results.geometry import CameraPoses, read_geometry
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, read_noise
 from faintfield.pipelines.formats.results.plane_files import plane_name
-from faintfield.pipelines.formats.results.records import JOINT_METHODS
+from faintfield.pipelines.formats.results.records import RECONSTRUCTION_FILE, ReconstructionRecord
+from faintfield.pipelines.formats.results.surface import read_result
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, load_session, nominal_session
 from faintfield.pipelines.formats.toml_files import write_toml
@@ -28,6 +28,7 @@ from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.reconstruction.accuracy import assess
 from faintfield.pipelines.reconstruction.options import Options
 from faintfield.pipelines.reconstruction.request import DEFAULT_METHOD, Request, folder_of_method, select_planes
+from faintfield.pipelines.reconstruction.surface.request import select_surface
 from faintfield.pipelines.simulation.synthetic_set import NOISE_FREE, render_scene, write_ground_truth
 from faintfield.pipelines.workflows.reconstruct import reconstruct_and_report
 from faintfield.pipelines.workflows.session import run_steps, session_steps
@@ -52,13 +53,15 @@ from faintfield.rig.stages.protocol import Point, StageSettings
 # The file that marks a folder as made by a demo; the next demo may replace such a folder.
 _MARK = "demo.json"
 
-# The methods that reconstruct each plane by itself; those of all planes together would take too long.
-_METHODS: list[Method] = [method for method in get_args(Method.__value__) if method not in JOINT_METHODS]
-
+# The methods that are compared, beside single planes of total variation.
+_METHODS: list[Method] = ["backprojection", "pmlem-osl", "occlusion"]
 
 type Node = tuple[int, int]
 
 _EXPOSURE_S = 0.1
+
+# Depths among which the surface is searched.
+_RANGE_MM = "400:900"
 
 # Sweeps over the nodes with a board at another place each.
 _BOARD_SWEEPS = 6
@@ -98,12 +101,13 @@ def run_demo(out: Path, quick: bool, snr: float, seed: int) -> DemoResult:
     )
     capture_session(settings, session, unattended=True, page=False)
     depths = list(settings.scene.depth_mm)
-    asked = Options(depth_mm=[*depths], method=_METHODS, solver=SolverOptions(prior="tv"))
-    run_steps(session, session_steps(session, select_planes(asked)))
+    asked = Options(depth_mm=[*depths], method=_METHODS, surface=True, depth_range_mm=_RANGE_MM)
+    run_steps(session, session_steps(session, select_planes(asked), select_surface(asked)))
     inform("looking up the truth, and reconstructing with it and without any measured poses, for comparison")
     truth = write_truth(out / "truth", session, snr)
     reconstruct_and_report(load_set(truth / NOISE_FREE), out / "noise-free", Request(depths, ["backprojection"]))
-    alone = Request(depths, [DEFAULT_METHOD])
+    alone = Request(depths, [DEFAULT_METHOD])  # by total variation
+    reconstruct_and_report(load_session(session), out / "tv", alone)
     reconstruct_and_report(nominal_session(session), out / "nominal", alone)
     reconstruct_and_report(true_set(session, truth), out / "true", alone)
     metrics = demo_metrics(out, session, truth)
@@ -114,7 +118,7 @@ def run_demo(out: Path, quick: bool, snr: float, seed: int) -> DemoResult:
 def _make_free(out: Path) -> None:
     """Remove what an earlier demo left, and nothing else."""
     check_free(out, replace_if=_MARK)
-    for name in ("session", "truth", "noise-free", "nominal", "true"):
+    for name in ("session", "truth", "noise-free", "tv", "nominal", "true"):
         shutil.rmtree(out / name, ignore_errors=True)
     write_json(out / _MARK, {"format": 1, "made_by": "faintfield demo"})
 
@@ -204,7 +208,7 @@ def true_set(session: Path, truth: Path) -> ElementalSet:
 def demo_metrics(out: Path, session: Path, truth: Path) -> Metrics:
     """Return the errors of geometry, noise and planes against the truth that `write_truth` wrote.
 
-    With nominal and with true poses, planes were reconstructed by the default method alone.
+    Kinds of poses are compared by single planes of total variation.
     """
     depths = read_plan(session).rig.scene.depth_mm
     results = session / RECONSTRUCTIONS
@@ -213,13 +217,15 @@ def demo_metrics(out: Path, session: Path, truth: Path) -> Metrics:
         planes = {
             (method, depth): folders[method] / f"{plane_name(depth)}.tiff" for method in folders for depth in depths
         }
-        metrics = assess(elemental_set, planes, truth)
+        results = [read_result(folder / RECONSTRUCTION_FILE, ReconstructionRecord) for folder in folders.values()]
+        metrics = assess(elemental_set, planes, [record for result in results for record in result.planes], truth)
         assert metrics is not None
         return metrics
 
     folders = {method: folder_of_method(results, method, _METHODS) for method in _METHODS}
-    metrics = metrics_of(load_session(session), folders)
-    errors = list(metrics.planes)
+    measured = load_session(session)
+    metrics = metrics_of(measured, folders)
+    errors = [*metrics.planes, *metrics_of(measured, {DEFAULT_METHOD: out / "tv"}).planes]
     for elemental_set in (nominal_session(session), true_set(session, truth)):
         errors += metrics_of(elemental_set, {DEFAULT_METHOD: out / elemental_set.poses}).planes
     geometry, noise = _geometry_errors(session), _noise_errors(session)

@@ -6,7 +6,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,10 +15,8 @@ from matplotlib.figure import Figure
 from faintfield.pipelines.cli import run
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import encoded
-from faintfield.pipelines.formats.results.records import JOINT_METHODS, Method
 from faintfield.pipelines.workflows import demo as workflow
 
-METHODS = [method for method in get_args(Method.__value__) if method not in JOINT_METHODS]
 DEPTHS_MM = (500.0, 700.0)
 MOST_BYTES_OF_THE_REPORT = 5_000_000
 SNR = 0.16
@@ -60,11 +58,12 @@ def _save_nothing(_: Figure, file: Any, format: str, **__: object) -> None:
 def test_small_demo_from_capture_to_report(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Nine nodes, and two methods that are fast."""
-    methods = ["backprojection", "pmlem-osl"]
+    """Nine nodes, two methods that are fast, and no surface."""
+    methods = ["backprojection"]
     monkeypatch.setattr(workflow, "QUICK", workflow.DemoSize(3, 100.0, (288, 216), 3))
     monkeypatch.setattr(workflow, "_METHODS", methods)
     monkeypatch.setattr(workflow, "DEFAULT_METHOD", "pmlem-osl")
+    monkeypatch.setattr(workflow, "select_surface", lambda _: None)
     monkeypatch.setattr(Figure, "savefig", _save_nothing)  # text takes most of the time of a page
     out = tmp_path / "demo"
     assert run(["demo", str(out), "--quick", "--json"]) == 0
@@ -76,8 +75,8 @@ def test_small_demo_from_capture_to_report(
     _check_sensor(metrics)
     _check_light(metrics, out)
     errors = {(row["method"], row["poses"], row["depth_mm"]): row["mse_bright"] for row in metrics["planes"]}
-    assert set(errors) == {(method, "measured", depth) for method in methods for depth in DEPTHS_MM} | {
-        ("pmlem-osl", poses, depth) for poses in ("nominal", "true") for depth in DEPTHS_MM
+    assert set(errors) == {("backprojection", "measured", depth) for depth in DEPTHS_MM} | {
+        ("pmlem-osl", poses, depth) for poses in ("measured", "nominal", "true") for depth in DEPTHS_MM
     }
     for depth in DEPTHS_MM:
         assert errors["pmlem-osl", "measured", depth] <= 1.1 * errors["pmlem-osl", "true", depth]
@@ -104,8 +103,14 @@ def test_demo_is_as_accurate_as_promised(size: str, tmp_path: Path) -> None:
     _check_sensor(metrics)
     _check_light(metrics, out)
     errors = {(row["method"], row["poses"], row["depth_mm"]): row["mse_bright"] for row in metrics["planes"]}
-    assert {key[0] for key in errors} == set(METHODS)
+    assert {key[0] for key in errors} == {"backprojection", "pmlem-osl", "pmlem", "occlusion"}
+    of_planes = {(row["method"], row["poses"], row["depth_mm"]): row for row in metrics["planes"]}
     for depth in DEPTHS_MM:
+        alone, together = (of_planes[method, "measured", depth] for method in ("pmlem", "occlusion"))
+        assert (alone["prior"], together["prior"]) == ("tv", "auto")
+        if size == "full":
+            assert together["mse_texture"] < 0.8 * alone["mse_texture"]
+            assert together["mse_plane"] < 0.1 * alone["mse_plane"]
         measured, true, nominal = (errors["pmlem", poses, depth] for poses in ("measured", "true", "nominal"))
         assert measured <= errors["backprojection", "measured", depth] / 3
         if size == "--quick":

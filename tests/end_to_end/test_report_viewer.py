@@ -93,7 +93,8 @@ def test_numbers_under_cross_are_those_of_files(page: Tab, report: Path) -> None
         sample_px = size / plane.shape[1]
         _point(page, left + u0 + (column + 0.5) * sample_px, top + v0 + (row + 0.5) * sample_px)
         reading = re.search(
-            r"(-?[\d.]+) e⁻ per pixel \(± (\S+)\)\s+x (\S+), y (\S+) mm; column (\d+), row (\d+)", _reading(page)
+            r"(-?[\d.]+) e⁻ per pixel \(rounded by up to (\S+)\)\s+x (\S+), y (\S+) mm; column (\d+), row (\d+)",
+            _reading(page),
         )
         assert reading is not None, _reading(page)
         value, off, x_mm, y_mm = (float(word) for word in reading.groups()[:4])

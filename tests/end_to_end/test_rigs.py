@@ -43,9 +43,9 @@ def test_unusual_rig_gives_right_picture(name: str, tmp_path: Path) -> None:
     run_steps(session, session_steps(session, select_planes(asked)))
     truth = write_truth(tmp_path / "truth", session, 1.0)
     plane = session / "reconstructions" / f"{plane_name(_DEPTH_MM)}.tiff"
-    measured = error(assess(load_session(session), {(DEFAULT_METHOD, _DEPTH_MM): plane}, truth))
+    measured = error(assess(load_session(session), {(DEFAULT_METHOD, _DEPTH_MM): plane}, [], truth))
     exact = reconstruct_set(true_set(session, truth), tmp_path / "true", Request([_DEPTH_MM], [DEFAULT_METHOD])).out
-    best = error(assess(true_set(session, truth), {(DEFAULT_METHOD, _DEPTH_MM): Path(exact) / plane.name}, truth))
+    best = error(assess(true_set(session, truth), {(DEFAULT_METHOD, _DEPTH_MM): Path(exact) / plane.name}, [], truth))
     # Of a mosaic, a quarter of the pixels see each of two colours
     assert measured < (0.04 if "mosaic" in camera else 0.02)
     assert measured < 1.2 * best

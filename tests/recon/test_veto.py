@@ -17,6 +17,7 @@ from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.metrics import signal_scale_for_snr
 from faintfield.recon.operator.single_plane import PlaneOperator
 from faintfield.recon.prior.evidence import evidence_of_planes
+from faintfield.recon.prior.proposal import WEIGHT_ABOUT_PROPOSAL
 from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.solver.initialization import mean_light_e, universal_penalty_weight
 from faintfield.recon.solver.penalties import Penalty
@@ -82,7 +83,7 @@ def vetoed(of: Scene, images: ElementalImages, proposal: Image) -> Image:
     iterates = pmlem(
         problem.fit(mean_light_e(of.operator, start)),
         np.maximum(proposal, 1e-3 * start),
-        penalty_weight=of.weight,
+        penalty_weight=WEIGHT_ABOUT_PROPOSAL * of.weight,
         dual=replace(problem.dual(), proposal=proposal),
     )
     return run_until(iterates, 0.01, 30).plane

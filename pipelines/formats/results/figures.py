@@ -46,10 +46,14 @@ class Overview(Struct, frozen=True, kw_only=True):
 
 
 class PlaneErrors(Struct, frozen=True, kw_only=True):
-    """The errors of one plane against the truth, the object scaled to 0…1."""
+    """The errors of one plane against the truth, the object scaled to 0…1.
+
+    `prior` is that of a penalised plane; unset by versions that did not write it.
+    """
 
     depth_mm: float
     method: Method
+    prior: str | UnsetType = UNSET
     poses: Poses
     object: str
     mse_bright: float

@@ -167,6 +167,15 @@ class PlaneRecord(Struct, frozen=True, kw_only=True):
     moved_file: FileName | UnsetType = UNSET
 
     @property
+    def prior_name(self) -> str | UnsetType:
+        """Name of the prior, else of the penalty; unset where nothing is penalised."""
+        if self.prior is not UNSET:
+            return self.prior.name
+        if self.penalty is not UNSET:
+            return self.penalty.name
+        return "tv" if self.penalty_weight else UNSET
+
+    @property
     def files(self) -> list[str]:
         """Names of the files of this plane, beside the record."""
         sidecars = (self.sigma_file, self.opacity_file, self.proposal_file, self.moved_file)

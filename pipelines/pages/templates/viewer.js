@@ -69,7 +69,7 @@ const viewer = (() => {
     if (!one.levels || column < 0 || row < 0 || column >= one.width || row >= one.height) return null;
     const at = (row * one.width + column) * one.colours;
     const values = [...one.levels.subarray(at, at + one.colours)].map(level => level === UNKNOWN ? "not known" : told(number(one, level), one.step));
-    const off = one.step > 0 && !values.every(it => it === "not known") ? " (\u00b1 " + (one.step / 2).toPrecision(1) + ")" : "";
+    const off = one.step > 0 && !values.every(it => it === "not known") ? " (rounded by up to " + (one.step / 2).toPrecision(1) + ")" : "";
     const value = (one.colours === 3 ? "R " + values[0] + ", G " + values[1] + ", B " + values[2] : values[0]) + " " + one.unit;
     const [x, y] = one.pitch ? [one.origin[0] + column * one.pitch, one.origin[1] + row * one.pitch] : [];
     const many = one.bins > 1 && one.pitch ? "mean of " + one.bins + " \u00d7 " + one.bins + " samples, first " : "";

@@ -26,6 +26,9 @@ ALL_IN_FOCUS, CONFIDENCE = "all_in_focus", "depth_confidence"
 # Hatching of unknown values: two levels of grey (0 to 1), and their period.
 _MARK_GREY, _MARK_DARK, _MARK_PERIOD_PX = 0.62, 0.5, 12
 
+# Opacity of colours over the hatching where a map is not sure.
+_UNSURE_ALPHA = 0.3
+
 # Widths in inches of the picture and of the map in it, and the height of what is not the map.
 _PICTURE_WIDTH_IN, _MAP_WIDTH_IN, _MARGIN_IN = 8.6, 7.2, 0.6
 
@@ -132,10 +135,12 @@ def _all_in_focus(paths: Sequence[Path], index: NDArray[np.floating]) -> NDArray
     return sharp
 
 
-def map_picture(values: NDArray[np.floating], label: str, low: float, high: float) -> bytes:
+def map_picture(
+    values: NDArray[np.floating], label: str, low: float, high: float, sure: NDArray[np.bool_] | None = None
+) -> bytes:
     """Return a map (row, column) as PNG in colours from `low` to `high`; NaNs are hatched grey.
 
-    The colour bar ends in a point where values lie beyond it.
+    Where the map is not `sure`, the hatching shows through. The colour bar ends in a point where values lie beyond it.
     """
     from matplotlib.figure import Figure  # its memory is needed after that of the images
 
@@ -148,6 +153,8 @@ def map_picture(values: NDArray[np.floating], label: str, low: float, high: floa
     axes = figure.subplots()
     axes.imshow(hatch, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
     shown = axes.imshow(values, cmap="viridis", vmin=low, vmax=high, interpolation="nearest")
+    if sure is not None:
+        shown.set_alpha(np.where(sure, 1.0, _UNSURE_ALPHA))
     axes.set_axis_off()
     below, above = bool((values < low).any()), bool((values > high).any())
     extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get((below, above), "neither")

@@ -136,9 +136,11 @@ def _named_maps(
     if proposal is not None and moved is not None:
         yield _PROPOSED[0], proposal, encoded(grey_levels(proposal, white_level(maps.picture)), ".png")
         yield _PROPOSED[1], moved, _colour_map(moved, "picture less proposal (σ)")
-    yield record.depth, maps.depth, _colour_map(maps.depth, f"{what} ({record.unit})")
-    yield record.depth_sigma, maps.depth_sigma, _colour_map(maps.depth_sigma, f"σ of the {what} ({record.unit})")
     confidence = maps.depth_confidence
+    sure = confidence >= record.sure_above
+    limits = robust_limits(maps.depth[sure] if sure.any() else maps.depth)
+    yield record.depth, maps.depth, map_picture(maps.depth, f"{what} ({record.unit})", *limits, sure)
+    yield record.depth_sigma, maps.depth_sigma, _colour_map(maps.depth_sigma, f"σ of the {what} ({record.unit})")
     yield record.depth_confidence, confidence, map_picture(confidence, f"probability of the {what}", 0.0, 1.0)
     visibility = maps.visibility.astype(np.float32)
     most = max(float(np.nanmax(visibility, initial=1.0)), 1.0)
