@@ -251,7 +251,7 @@ def test_pictures_are_those_of_folder(surface: Path, done: Command) -> None:
     assert film == (surface / "parallax.webp").read_bytes()
     names = ("depth_mm.png", "depth_confidence.png", "depth_sigma_mm.png", "picture_sigma.png", "visibility.png")
     for name, content in zip(names, shown, strict=True):
-        assert _difference((surface / name).read_bytes(), content) < 3
+        assert _difference((surface / name).read_bytes(), content) < 8  # noise packs worst
     still = re.search(
         r'<source media="\(prefers-reduced-motion: reduce\), print" srcset="data:image/webp;base64,([^"]*)">', section
     )
