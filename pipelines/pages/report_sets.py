@@ -29,7 +29,7 @@ from faintfield.recon.metrics import noise_variance_e2
 _PIXELS_ACROSS = 540
 
 # Quality of the picture of all views, most of which is noise: it would be a fifth of the page without losses.
-_OVERVIEW_QUALITY = 60
+_OVERVIEW_QUALITY = 45
 
 
 class LightRow(NamedTuple):

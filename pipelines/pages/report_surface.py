@@ -10,13 +10,13 @@ from faintfield.pipelines.formats.reading import read_content
 from faintfield.pipelines.formats.results.records import DepthMapRecord, ReconstructionRecord, preview_name
 from faintfield.pipelines.formats.results.surface import HeldOutRecord, SurfaceFileRecord, SurfaceRecord
 from faintfield.pipelines.formats.units import MAX_PREVIEW_BYTES, StatedUnits, units_of
-from faintfield.pipelines.pages.page import data_uri, figure, smaller_uri
+from faintfield.pipelines.pages.page import LOSSLESS, data_uri, figure, smaller_uri
 
 # Kinds of films that browsers play.
 _FILMS = (".webp", ".png")
 
-# Quality of the previews as WebP, on a scale to 100: those of noise would take a tenth of the page without losses.
-_QUALITY = 75
+# Quality of maps as WebP, on a scale to 100: those of noise would take a tenth of the page without losses.
+_MAP_QUALITY = 55
 
 # A gain over planes that counts, in standard errors.
 _SIGNIFICANT = 3.0
@@ -96,7 +96,7 @@ def _section(title: str, folder: Path, made: SurfaceFileRecord) -> SurfaceSectio
 
 def _figures(folder: Path, surface: SurfaceRecord, units: StatedUnits) -> list[Figure]:
     quantity, unit = _quantity(surface), surface.unit
-    film = _embedded(folder / surface.film) if surface.film and Path(surface.film).suffix in _FILMS else None
+    film = _embedded_film(folder / surface.film) if surface.film and Path(surface.film).suffix in _FILMS else None
     circling = "From viewpoints between the nodes; the middle depth stands still, what is nearer moves most"
     measured = "in the unit of the poses, whose length is not known" if unit == "relative" else f"in {unit}"
     right = f"Probability that the {quantity} is right within {_tolerance(surface)}"
@@ -116,7 +116,8 @@ def _figures(folder: Path, surface: SurfaceRecord, units: StatedUnits) -> list[F
     figures = [
         Figure(src, name, caption)
         for file, name, caption in entries
-        if file is not UNSET and (src := _embedded(folder / preview_name(file))) is not None
+        if file is not UNSET
+        and (src := _embedded(folder / preview_name(file), LOSSLESS if file == surface.picture else _MAP_QUALITY))
     ]
     if film is not None:
         still = _embedded(folder / preview_name(surface.picture)) or film
@@ -124,12 +125,12 @@ def _figures(folder: Path, surface: SurfaceRecord, units: StatedUnits) -> list[F
     return figures
 
 
-def _embedded(path: Path) -> str | None:
-    if not path.is_file():
-        return None
-    content = read_content(path, MAX_PREVIEW_BYTES)
-    # Films are animations, which OpenCV's still pictures would lose
-    return data_uri(content, path.suffix) if path.name.startswith("parallax") else smaller_uri(content, _QUALITY)
+def _embedded(path: Path, quality: int = LOSSLESS) -> str | None:
+    return smaller_uri(read_content(path, MAX_PREVIEW_BYTES), quality) if path.is_file() else None
+
+
+def _embedded_film(path: Path) -> str | None:
+    return data_uri(read_content(path, MAX_PREVIEW_BYTES), path.suffix) if path.is_file() else None
 
 
 def _rows(surface: SurfaceRecord) -> list[tuple[str, str, str]]:
