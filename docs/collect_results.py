@@ -63,13 +63,15 @@ def table(results: dict[str, Any]) -> str:
         + " |",
         "|---|" + "---|" * len(columns),
     ]
-    by_kind: dict[tuple[str, str], dict[float, dict[str, Any]]] = {}
-    for row in sorted(results["planes"], key=lambda row: list(_METHODS).index((row["method"], row["prior"]))):
-        kind = (_METHODS[row["method"], row["prior"]], row["poses"])
-        by_kind.setdefault(kind, {})[row["depth_mm"]] = row
-    for (method, poses), of_depth in by_kind.items():
-        cells = " | ".join(f"{of_depth[depth][key]:.4f}" if depth in of_depth else "–" for key, depth in columns)
-        lines.append(f"| {method}, {poses} poses | {cells} |")
+    rows = sorted(results["planes"], key=lambda row: list(_METHODS).index((row["method"], row["prior"])))
+    errors = {
+        (f"{_METHODS[row['method'], row['prior']]}, {row['poses']} poses", key, row["depth_mm"]): f"{row[key]:.4f}"
+        for row in rows
+        for key in _ERRORS
+    }
+    for name in dict.fromkeys(name for name, _, _ in errors):
+        cells = " | ".join(errors.get((name, key, depth), "–") for key, depth in columns)
+        lines.append(f"| {name} | {cells} |")
     measured = [
         f"{words} {known['value']:g} ± {known['se']:.1g} {unit} (true: {known['truth']:g})"
         for name, (words, unit) in _NOISE.items()

@@ -23,13 +23,14 @@ from PIL import Image
 
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import contact_sheet, grey_levels, shrunk, write_png
+from faintfield.recon.surface.confidence import SURE
 from tests.end_to_end.browser import Tab, open_browser
 
 _PICTURES = Path(__file__).parent / "pictures"
 _WHITE_E = 1.5
 _TRUCK, _AIRPLANE = "plane_00500.0.tiff", "plane_00700.0.tiff"
-# Depths whose colours are the ends of the scale, and the least probability of a depth that is shown.
-_DEPTHS_MM, _SURE = (450.0, 750.0), 0.8
+# Depths whose colours are the ends of the scale.
+_DEPTHS_MM = (450.0, 750.0)
 _WIDTH_PX = 1000
 _PAGES = (("report", "report.html", 1250), ("stage", "geometry.html", 1250))
 
@@ -58,7 +59,7 @@ def _depth_where_sure(demo: Path) -> NDArray[np.uint8]:
     )
     near_mm, far_mm = _DEPTHS_MM
     colours = colormaps["viridis"](np.clip((depth_mm - near_mm) / (far_mm - near_mm), 0, 1))[..., :3]
-    sure = (np.nan_to_num(probability) >= _SURE)[..., None]
+    sure = (np.nan_to_num(probability) >= SURE)[..., None]
     return np.where(sure, 255 * colours, 40).astype(np.uint8)
 
 

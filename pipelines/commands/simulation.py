@@ -24,9 +24,9 @@ def demo(out: Path = Path("demo"), /, *, quick: bool = False, snr: Positive = 0.
     """Run the paper's experiment on a simulated rig, from the first board sweep to the report.
 
     A simulated gantry behind a pseudo-terminal carries a simulated camera, which captures boards, objects, dark and
-    flat frames as a session; noise, geometry and planes are found from that session. The truth is looked up last, in
-    OUT/truth, and metrics.json gives the errors of the results: with measured poses, with nominal ones, and with the
-    true ones.
+    flat frames as a session; noise, geometry, planes and a surface are found from that session. The truth is looked up
+    last, in OUT/truth, and metrics.json gives the errors of the planes: together with occlusion, and each alone with
+    measured, nominal and true poses.
 
     Parameters
     ----------

@@ -78,7 +78,8 @@ def write_report(directory: Path, *, noise: Path | None = None, geometry: Path |
     facts = _light(the_set) if the_set else []
     facts.append(_poses(of_geometry, errors.geometry_off, units))
     facts += _noise(of_noise, the_set)
-    if shown.best and (best := errors.of(shown.best)):
+    led_by = [plane for plane in planes if shown.best and plane.column == shown.best.column]
+    if best := errors.of(led_by):
         values = ", ".join(figure(row.mse_texture) for row in best)
         depths = format_depths(units, *(row.depth_mm for row in best))
         facts.append(Fact("Mean square error", values, f"against the object, 0…1, at {depths}"))

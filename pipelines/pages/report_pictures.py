@@ -167,7 +167,7 @@ def _sigmas(planes: list[Plane], titles: dict[str, str]) -> Sigmas | None:
     maps = [
         (f"{titles[plane.column]}, {plane.label}", sigma)
         for plane in sorted(planes, key=lambda plane: plane.depth_mm)
-        if (sigma := plane.pixels_beside("sigma_file")) is not None
+        if (sigma := plane.sidecar_pixels("sigma_file")) is not None
     ]
     if not maps:
         return None
@@ -180,7 +180,7 @@ def _proposals(planes: list[Plane], titles: dict[str, str], white: float) -> lis
     """Return what was proposed on the scale of the planes, and what the data moved, on one of ± 3 σ."""
     proposals = []
     for plane in sorted(planes, key=lambda plane: plane.depth_mm):
-        proposal, moved = plane.pixels_beside("proposal_file"), plane.pixels_beside("moved_file")
+        proposal, moved = plane.sidecar_pixels("proposal_file"), plane.sidecar_pixels("moved_file")
         if proposal is not None and moved is not None:
             levels = shrunk(grey_levels(moved, _MOST_MOVED, -_MOST_MOVED), _GRID_WIDTH_PX)
             picture = _picture(proposal, white, _GRID_WIDTH_PX, ".png")

@@ -73,7 +73,7 @@ class Plane:
         """Return the light of the plane (row, column[, colour])."""
         return read_frame(self.path).pixels_dn
 
-    def pixels_beside(self, key: Literal["sigma_file", "proposal_file", "moved_file"]) -> NDArray[Any] | None:
+    def sidecar_pixels(self, key: Literal["sigma_file", "proposal_file", "moved_file"]) -> NDArray[Any] | None:
         """Return the pixels of a file beside the plane that its record names, None if it names none."""
         name = getattr(self.records[0], key)
         return read_frame(_existing(self.path.with_name(Path(name).name))).pixels_dn if name else None
@@ -161,9 +161,9 @@ class ErrorSections:
     pose_kinds: list[Poses]
     by_poses: list[tuple[tuple[float, str, str], dict[Poses, float]]]
 
-    def of(self, plane: Plane) -> list[PlaneErrors]:
-        """Return the errors of the method and the poses of a plane."""
-        return [errors for _, errors in self.metrics if _is_of(errors, plane)]
+    def of(self, planes: Sequence[Plane]) -> list[PlaneErrors]:
+        """Return the errors of some planes."""
+        return [errors for _, errors in self.metrics if any(_is_of(errors, plane) for plane in planes)]
 
 
 def error_sections(directory: Path, planes: Sequence[Plane]) -> ErrorSections:
@@ -184,9 +184,10 @@ def error_sections(directory: Path, planes: Sequence[Plane]) -> ErrorSections:
 
 
 def _is_of(errors: PlaneErrors, plane: Plane) -> bool:
-    """Compare errors with a plane's method, prior and poses; poses that a set states match those of any kind."""
+    """Compare errors with a plane's method, depth, prior and poses; poses that a set states match those of any kind."""
+    same_place = (errors.method, errors.depth_mm) == (plane.method, plane.depth_mm)
     same_prior = errors.prior in (UNSET, plane.records[0].prior_name)
-    return errors.method == plane.method and same_prior and plane.poses in ("stated", errors.poses)
+    return same_place and same_prior and plane.poses in ("stated", errors.poses)
 
 
 def _title_of(errors: PlaneErrors, planes: Sequence[Plane]) -> str:

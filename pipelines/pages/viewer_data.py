@@ -164,7 +164,7 @@ class _Source(NamedTuple):
 
     def read(self, coarser: int) -> tuple[NDArray[np.floating], int]:
         """Return the numbers (row, column[, colour]) in bins, and the width of these; `coarser` is added to it."""
-        numbers = self.plane.pixels_beside("sigma_file") if self.kind == "sigma" else self.plane.pixels()
+        numbers = self.plane.sidecar_pixels("sigma_file") if self.kind == "sigma" else self.plane.pixels()
         assert numbers is not None
         bins = 1
         while (numbers.shape[0] // bins) * (numbers.shape[1] // bins) > _MAX_SAMPLES:

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import msgspec
 import numpy as np
-from msgspec import UNSET, UnsetType
+from msgspec import UNSET
 from numpy.typing import NDArray
 
 from faintfield.pipelines.console import inform
@@ -54,14 +54,16 @@ def assess(
         return None
     noise_free = load_set(folder / truth.noise_free)
     bright = _back_projections(noise_free, depths)
-    priors = {(record.method, record.depth_mm): record.prior_name for record in reversed(list(records))}
     rows = [
-        _plane_errors(folder, elemental_set.poses, truth, of, path, bright[of[1]], priors.get(of, UNSET))
-        for of, path in planes.items()
-        if of[1] in depths
+        _plane_errors(folder, elemental_set.poses, truth, method, depth, read_frame(path).pixels_dn, bright[depth])
+        for (method, depth), path in planes.items()
+        if depth in depths
     ]
+    in_own = [in_units(elemental_set, row) for row in rows if row is not None]
+    # Of a plane in colour, the first one counts
+    priors = {(record.method, record.depth_mm): record.prior_name for record in reversed(list(records))}
     return Metrics(
-        planes=[in_units(elemental_set, row) for row in rows if row is not None],
+        planes=[msgspec.structs.replace(row, prior=priors.get((row.method, row.depth_mm), UNSET)) for row in in_own],
         units=elemental_set.units,
         snr=SnrRecord(truth.snr, brightness(elemental_set, folder / OBJECT_REGION).snr),
         photons_per_px=PhotonsRecord(truth.photons_linear, truth.photons_from_moments, truth.photons_on_object),
@@ -69,15 +71,8 @@ def assess(
 
 
 def _plane_errors(
-    folder: Path,
-    poses: Poses,
-    truth: Truth,
-    of: tuple[Method, float],
-    path: Path,
-    bright: NDArray[Any],
-    prior: str | UnsetType,
+    folder: Path, poses: Poses, truth: Truth, method: Method, depth: float, plane: NDArray[Any], bright: NDArray[Any]
 ) -> PlaneErrors | None:
-    (method, depth), plane = of, read_frame(path).pixels_dn
     at_depth = true_plane(truth, depth)
     assert at_depth is not None
     texture, region = texture_and_region(folder, at_depth)
@@ -87,7 +82,6 @@ def _plane_errors(
     return PlaneErrors(
         depth_mm=depth,
         method=method,
-        prior=prior,
         poses=truth.poses if poses == "stated" else poses,
         object=at_depth.name,
         mse_bright=error,

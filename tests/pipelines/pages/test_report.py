@@ -17,6 +17,7 @@ import tifffile
 
 from faintfield.pipelines.formats.image_files import grey_levels, white_level
 from faintfield.pipelines.pages import report_surface
+from faintfield.pipelines.pages.page import figure
 from tests.pipelines.by_hand import write_by_hand
 from tests.pipelines.conftest import Command, assert_refused, run_undrawn
 from tests.pipelines.forms import read_record
@@ -119,8 +120,8 @@ def test_page_shows_digests_brightness_and_errors(page: _Page, original: Path) -
     for digest in read_record(original / "pmlem-osl")["inputs"].values():
         assert digest in page.words
     light = read_record(original, "overview.json")["brightness"]
-    for figure in (light["snr"], light["photons_from_moments"]):
-        assert f"{figure:.3g}" in page.words
+    for number in (light["snr"], light["photons_from_moments"]):
+        assert f"{number:.3g}" in page.words
     for plane in read_record(original, "metrics.json")["planes"]:
         assert f"{plane['mse_bright']:.4f}" in page.words
     assert "<planes & more>: planes at 3 depths, 500 to 700 mm" in page.words
@@ -156,6 +157,27 @@ def test_titles_say_whether_occlusion_was_kept(kept: bool, planes: Path, done: C
     assert ("with occlusion" in page.words) == kept
     assert ("left out: it is no better." in page.words) == (not kept)
     assert "--joint" not in page.words
+
+
+def test_errors_follow_prior_of_each_plane(planes: Path, done: Command) -> None:
+    """Where a prior is left out at one depth, its errors lead the page beside those of the other."""
+    priors: dict[float, dict[str, Any]] = {
+        500.0: {"name": "tv", "left_out": "the views contradict it"},
+        700.0: {"name": "auto", "moved_sigma": 0.5},
+    }
+    made = read_record(planes / "pmlem-osl")
+    made["planes"] = [plane | {"prior": priors.get(plane["depth_mm"], priors[700.0])} for plane in made["planes"]]
+    write_by_hand(planes / "pmlem-osl" / "reconstruction.json", made)
+    metrics = read_record(planes, "metrics.json")
+    rows = [row for row in metrics["planes"] if row["method"] == "pmlem-osl"]
+    for row in rows:
+        row["prior"] = priors[row["depth_mm"]]["name"]
+    write_by_hand(planes / "metrics.json", metrics)
+    done("report", planes)
+    words = _Page((planes / "report.html").read_text()).words
+    assert len(rows) == 2
+    shown = ", ".join(figure(row["mse_texture"]) for row in rows)
+    assert f"Mean square error{shown}against the object" in words
 
 
 # What a report has always needed of results and their planes; earlier versions did not write all the other keys.

@@ -25,6 +25,7 @@ from faintfield.pipelines.formats.sets.ground_truth import (
 from faintfield.pipelines.reconstruction.accuracy import write_depth_errors
 from faintfield.pipelines.reconstruction.depth.autofocus import searched_range_mm
 from faintfield.pipelines.reconstruction.depth.comparison import binned_views
+from faintfield.pipelines.reconstruction.depth.depth_map import map_picture
 from faintfield.recon.depth.agreement import depth_map
 from faintfield.recon.depth.focus import SURE
 from tests.pipelines.conftest import Command, Edit, SetMaker, assert_refused, run_undrawn
@@ -150,6 +151,19 @@ def _shuffle(paths: list[Path]) -> None:
     pictures = [path.read_bytes() for path in paths]
     for path, index in zip(paths, np.random.default_rng(3).permutation(len(paths)), strict=True):
         path.write_bytes(pictures[index])
+
+
+def test_colours_are_faint_where_map_is_not_sure(undrawn: pytest.MonkeyPatch) -> None:
+    undrawn.undo()
+    values, sure = np.ones((60, 80)), np.arange(80) < 40
+    pictures = [map_picture(values, "depth (mm)", 0.0, 2.0, mask) for mask in (np.tile(sure, (60, 1)), None)]
+    faint, opaque = (cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR) for picture in pictures)
+    assert faint is not None
+    assert opaque is not None
+    changed = (faint != opaque).any(axis=2)
+    middle = round(0.43 * changed.shape[1])  # of the map, beside which the scale stands
+    assert not changed[:, : middle - 20].any()
+    assert changed[20:-20, middle + 20 : 2 * middle - 20].mean() > 0.95
 
 
 @pytest.mark.parametrize(

@@ -61,6 +61,8 @@ def test_plane_has_proposal_change_mixtures_and_certificate(proposed: Path, with
     assert 0.1 < np.percentile(sigma, 1) < np.percentile(sigma, 99) < 10
     assert 0 < plane["prior"]["moved_sigma"] < 1
     (first,) = read_record(without)["planes"]
+    assert plane["penalty_weight"] == first["penalty_weight"]
+    assert plane["prior"]["penalty_weight"] == pytest.approx(1.2 * first["penalty_weight"])
     assert plane["prior"]["name"] == "patches"
     mixture = plane["prior"]["mixture"]
     assert set(mixture) == {"light, detail", "light, smooth", "dark, detail", "dark, smooth"}
