@@ -53,7 +53,7 @@ results: $(VENV)/installed ## the demo's figures and pictures, put into README.m
 	$(BIN)/python docs/collect_results.py $(OUT)
 	PYTHONPATH=. $(BIN)/python docs/draw_pictures.py $(OUT)
 
-lock: ## renew requirements.lock from pyproject.toml; it leaves out the extras for cameras, napari and BM3D
+lock: ## renew requirements.lock from pyproject.toml; it leaves out the extras for cameras and napari
 	$(PYTHON) -m venv .uv
 	.uv/bin/pip --disable-pip-version-check --quiet install uv
 	.uv/bin/uv pip compile pyproject.toml --extra cluster --extra zarr --group dev --universal --upgrade \

@@ -1,8 +1,9 @@
 """Make the pictures of README.md and the guide from a finished demo: `python docs/draw_pictures.py demo`.
 
 Run it from the root of the repository. Chromium takes the pictures of the pages. That of a capture shows a session on a
-simulated rig, which is started for it. `python docs/draw_pictures.py demo FOLDER` takes the viewer of its report
-instead, on screens of three widths, bright and dark, and puts the pictures into the folder.
+simulated rig, which is started for it. With `FAINTFIELD_DATA`, the folder of real data that tests read, photographs
+are darkened and reconstructed, too. `python docs/draw_pictures.py demo FOLDER` takes the viewer of its report instead,
+on screens of three widths, bright and dark, and puts the pictures into the folder.
 """
 
 import base64
@@ -32,6 +33,7 @@ _TRUCK, _AIRPLANE = "plane_00500.0.tiff", "plane_00700.0.tiff"
 # Depths whose colours are the ends of the scale.
 _DEPTHS_MM = (450.0, 750.0)
 _WIDTH_PX = 1000
+_MAIN = "from faintfield.pipelines.cli import main; main()"
 _PAGES = (("report", "report.html", 1250), ("stage", "geometry.html", 1250))
 
 # Widths and heights of the screens on which the viewer is shown.
@@ -61,6 +63,30 @@ def _depth_where_sure(demo: Path) -> NDArray[np.uint8]:
     colours = colormaps["viridis"](np.clip((depth_mm - near_mm) / (far_mm - near_mm), 0, 1))[..., :3]
     sure = (np.nan_to_num(probability) >= SURE)[..., None]
     return np.where(sure, 255 * colours, 40).astype(np.uint8)
+
+
+def draw_photographs(photographs: Path) -> None:
+    """Darken photographs of a light field, reconstruct their surface, and draw a view, the picture and its depth."""
+    with TemporaryDirectory() as scratch:
+        dark, surface = Path(scratch) / "dark", Path(scratch) / "surface"
+        for command in (
+            ("import", "grid", photographs, Path(scratch) / "bright"),
+            ("darken", Path(scratch) / "bright", dark, "--snr", "0.16", "--seed", "1"),
+            ("reconstruct", dark, "--surface", "--out", surface),
+        ):
+            subprocess.run([sys.executable, "-c", _MAIN, *map(str, command)], check=True)
+        view = read_frame(dark / "view_r4_c4.tiff").pixels_dn
+        black, white = np.quantile(view, (0.001, 0.999))
+        picture = cv2.cvtColor(cv2.imread(str(surface / "picture.png")), cv2.COLOR_BGR2RGB)
+        disparity_px, probability = (
+            read_frame(surface / f"{name}.tiff").pixels_dn for name in ("disparity_px", "depth_confidence")
+        )
+        sure = np.nan_to_num(probability) >= SURE
+        near_px, far_px = np.quantile(disparity_px[sure], (0.01, 0.99))
+        colours = 255 * colormaps["viridis"](np.clip((disparity_px - near_px) / (far_px - near_px), 0, 1))[..., :3]
+        depth = np.where(sure[..., None], colours, 0.35 * colours + 26).astype(np.uint8)
+        pictures = [grey_levels(view, float(white), float(black)), np.asarray(picture, np.uint8), depth]
+        write_png(_PICTURES / "photographs.png", shrunk(contact_sheet(pictures, 3), _WIDTH_PX))
 
 
 def draw_noise_page(demo: Path) -> None:
@@ -140,7 +166,7 @@ def _capturing(folder: Path) -> Iterator[str]:
     command = [
         sys.executable,
         "-c",
-        "from faintfield.pipelines.cli import main; main()",
+        _MAIN,
         "capture",
         str(rig),
         str(folder / "it"),
@@ -195,3 +221,5 @@ if __name__ == "__main__":
     draw_planes(finished)
     draw_noise_page(finished)
     draw_pages(finished)
+    if data := os.environ.get("FAINTFIELD_DATA"):
+        draw_photographs(Path(data) / "lightfield-chess")

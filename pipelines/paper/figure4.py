@@ -4,22 +4,20 @@ To compare one more method, add an entry to `METHODS`.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from importlib.util import find_spec
 from itertools import pairwise
+from pathlib import Path
 from typing import Literal
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
-from skimage.restoration import denoise_tv_chambolle
 
 from faintfield.calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.arguments import PriorName, SolverOptions
 from faintfield.pipelines.console import progress
-from faintfield.pipelines.errors import import_optional
 from faintfield.pipelines.formats.results.records import Method
 from faintfield.pipelines.reconstruction.planes.solve import solve
 from faintfield.recon.likelihood.images import ElementalImages, Image
@@ -37,13 +35,13 @@ class FigureMethod:
     """A method that makes a plane from dark views.
 
     `plane` takes the operator, the images and one of the `weights`, if there are any; it returns the plane (row,
-    column) in electrons. The best weight only the true object tells. `draws` limits the draws of the noise, for
-    methods that are slow and far from the best.
+    column) in electrons. It is None for a method whose errors stand in a table. The best weight only the true object
+    tells. `draws` limits the draws of the noise, for methods that are slow and far from the best.
     """
 
     name: str
     title: str
-    plane: Callable[..., Image]
+    plane: Callable[..., Image] | None
     weights: tuple[float, ...] = ()
     draws: int | None = None
 
@@ -58,48 +56,24 @@ def _solved(
     return solve(operator, images, method, SolverOptions(penalty_weight=weight, prior=prior)).plane
 
 
-def _clipped(operator: PlaneOperator, images: ElementalImages) -> Image:
-    """Return the plane by a naive reading of eq. (2): negative pixels clipped at zero, read noise not modelled."""
-    floor = np.maximum(images.electrons, 0)
-    return _solved("pmlem-osl", operator, replace(images, electrons=floor, read_variance_e2=0.0))
+BACK_PROJECTION = "backprojection"
 
-
-def _tv_denoised(operator: PlaneOperator, images: ElementalImages, weight: float) -> Image:
-    """Return the back-projection, denoised by total variation (Chambolle 2004)."""
-    plane = back_projection(operator, images)
-    # At the default tolerance it stops too early to compare weights
-    return np.asarray(denoise_tv_chambolle(plane, weight=weight, eps=1e-5, max_num_iter=200), np.float32)
-
-
-def _bm3d_denoised(operator: PlaneOperator, images: ElementalImages, weight: float) -> Image:
-    """Return the back-projection, denoised by BM3D with a standard deviation of `weight` electrons."""
-    denoise = import_optional("bm3d", "bm3d").bm3d
-    return np.asarray(denoise(back_projection(operator, images), sigma_psd=weight), np.float32)
-
-
-# The method that stands for the paper's, and the same with the best weight, which only the truth can tell.
-OURS: Method = "pmlem"
-BEST = "pmlem-best"
-
-# Weights to try: β for PMLEM, electrons for the denoisers.
+# The default of `reconstruct`; total variation alone; and the same with the best weight, which only the truth tells.
+OURS, TOTAL_VARIATION, BEST = "pmlem-auto", "pmlem", "pmlem-best"
 _PMLEM_WEIGHTS = tuple(np.geomspace(1.0, 3.2, 6).tolist())
-_TV_WEIGHTS_E = tuple(np.geomspace(0.1, 1.6, 12).tolist())
-_BM3D_WEIGHTS_E = tuple(np.geomspace(0.4, 1.2, 5).tolist())
+
+PEER = "bm3d"
+PEER_FILE = Path(__file__).parent / "bm3d_errors.json"
 
 # The first is the reference for the others.
 METHODS = (
-    FigureMethod("backprojection", "back-projection", back_projection),
-    FigureMethod("tv", "back-projection + TV denoising, best weight", _tv_denoised, _TV_WEIGHTS_E),
-    *(
-        [FigureMethod("bm3d", "back-projection + BM3D, best weight", _bm3d_denoised, _BM3D_WEIGHTS_E, draws=2)]
-        if find_spec("bm3d")
-        else []
-    ),
-    FigureMethod("pmlem-clipped", "PMLEM, one-step-late, negative data clipped", _clipped, draws=2),
+    FigureMethod(BACK_PROJECTION, "back-projection", back_projection),
     FigureMethod("pmlem-osl", "PMLEM, one-step-late, weight from the noise", partial(_solved, "pmlem-osl"), draws=2),
-    FigureMethod(OURS, "PMLEM, convergent, weight from held-out views", partial(_solved, OURS)),
-    FigureMethod("pmlem-patches", "PMLEM, prior of patches", partial(_solved, OURS, prior="patches")),
-    FigureMethod(BEST, "PMLEM, convergent, best weight", partial(_solved, OURS), _PMLEM_WEIGHTS),
+    FigureMethod(BEST, "PMLEM, total variation, best weight", partial(_solved, "pmlem"), _PMLEM_WEIGHTS),
+    FigureMethod(TOTAL_VARIATION, "PMLEM, total variation, weight from held-out views", partial(_solved, "pmlem")),
+    FigureMethod(PEER, "back-projection + BM3D, best weight", None),
+    FigureMethod("pmlem-patches", "PMLEM, prior of patches", partial(_solved, "pmlem", prior="patches")),
+    FigureMethod(OURS, "PMLEM, prior auto", partial(_solved, "pmlem", prior="auto")),
 )
 
 OBJECTS = (toy_truck, toy_airplane, sailing_boat, shaded_ball)
@@ -110,6 +84,9 @@ _DEPTH_MM = 600.0
 
 # A plane extends beyond its object on each side by the object's width divided by this.
 _MARGIN_DIVISOR = 16
+
+# Back-projections of the same exposure by different versions of the libraries differ by less than this.
+_SAME_MSE = 1e-3
 
 _POSITION_SD_MM, _ROTATION_SD_RAD = 0.3, 3.5e-3
 
@@ -128,6 +105,18 @@ class ErrorPoint(msgspec.Struct, frozen=True):
     seed: int
     mse_texture: float
     weight: float | None
+
+
+class PeerTable(msgspec.Struct, frozen=True):
+    """Errors of a program that is no part of faintfield, measured once: `bm3d_errors.json`.
+
+    `errors` also has those of the back-projections that the program denoised. They tell the exposures apart.
+    """
+
+    program: str
+    made: str
+    command: str
+    errors: list[ErrorPoint]
 
 
 class CurvePoint(msgspec.Struct, frozen=True):
@@ -202,15 +191,33 @@ def measure_errors(size_px: tuple[int, int], seeds: int) -> list[ErrorPoint]:
     cases = progress(_exposures(size_px, seeds), "figure 4: exposures", len(OBJECTS) * seeds * len(SNRS))
     for stage, weights, seed, (snr, images, scale_e) in cases:
         for method in METHODS:
-            if method.draws is not None and seed > method.draws:
+            if method.plane is None or (method.draws is not None and seed > method.draws):
                 continue
+            plane_of = partial(method.plane, stage.operator, images)
             if (method.name, snr) not in weights:
-                weights[method.name, snr] = _best_weight(stage, method, images, scale_e)
+                weights[method.name, snr] = _best_weight(stage, plane_of, method.weights, scale_e)
             weight = weights[method.name, snr]
-            plane = method.plane(stage.operator, images, *(() if weight is None else (weight,)))
-            mse, mse_texture = stage.errors(plane, scale_e)
+            mse, mse_texture = stage.errors(plane_of() if weight is None else plane_of(weight), scale_e)
             errors.append(ErrorPoint(stage.name, snr, method.name, mse, seed, mse_texture, weight))
-    return errors
+    return errors + peer_errors(errors)
+
+
+def read_peer_table() -> PeerTable:
+    """Return the errors of BM3D."""
+    return msgspec.json.decode(PEER_FILE.read_bytes(), type=PeerTable)
+
+
+def peer_errors(errors: Sequence[ErrorPoint]) -> list[ErrorPoint]:
+    """Return the errors of BM3D for the exposures of `errors`, those whose back-projection has the same error."""
+    known = {(error.object, error.snr, error.seed): error.mse for error in errors if error.method == BACK_PROJECTION}
+    table = read_peer_table().errors
+    same = {
+        key
+        for error in table
+        if error.method == BACK_PROJECTION
+        and np.isclose(known.get(key := (error.object, error.snr, error.seed), np.nan), error.mse, rtol=_SAME_MSE)
+    }
+    return [error for error in table if error.method == PEER and (error.object, error.snr, error.seed) in same]
 
 
 def _exposures(size_px: tuple[int, int], seeds: int) -> Iterator[_Case]:
@@ -223,13 +230,11 @@ def _exposures(size_px: tuple[int, int], seeds: int) -> Iterator[_Case]:
                 yield stage, weights, seed, exposure
 
 
-def _best_weight(stage: StagedObject, method: FigureMethod, images: ElementalImages, scale_e: float) -> float | None:
-    """Return the weight whose plane is nearest to the bright one, None for a method that finds its own."""
-
-    def error(weight: float) -> float:
-        return stage.errors(method.plane(stage.operator, images, weight), scale_e)[0]
-
-    return min(method.weights, key=error, default=None)
+def _best_weight(
+    stage: StagedObject, plane_of: Callable[[float], Image], weights: Sequence[float], scale_e: float
+) -> float | None:
+    """Return the weight whose plane is nearest to the bright one, None if there are no weights to try."""
+    return min(weights, key=lambda weight: stage.errors(plane_of(weight), scale_e)[0], default=None)
 
 
 def stage_object(shown: TexturedPlane, size_px: tuple[int, int]) -> StagedObject:

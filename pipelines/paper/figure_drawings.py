@@ -56,7 +56,7 @@ def draw_figure3(
             image = axes.imshow(frame, cmap="gray", vmin=scale_dn[0], vmax=scale_dn[1], interpolation="none")
             axes.set(title=title, xlabel="column (px)", ylabel="row (px)")
         figure.colorbar(image, ax=above.tolist(), shrink=0.85, label="DN")
-        _draw_planes(figure, below.tolist(), planes, "cd", "TV-PMLEM")
+        _draw_planes(figure, below.tolist(), planes, "cd", "PMLEM, prior auto,")
         return _png(figure)
 
 
@@ -89,8 +89,10 @@ def draw_figure4(points: Sequence[CurvePoint]) -> bytes:
         papers.legend(frameon=False, title="object", loc="upper right")
         panels = below.subplots(1, len(objects), sharey=True)
         for axes, name, letter in zip(np.atleast_1d(panels), objects, "cdefgh", strict=False):
+            measured = {point.method for point in points}
             for index, method in enumerate(METHODS):
-                _draw_curve(axes, points, (name, method.name), index, method.title)
+                if method.name in measured:
+                    _draw_curve(axes, points, (name, method.name), index, method.title)
             axes.axhspan(*PAPERS_AXIS, color="0.93", zorder=0)
             axes.set(yscale="log", title=f"({letter}) {name}: all methods")
             _name_axes(axes)

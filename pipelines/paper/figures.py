@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.pipelines.arguments import FigureNumber
+from faintfield.pipelines.arguments import FigureNumber, SolverOptions
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.files import check_free, exclusive, remove, write_json, write_whole
 from faintfield.pipelines.formats.frames import read_frame
@@ -28,16 +28,19 @@ from faintfield.pipelines.paper.figure4 import (
     METHODS,
     OURS,
     PAPERS_AXIS,
+    PEER,
+    TOTAL_VARIATION,
     CurvePoint,
     ErrorPoint,
     is_monotone,
     mean_curves,
     measure_errors,
     over_best,
+    read_peer_table,
 )
 from faintfield.pipelines.paper.figure_drawings import DrawnPlane, draw_figure2, draw_figure3, draw_figure4
 from faintfield.pipelines.reconstruction.overview import INTEGRAL_IMAGE, grey_scale_dn
-from faintfield.pipelines.reconstruction.request import Request
+from faintfield.pipelines.reconstruction.request import DEFAULT_METHOD, Request
 from faintfield.pipelines.reconstruction.run import Outcome, reconstruct_set
 from faintfield.pipelines.simulation.options import SyntheticOptions
 from faintfield.pipelines.simulation.synthetic_set import NOISE_FREE, write_synthetic_set
@@ -92,7 +95,7 @@ class Figure4(msgspec.Struct, frozen=True):
     """The curves of figure 4.
 
     `monotone` tells of each method if every object's error falls from each SNR to the next; `over_best` is the largest
-    ratio of our error to that with the best weight, of each object.
+    ratio of total variation's error to that with the best weight, of each object.
     """
 
     monotone: dict[str, bool]
@@ -194,7 +197,7 @@ def _detail_rows(scene: Path, pixels: NDArray[np.float32], depth_mm: float) -> l
 
 def _figure3(out: Path, _: FigureOptions) -> Figure3:
     """Reconstruct the dark set, and measure the errors of its planes."""
-    outcome = _reconstruct(out / _SCENE, out / _DARK, OURS)
+    outcome = _reconstruct(out / _SCENE, out / _DARK, DEFAULT_METHOD)
     metrics = outcome.metrics
     assert metrics is not None
     assert metrics.snr
@@ -221,8 +224,9 @@ def _figure3(out: Path, _: FigureOptions) -> Figure3:
 def _figure4(out: Path, options: FigureOptions) -> Figure4:
     errors = measure_errors(options.size_px, options.seeds)
     points = mean_curves(errors)
-    monotone = {method.name: is_monotone(points, method.name) for method in METHODS}
-    numbers = Figure4(monotone, over_best(points, OURS, BEST), points)
+    measured = {point.method for point in points}
+    monotone = {method.name: is_monotone(points, method.name) for method in METHODS if method.name in measured}
+    numbers = Figure4(monotone, over_best(points, TOTAL_VARIATION, BEST), points)
     write_json(out / _CURVES_FILE, Figure4Curves(**msgspec.structs.asdict(numbers), size_px=options.size_px))
     _write(out, 4, draw_figure4(points), errors, errors)
     return numbers
@@ -230,7 +234,9 @@ def _figure4(out: Path, options: FigureOptions) -> Figure4:
 
 def _reconstruct(set_path: Path, out: Path, method: Method) -> Outcome:
     with exclusive(out):
-        outcome = reconstruct_set(load_set(set_path), out, Request([*DEFAULT_DEPTHS_MM], [method]))
+        outcome = reconstruct_set(
+            load_set(set_path), out, Request([*DEFAULT_DEPTHS_MM], [method], SolverOptions(prior="auto"))
+        )
         write_report(out)
     return outcome
 
@@ -271,6 +277,7 @@ def _write_page(folder: Path) -> None:
         curves=curves,
         methods=[method for method in METHODS if curves is None or method.name in curves.monotone],
         ours=OURS,
+        peer=read_peer_table() if curves is not None and PEER in curves.monotone else None,
         papers_axis=PAPERS_AXIS,
     )
     write_whole(folder / PAGE_FILE, page)
