@@ -173,20 +173,31 @@ _MIN_FRAMES = 6
 
 
 class Settling(Struct, frozen=True):
-    """Result of `measure_settling`: the rest before an exposure, and whether the rig was seen at rest.
+    """Swing of the rig after a stop, as `measure_settling` saw it.
 
     The scatter is the median shift at rest, which is due to noise; the curve has the time in s after the stop, and the
     shift in pixels from the picture at rest.
     """
 
-    wait_s: float
-    settled: bool
     scatter_px: float
     curve: tuple[tuple[float, float], ...]
 
+    def rest_s(self, kind: StepKind, settings: SettleSettings) -> float | None:
+        """Return the rest that a step needs after a move; None if the rig was not seen to come to rest."""
+        limit_px = max(settings.limit_of(kind), 4.0 * self.scatter_px)
+        swinging = [index for index, (_, shift_px) in enumerate(self.curve) if shift_px > limit_px]
+        first_still = swinging[-1] + 1 if swinging else 0
+        # In the dark, shifts are noise; a rig that swings to the end has no picture at rest
+        seen = first_still <= _first_at_rest(len(self.curve)) and self.scatter_px <= settings.limit_px
+        return self.curve[first_still][0] if seen else None
+
+
+def _first_at_rest(frames: int) -> int:
+    return frames - frames // 3
+
 
 def measure_settling(expose: Callable[[float], Pixels], clock: Clock, settings: SettleSettings) -> Settling:
-    """Measure when the rig comes to rest; call it right after a move.
+    """Measure how the rig swings; call it right after a move.
 
     The mean of the last third of the frames is the picture r at rest. A small shift d changes a frame by ∇r · d, so d
     is the least-squares solution of ∇r · d = frame − r over all pixels. `expose` takes and returns a frame, given its
@@ -198,19 +209,10 @@ def measure_settling(expose: Callable[[float], Pixels], clock: Clock, settings: 
     while clock.now_s() - begun_s < settings.longest_s or len(frames) < _MIN_FRAMES:
         times_s.append(clock.now_s() - begun_s)
         frames.append(_smooth(expose(settings.exposure_s)))
-    at_rest = len(frames) - len(frames) // 3
+    at_rest = _first_at_rest(len(frames))
     shifts_px = _shifts_px(frames, np.mean(frames[at_rest:], axis=0))
-    scatter_px = float(np.median(shifts_px[at_rest:]))
-    swinging = np.flatnonzero(shifts_px > max(settings.limit_px, 4.0 * scatter_px))
-    first_still = int(swinging[-1]) + 1 if len(swinging) else 0
-    # In the dark, shifts are noise; a rig that swings to the end has no picture at rest
-    settled = first_still <= at_rest and scatter_px <= settings.limit_px
-    return Settling(
-        wait_s=times_s[first_still] if settled else settings.longest_s,
-        settled=settled,
-        scatter_px=round(scatter_px, 5),
-        curve=tuple((round(t, 4), round(float(shift), 4)) for t, shift in zip(times_s, shifts_px, strict=True)),
-    )
+    curve = tuple((round(t, 4), round(float(shift), 4)) for t, shift in zip(times_s, shifts_px, strict=True))
+    return Settling(round(float(np.median(shifts_px[at_rest:])), 5), curve)
 
 
 def _smooth(pixels: Pixels) -> NDArray[np.float32]:
