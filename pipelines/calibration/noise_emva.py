@@ -165,7 +165,7 @@ def _bright_image(darks: list[Series], calibration: NoiseCalibration) -> MeanIma
     image = map_of(lambda rows: charge(rows) / smooth(rows) / mean, used.shape, np.float64)
 
     def weight(series: Series) -> float:
-        """Return by how much the division by the vignetting raises the noise: that of a flat is lower where it is dim."""
+        """Return by how much the division by the vignetting raises the noise; a flat has less of it where it is dim."""
         divided = mean_over(lambda rows: series.within_dn2[rows] / smooth(rows) ** 2, used)
         return divided / mean_over(lambda rows: series.within_dn2[rows], used)
 

@@ -32,7 +32,8 @@ _TO_DO: dict[StepKind, tuple[str, ...]] = {
         "Turn the lights on. From here on, move nothing until the dark-scene set is done.",
     ),
     "dark_scene": (
-        "Lights out. Cover every lamp, screen and indicator; the objects stay where they are.",
+        "Lights out. Cover every lamp, every indicator and all screens but this one, which you dim and turn away from "
+        "the scene. The objects stay where they are.",
         "Set the faint light for the scene, wait until your eyes are dark-adapted, and look for stray light.",
     ),
     "noise_reference": (
@@ -52,7 +53,8 @@ _TO_DO_AGAIN: dict[StepKind, tuple[str, ...]] = {
 _CHECK: dict[StepKind, str] = {
     "charuco": "Check that many corners are found and that no frame is saturated.",
     "bright": "Check focus and that no frame is saturated.",
-    "dark_scene": "Check that frames look empty: the scene shows only in the reconstruction.",
+    "dark_scene": "Check the SNR of each frame, and that stray light stays near 0 DN. Black and white are fixed: the "
+    "scene hardly shows before it is reconstructed.",
     "noise_reference": "Check that frames are even: a bright corner is stray light.",
     "dark": "Check that frames are even: a bright corner means that the cover leaks.",
     "flat": "Check that frames are even, bright, and not saturated.",

@@ -224,12 +224,14 @@ class FrameTaker:
         if pixels is None:
             warning = "the file cannot be decoded here, so nothing was checked; look at it with the camera's program"
             return Findings({}, (warning,))
-        earlier_sharpness = [
-            committed.record.checks["sharpness"]
+        earlier = [
+            committed.record.checks
             for committed in self._session.valid().values()
-            if self._session.frames[committed.frame].step == frame.step and "sharpness" in committed.record.checks
+            if committed.frame != frame.number
+            and self._session.frames[committed.frame].step == frame.step
+            and self._session.frames[committed.frame].exposure_s == frame.exposure_s
         ]
-        return check_frame(pixels, frame.kind, self._settings.checks, self._settings.board, earlier_sharpness)
+        return check_frame(pixels, frame.kind, self._settings.checks, self._settings.board, earlier)
 
     def _measure_settling(self, frame: PlannedFrame) -> None:
         settings = self._settings.settle

@@ -63,7 +63,7 @@ def test_keys_lead_through_capture(tmp_path: Path) -> None:
         terminal.press(key)
     terminal.press("\n")
     terminal.wait_for("▀▀▀▀")
-    terminal.wait_for("board_corners")
+    terminal.wait_for("board corners")
     for sweep in range(2, 7):
         terminal.wait_for(f"Step {sweep} of 11: Board sweep {sweep}")
         terminal.press("s")

@@ -49,8 +49,8 @@ def test_operator_is_led_through_all_steps(folder: Path) -> None:
         (prompt.key, prompt.title, "go") for prompt in operator.prompts
     ]
     last = operator.statuses[-1]
-    assert (last.step, last.steps, last.done, last.total) == (3, 3, FRAMES - 1, FRAMES)
-    assert last.grid == ((-1.0, -1.0, -1.0), (-1.0, 0.75, -1.0))
+    assert (last.step, last.steps, last.done, last.total) == (3, 3, FRAMES, FRAMES)
+    assert last.grid == ((-1.0, -1.0, -1.0), (-1.0, 1.0, -1.0))
     for frame, committed, path in taken_frames(folder):
         assert path.is_file()
         assert committed.record.position_mm == pytest.approx(list(frame.stop.target), abs=0.02)
