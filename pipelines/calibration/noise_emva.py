@@ -163,14 +163,9 @@ def _bright_image(darks: list[Series], calibration: NoiseCalibration) -> MeanIma
         ends = response.charge_dn(np.array([0.99, 1.01]) * signal_dn)
         slope = float(ends[1] - ends[0]) / (0.02 * signal_dn)
     image = map_of(lambda rows: charge(rows) / smooth(rows) / mean, used.shape, np.float64)
-
-    def weight(series: Series) -> float:
-        """Return by how much the division by the vignetting raises the noise; a flat has less of it where it is dim."""
-        divided = mean_over(lambda rows: series.within_dn2[rows] / smooth(rows) ** 2, used)
-        return divided / mean_over(lambda rows: series.within_dn2[rows], used)
-
-    noise = temporal_noise(flat, used).scaled(weight(flat)) + dark.noise.scaled(weight(dark.series))
-    return MeanImage(flat, image, noise.scaled((slope / mean) ** 2), signal_dn)
+    noise = temporal_noise(flat, used) + dark.noise
+    weight = mean_over(lambda rows: 1 / smooth(rows) ** 2, used) * (slope / mean) ** 2
+    return MeanImage(flat, image, noise.scaled(weight), signal_dn)
 
 
 def _spreads(

@@ -153,6 +153,13 @@ def test_stage_rests_before_every_frame(folder: Path) -> None:
 
 
 def test_settling_is_measured_once_per_session(folder: Path) -> None:
+    rests_s: dict[int, float] = {}
+    expose = SimulatedLab.expose
+
+    def watched(lab: SimulatedLab, exposure_s: float, number: int) -> NDArray[np.uint16]:
+        rests_s[number] = lab.still_s()
+        return expose(lab, exposure_s, number)
+
     swinging = replace(
         SMALL_RIG,
         camera=SimulatedSettings(size_px=(160, 120)),
@@ -161,8 +168,9 @@ def test_settling_is_measured_once_per_session(folder: Path) -> None:
         step=(StepSettings("charuco", 0.05), StepSettings("dark_scene", 0.1)),
         settle=SettleSettings(exposure_s=0.05),
     )
-    assert isinstance(capture(folder, Operator({}, {2: "stop"}), swinging), CaptureStopped)
-    assert capture(folder, settings=swinging) is None
+    with mock.patch.object(SimulatedLab, "expose", watched):
+        assert isinstance(capture(folder, Operator({}, {2: "stop"}), swinging), CaptureStopped)
+        assert capture(folder, settings=swinging) is None
     with Journal(folder / "journal.sqlite", read_only=True) as journal:
         (settling,) = journal.details("settling", Settling)
     measured_s = settling.rest_s("bright", swinging.settle)
@@ -172,6 +180,14 @@ def test_settling_is_measured_once_per_session(folder: Path) -> None:
     rest_s = 0.25 * np.log(shift_px / swinging.settle.limit_px)
     assert measured_s is not None
     assert rest_s - 0.4 <= measured_s <= rest_s - 0.2 + 0.2
+    # A board waits for less swing than the scene
+    of_boards_s = settling.rest_s("charuco", swinging.settle)
+    assert of_boards_s is not None
+    assert of_boards_s >= measured_s + 0.3
+    frames = taken_frames(folder)
+    boards, scene = ([rests_s[taken.intent] for frame, taken, _ in frames if frame.step == step] for step in (0, 1))
+    assert min(boards) >= of_boards_s
+    assert measured_s <= min(scene) <= max(scene) < of_boards_s
     shifts = [shift for _, shift in settling.curve]
     assert shifts[0] > 5 * max(shifts[-10:])
 
