@@ -74,8 +74,9 @@ class SettleSettings(Struct, frozen=True, forbid_unknown_fields=True):
     ----------
     measure, exposure_s : bool, float
         Measure the rest once per session, from short frames after a move; exposure time of these.
-    limit_px : float
-        Largest shift of the picture that does no harm.
+    limit_px, board_limit_px : float
+        Largest shift of the picture that does no harm; the same in board sweeps, whose corners fit to some thousandths
+        of a pixel.
     longest_s : float
         Duration of the measurement; there is a warning if the rig still swings at its end.
     wait_s : float
@@ -85,15 +86,21 @@ class SettleSettings(Struct, frozen=True, forbid_unknown_fields=True):
     measure: bool = True
     exposure_s: float = 0.01
     limit_px: float = 0.1
+    board_limit_px: float = 0.01
     longest_s: float = 3.0
     wait_s: float = 0.5
 
     def __post_init__(self) -> None:
-        if min(self.exposure_s, self.longest_s, self.limit_px) <= 0.0 or self.wait_s < 0.0:
+        positive = (self.exposure_s, self.longest_s, self.limit_px, self.board_limit_px)
+        if min(positive) <= 0.0 or self.wait_s < 0.0:
             raise ValueError(f"settle times and limits must be positive; got {self}")
         for name in ("exposure_s", "longest_s", "wait_s"):
             if (duration_s := getattr(self, name)) > _MAX_REST_S:
                 raise ValueError(f"settle.{name} = {duration_s:g}; at most {_MAX_REST_S:g} s are waited for rest")
+
+    def limit_of(self, kind: StepKind) -> float:
+        """Return the largest shift in pixels that does no harm in steps of a kind."""
+        return self.board_limit_px if kind == "charuco" else self.limit_px
 
 
 class CheckSettings(Struct, frozen=True, forbid_unknown_fields=True):

@@ -6,9 +6,11 @@ serves one request.
 """
 
 import asyncio
+import math
 import secrets
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
@@ -30,7 +32,7 @@ from faintfield.pipelines.console import conceal, inform
 from faintfield.pipelines.formats.image_files import encoded
 from faintfield.pipelines.live.panel import REQUESTS, CapturePanel, SessionFrames, ShownFrame
 from faintfield.pipelines.live.planes_client import PlanesClient
-from faintfield.pipelines.live.terminal import LABELS, display_levels
+from faintfield.pipelines.live.terminal import LABELS, describe_values, display_levels
 from faintfield.rig.capture.guide import Answer, OperatorRequest, format_duration
 
 _HOST = "127.0.0.1"
@@ -43,8 +45,9 @@ _MAX_ARRIVALS = 16
 _MAX_REQUEST_S = 15.0
 _MAX_HEADER_BYTES = 8192
 _MAX_PRESS_BYTES = 1000
-# The end of the capture waits no longer for the page.
+# The end of the capture waits no longer for the page; and not for one that has not asked for so long.
 _MAX_FAREWELL_S = 5.0
+_GONE_S = 2.0
 _HEADERS = {
     "Connection": "close",
     "Cache-Control": "no-store",
@@ -70,10 +73,11 @@ def serve_page(
     """
     token = secrets.token_urlsafe(24)
     conceal(token)
+    audience = _Audience()
     listener = socket.create_server((_HOST, 0))
     server = uvicorn.Server(
         uvicorn.Config(
-            _TokenMiddleware(_pages(panel, frames, planes), token),
+            _TokenMiddleware(_pages(panel, frames, planes, audience), token),
             http=_BoundedConnection,
             h11_max_incomplete_event_size=_MAX_HEADER_BYTES,
             backlog=_MAX_ARRIVALS,
@@ -92,9 +96,30 @@ def serve_page(
     try:
         yield f"http://{_HOST}:{listener.getsockname()[1]}/{token}/"
     finally:
+        if panel.outcome is not None:
+            audience.wait()
         server.should_exit = True
         thread.join(_MAX_FAREWELL_S)
         listener.close()
+
+
+class _Audience:
+    """The pages that look on: when one asked for the state, and whether one has shown the outcome."""
+
+    def __init__(self) -> None:
+        self._asked_s = -math.inf
+        self._informed = threading.Event()
+
+    def note(self, *, informed: bool) -> None:
+        """Note that a page has asked for the state."""
+        self._asked_s = time.monotonic()
+        if informed:
+            self._informed.set()
+
+    def wait(self) -> None:
+        """Wait until a page that looks on has shown the outcome."""
+        if time.monotonic() - self._asked_s < _GONE_S:
+            self._informed.wait(_MAX_FAREWELL_S)
 
 
 def _run(server: uvicorn.Server, listener: socket.socket) -> None:
@@ -161,14 +186,17 @@ def _is_own(headers: Headers) -> bool:
     return host.partition(":")[0] == _HOST and headers.get("origin") in (None, f"http://{host}")
 
 
-def _pages(panel: CapturePanel, frames: SessionFrames | None, planes: PlanesClient | None) -> Router:
+def _pages(
+    panel: CapturePanel, frames: SessionFrames | None, planes: PlanesClient | None, audience: _Audience
+) -> Router:
     """Return the addresses behind the token."""
     html = files("faintfield.pipelines.live").joinpath("capture.html").read_text(encoding="utf-8")
 
     async def index(_: Request) -> Response:
         return HTMLResponse(html)
 
-    async def state(_: Request) -> Response:
+    async def state(request: Request) -> Response:
+        audience.note(informed="informed" in request.query_params)
         return _json(_state(panel) | {"planes": None if planes is None else _planes(planes)})
 
     async def picture(_: Request) -> Response:
@@ -230,17 +258,17 @@ async def _body(request: Request) -> bytes:
 @lru_cache(maxsize=1)
 def _png(shown: ShownFrame) -> bytes:
     """Return the picture of a frame in red, as a PNG file."""
-    red = display_levels(shown.pixels, _PICTURE_PX)
+    red = display_levels(shown.pixels, _PICTURE_PX, shown.scale_dn)
     return encoded(np.dstack([red, np.zeros_like(red), np.zeros_like(red)]), ".png")
 
 
 @lru_cache(maxsize=1)
 def _frame(shown: ShownFrame) -> dict[str, Any]:
-    """Return name, values and histogram of a frame as a JSON object."""
+    """Return name, values in words and histogram of a frame as a JSON object."""
     counts, edges = np.histogram(shown.pixels, bins=_HISTOGRAM_BINS)
     return {
         "name": shown.frame.name,
-        "values": dict(shown.values),
+        "values": describe_values(shown),
         "histogram": np.log1p(counts).tolist(),
         "range_dn": [float(edges[0]), float(edges[-1])],
     }
@@ -266,4 +294,5 @@ def _state(panel: CapturePanel) -> dict[str, Any]:
         "to_go": "" if status is None else format_duration(status.to_go_s),
         "buttons": [{"word": word, "label": LABELS[word]} for word in words],
         "frame": None if shown is None else _frame(shown),
+        "outcome": panel.outcome,
     }

@@ -21,7 +21,7 @@ from faintfield.rig.capture.guide import format_capture_duration
 from faintfield.rig.capture.loop import Capture
 from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import open_rig
-from faintfield.rig.errors import CameraError, CaptureStopped
+from faintfield.rig.errors import CameraError, CaptureStopped, RigError
 from faintfield.rig.session.resume import adopt_settings, check_same_rig, open_session
 from faintfield.rig.session.session import FrozenPlan, has_session, is_sealed, read_plan
 from faintfield.rig.settings import RigSettings
@@ -52,9 +52,14 @@ def capture_session(
             _open_page(panel, stack, SessionFrames(session), planes)
         stack.enter_context(TerminalView(panel).show())
         stack.enter_context(_stop_on_interrupt(panel))
-        Capture(session, open_rig(settings, session.journal, read_pixels), panel, read_pixels).run()
+        try:
+            Capture(session, open_rig(settings, session.journal, read_pixels), panel, read_pixels).run()
+        except RigError as failure:
+            panel.end(str(failure))
+            raise
+        panel.end(f"Complete. Next: faintfield run {folder}")
         count = len(session.valid()) - before
-    inform(f"{folder}: complete, {count} frames taken; faintfield verify {folder} compares every byte")
+    inform(f"{folder}: complete, {count} frames taken; next: faintfield run {folder}")
     return count
 
 

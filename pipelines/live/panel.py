@@ -10,10 +10,12 @@ from contextlib import suppress
 from queue import Empty, SimpleQueue
 from typing import Any, get_args
 
+import numpy as np
 from msgspec import Struct
 
 from faintfield.pipelines.live.planes_client import LiveFrame
 from faintfield.rig.cameras.protocol import Pixels
+from faintfield.rig.capture.checks import LIT_KINDS
 from faintfield.rig.capture.guide import Answer, OperatorRequest, Prompt, Status
 from faintfield.rig.plan import PlannedFrame
 from faintfield.rig.session.journal import CommittedFrame
@@ -30,11 +32,30 @@ class OpenPrompt(Struct, frozen=True):
 
 
 class ShownFrame(Struct, frozen=True, eq=False):
-    """The frame on display, with its measured values by name; each is equal to itself alone."""
+    """The frame on display, with its measured values by name; each is equal to itself alone.
+
+    `scale_dn` is black and white of its picture if they stay the same in its step, else None.
+    """
 
     frame: PlannedFrame
     pixels: Pixels
     values: Mapping[str, float]
+    scale_dn: tuple[float, float] | None = None
+
+
+# Black and white of frames without light: so many standard deviations of a pixel below and above the median.
+_BELOW, _ABOVE = 3.0, 6.0
+# About so many pixels are enough for both.
+_SAMPLES = 1_000_000
+
+
+def _dark_scale_dn(pixels: Pixels) -> tuple[float, float]:
+    """Return black and white for the frames of a step without light, of which this is the first."""
+    samples = pixels.ravel()[:: max(1, pixels.size // _SAMPLES)].astype(float)
+    middle = float(np.median(samples))
+    # The median deviation of a normal law is 0.6745 standard deviations; whole numbers may make it 0
+    sigma = max(float(np.median(np.abs(samples - middle))) / 0.6745, 1.0)
+    return middle - _BELOW * sigma, middle + _ABOVE * sigma
 
 
 class CapturePanel:
@@ -42,13 +63,15 @@ class CapturePanel:
 
     If it is `unattended`, it gives every prompt its unattended answer; requests are still accepted. Prompt, status and
     frame to show are each replaced as a whole, so any thread may read them; then the functions `on_change` are called
-    in the thread of the capture.
+    in the thread of the capture. The `outcome` is how the capture ended, and what comes next; None until then.
     """
 
     def __init__(self, *, unattended: bool) -> None:
         self.asked: OpenPrompt | None = None
         self.status: Status | None = None
         self.shown: ShownFrame | None = None
+        self.outcome: str | None = None
+        self._scale: tuple[int, tuple[float, float]] | None = None
         self.on_change: list[Callable[[], None]] = []
         self.unattended = unattended
         # The word of each button or key, and the number of the prompt that it answers, if any
@@ -89,7 +112,17 @@ class CapturePanel:
 
     def show_frame(self, frame: PlannedFrame, pixels: Pixels, values: Mapping[str, float]) -> None:
         """Show the frame just taken."""
-        self.shown = ShownFrame(frame, pixels, values)
+        scale_dn = None
+        if frame.kind not in LIT_KINDS:
+            if self._scale is None or self._scale[0] != frame.step:
+                self._scale = frame.step, _dark_scale_dn(pixels)
+            scale_dn = self._scale[1]
+        self.shown = ShownFrame(frame, pixels, values, scale_dn)
+        self._changed()
+
+    def end(self, outcome: str) -> None:
+        """Show how the capture ended."""
+        self.outcome = outcome
         self._changed()
 
     def _changed(self) -> None:

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Group, RenderableType
 from rich.live import Live
 from rich.text import Text
@@ -34,6 +35,18 @@ _KEYS = {"go": "g", "again": "a", "keep": "k", "retake": "r", "skip": "s", "stop
 # Widths of the frame's picture and histogram in characters.
 _PICTURE_COLUMNS, _HISTOGRAM_COLUMNS = 48, 24
 _BARS = " ▁▂▃▄▅▆▇█"
+# The measured values of a frame in words.
+_VALUES = {
+    "median_dn": "median {:.5g} DN",
+    "contrast_dn": "contrast {:.5g} DN",
+    "saturated_share": "saturated {:.2%}",
+    "sharpness": "sharpness {:.3g}",
+    "board_corners": "{:g} board corners",
+    "leak_dn": "parts differ by {:.1f} DN",
+    "snr": "SNR {:.2f}",
+    "darkest_dn": "darkest parts {:.1f} DN",
+    "stray_dn": "stray light {:+.1f} DN",
+}
 # Cursor and function keys, whose letters are no keys of ours.
 _ESCAPES = re.compile(rb"\x1b(\[[0-9;]*[~A-Za-z]|O[A-Z]|.)?")
 
@@ -82,7 +95,7 @@ class TerminalView:
         """Return the part of the screen that is redrawn."""
         parts: list[RenderableType] = []
         if self._panel.shown is not None:
-            parts += [_frame_picture(self._panel.shown.pixels), Text(_describe_frame(self._panel.shown), style="dim")]
+            parts += [_frame_picture(self._panel.shown), Text(_describe_frame(self._panel.shown), style="dim")]
         if self._panel.status is not None:
             parts.append(Text(_describe_status(self._panel.status)))
         if self._panel.asked is None:
@@ -102,28 +115,39 @@ def _describe_status(status: Status) -> str:
 
 def _describe_frame(shown: ShownFrame) -> str:
     """Return a line with name and histogram of a frame, of logarithmic height, and a second one with its values."""
-    values = visible("  ".join(f"{name} {value:g}" for name, value in shown.values.items()))
+    values = visible("  ".join(describe_values(shown)))
     heights = np.log1p(np.histogram(shown.pixels, bins=_HISTOGRAM_COLUMNS)[0])
     bars = "".join(_BARS[round(height / max(heights.max(), 1.0) * (len(_BARS) - 1))] for height in heights)
     return f"{visible(shown.frame.name)}  {bars}\n{values}"
 
 
-def display_levels(pixels: Pixels, width_px: int) -> Pixels:
-    """Return a frame (row, column) reduced to a width, in 8-bit levels from its 1 % to its 99.8 % quantile."""
+def describe_values(shown: ShownFrame) -> list[str]:
+    """Return the measured values of a frame in words, and black and white of its picture if they are fixed."""
+    words = [_VALUES.get(name, f"{visible(name)} {{:g}}").format(value) for name, value in shown.values.items()]
+    if shown.scale_dn is not None:
+        words.append("black {:.0f} DN, white {:.0f} DN in this step".format(*shown.scale_dn))
+    return words
+
+
+def display_levels(pixels: Pixels, width_px: int, scale: tuple[float, float] | None = None) -> NDArray[np.uint8]:
+    """Return a frame (row, column) reduced to a width, in 8-bit levels from black to white.
+
+    Unless their values are given, these are its 1 % and its 99.8 % quantile.
+    """
     grey = np.asarray(pixels if pixels.ndim == 2 else pixels.mean(axis=2), np.float32)
-    scale = min(1.0, width_px / grey.shape[1])
-    small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    low, high = np.quantile(small, (0.01, 0.998))
+    factor = min(1.0, width_px / grey.shape[1])
+    small = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    low, high = np.quantile(small, (0.01, 0.998)) if scale is None else scale
     return np.asarray(np.clip((small - low) * (255.0 / max(float(high - low), 1.0)), 0, 255), np.uint8)
 
 
-def _frame_picture(pixels: Pixels) -> Text:
+def _frame_picture(shown: ShownFrame) -> Text:
     """Return a frame in half blocks, red on black, which preserves dark adaptation."""
-    picture = display_levels(pixels, _PICTURE_COLUMNS)
+    red = display_levels(shown.pixels, _PICTURE_COLUMNS, shown.scale_dn).astype(int) * 3 // 4
     text = Text()
-    for top, bottom in zip(picture[:-1:2], picture[1::2], strict=True):
+    for top, bottom in zip(red[:-1:2], red[1::2], strict=True):
         for upper, lower in zip(top, bottom, strict=True):
-            text.append("▀", style=f"rgb({upper * 3 // 4},0,0) on rgb({lower * 3 // 4},0,0)")
+            text.append("▀", style=f"rgb({upper},0,0) on rgb({lower},0,0)")
         text.append("\n")
     return text
 

@@ -14,8 +14,8 @@ from faintfield.rig.settings import BoardSettings, CheckSettings, SettleSettings
 
 LIT_KINDS: frozenset[StepKind] = frozenset({"charuco", "bright", "flat"})
 DARK_KINDS: frozenset[StepKind] = frozenset({"noise_reference", "dark"})
-# A dark frame is divided into this many parts per axis to find stray light.
-_LEAK_PARTS = 8
+# A dark frame is divided into this many parts per axis to find stray light, and one of the scene to find its light.
+_PARTS = 8
 # Boards are searched in an image reduced to this size in pixels: enough to see that they are in view, and fast.
 _BOARD_SEARCH_PX = 1600
 
@@ -23,7 +23,8 @@ _BOARD_SEARCH_PX = 1600
 class Findings(Struct, frozen=True):
     """Measured values of a frame by name, and warnings, one line each, with the limit and a remedy.
 
-    The names are `median_dn`, `contrast_dn`, `saturated_share`, `sharpness`, `board_corners` and `leak_dn`.
+    The names are `median_dn`, `contrast_dn`, `saturated_share`, `sharpness`, `board_corners` and `leak_dn`; and for the
+    dark scene `snr`, `darkest_dn` and `stray_dn`, see `_scene_values`.
     """
 
     values: dict[str, float]
@@ -35,12 +36,13 @@ def check_frame(
     kind: StepKind,
     limits: CheckSettings,
     boards: Sequence[BoardSettings] = (),
-    earlier_sharpness: Sequence[float] = (),
+    earlier: Sequence[Mapping[str, float]] = (),
 ) -> Findings:
     """Measure a frame as its kind requires, and compare the values with the limits.
 
-    `pixels` are (row, column) or (row, column, colour). Sharpness is compared with earlier frames of the same step.
-    Corners of boards are only counted: a warning depends on more than one frame, see `board_warnings`.
+    `pixels` are (row, column) or (row, column, colour). Sharpness and stray light are compared with the values of
+    `earlier` frames of the same step and exposure. Corners of boards are only counted: a warning depends on more than
+    one frame, see `board_warnings`.
     """
     values: dict[str, float] = {"median_dn": float(np.median(pixels))}
     grey = _grey(pixels)
@@ -54,9 +56,9 @@ def check_frame(
         values["board_corners"] = float(_count_board_corners(grey, boards))
     if kind in DARK_KINDS:
         values["leak_dn"] = _leak_dn(grey)
-    return Findings(
-        {name: round(value, 5) for name, value in values.items()}, _warnings(kind, values, limits, earlier_sharpness)
-    )
+    if kind == "dark_scene":
+        values |= _scene_values(grey, earlier)
+    return Findings({name: round(value, 5) for name, value in values.items()}, _warnings(kind, values, limits, earlier))
 
 
 def _grey(pixels: Pixels) -> Pixels:
@@ -75,13 +77,35 @@ def _sharpness(grey: Pixels) -> float:
 
 def _leak_dn(grey: Pixels) -> float:
     """Return by how many DN the means of 8 x 8 parts of a frame differ, beyond the range expected from noise."""
-    height, width = (length // _LEAK_PARTS for length in grey.shape)
-    parts = np.asarray(grey[: height * _LEAK_PARTS, : width * _LEAK_PARTS], float).reshape(
-        _LEAK_PARTS, height, _LEAK_PARTS, width
-    )
+    parts = _parts(grey)
     # The expected range of 64 normal numbers is 4.7 standard deviations
-    noise = 4.7 * float(np.median(parts.std(axis=(1, 3)))) / np.sqrt(height * width)
+    noise = 4.7 * float(np.median(parts.std(axis=(1, 3)))) / np.sqrt(parts.shape[1] * parts.shape[3])
     return max(0.0, float(np.ptp(parts.mean(axis=(1, 3))) - noise))
+
+
+def _scene_values(grey: Pixels, earlier: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Return what a frame of the dark scene holds, by the brightest of its 8 x 8 parts and the darkest eighth of them.
+
+    `snr` is eq. (4) of the paper, (<g²> − <n²>) / <n²>: g are the pixels of the brightest part above the mean of the
+    darkest ones, n those of the darkest ones. `stray_dn` is how far this mean, `darkest_dn`, lies above the lowest of
+    the step: light that came since.
+    """
+    parts = _parts(grey)
+    mean, variance = parts.mean(axis=(1, 3)).ravel(), parts.var(axis=(1, 3)).ravel()
+    order = np.argsort(mean)
+    darkest, brightest = order[: _PARTS**2 // 8], order[-1]
+    darkest_dn, noise_dn2 = float(mean[darkest].mean()), float(variance[darkest].mean())
+    power_dn2 = float(variance[brightest] + (mean[brightest] - darkest_dn) ** 2)
+    lowest_dn = min([darkest_dn, *(values["darkest_dn"] for values in earlier if "darkest_dn" in values)])
+    values = {"darkest_dn": darkest_dn, "stray_dn": darkest_dn - lowest_dn}
+    return {"snr": power_dn2 / noise_dn2 - 1, **values} if noise_dn2 else values
+
+
+def _parts(grey: Pixels) -> NDArray[np.float64]:
+    """Return the parts of a frame, (part, row, part, column)."""
+    height, width = (length // _PARTS for length in grey.shape)
+    whole = np.asarray(grey[: height * _PARTS, : width * _PARTS], float)
+    return whole.reshape(_PARTS, height, _PARTS, width)
 
 
 def _count_board_corners(grey: Pixels, boards: Sequence[BoardSettings]) -> int:
@@ -97,7 +121,7 @@ def _count_board_corners(grey: Pixels, boards: Sequence[BoardSettings]) -> int:
 
 
 def _warnings(
-    kind: StepKind, values: dict[str, float], limits: CheckSettings, earlier_sharpness: Sequence[float]
+    kind: StepKind, values: dict[str, float], limits: CheckSettings, earlier: Sequence[Mapping[str, float]]
 ) -> tuple[str, ...]:
     warnings = []
     share = values.get("saturated_share", 0.0)
@@ -112,6 +136,7 @@ def _warnings(
             f"median {values['median_dn']:.0f} DN, limit {limits.least_flat_dn:.0f}; "
             "light the diffuser or expose longer"
         )
+    earlier_sharpness = [of_frame["sharpness"] for of_frame in earlier if "sharpness" in of_frame]
     if earlier_sharpness and values.get("sharpness", np.inf) < (
         limit := limits.sharpness_share * float(np.median(earlier_sharpness))
     ):
@@ -173,20 +198,31 @@ _MIN_FRAMES = 6
 
 
 class Settling(Struct, frozen=True):
-    """Result of `measure_settling`: the rest before an exposure, and whether the rig was seen at rest.
+    """Swing of the rig after a stop, as `measure_settling` saw it.
 
     The scatter is the median shift at rest, which is due to noise; the curve has the time in s after the stop, and the
     shift in pixels from the picture at rest.
     """
 
-    wait_s: float
-    settled: bool
     scatter_px: float
     curve: tuple[tuple[float, float], ...]
 
+    def rest_s(self, kind: StepKind, settings: SettleSettings) -> float | None:
+        """Return the rest that a step needs after a move; None if the rig was not seen to come to rest."""
+        limit_px = max(settings.limit_of(kind), 4.0 * self.scatter_px)
+        swinging = [index for index, (_, shift_px) in enumerate(self.curve) if shift_px > limit_px]
+        first_still = swinging[-1] + 1 if swinging else 0
+        # In the dark, shifts are noise; a rig that swings to the end has no picture at rest
+        seen = first_still <= _first_at_rest(len(self.curve)) and self.scatter_px <= settings.limit_px
+        return self.curve[first_still][0] if seen else None
+
+
+def _first_at_rest(frames: int) -> int:
+    return frames - frames // 3
+
 
 def measure_settling(expose: Callable[[float], Pixels], clock: Clock, settings: SettleSettings) -> Settling:
-    """Measure when the rig comes to rest; call it right after a move.
+    """Measure how the rig swings; call it right after a move.
 
     The mean of the last third of the frames is the picture r at rest. A small shift d changes a frame by ∇r · d, so d
     is the least-squares solution of ∇r · d = frame − r over all pixels. `expose` takes and returns a frame, given its
@@ -198,19 +234,10 @@ def measure_settling(expose: Callable[[float], Pixels], clock: Clock, settings: 
     while clock.now_s() - begun_s < settings.longest_s or len(frames) < _MIN_FRAMES:
         times_s.append(clock.now_s() - begun_s)
         frames.append(_smooth(expose(settings.exposure_s)))
-    at_rest = len(frames) - len(frames) // 3
+    at_rest = _first_at_rest(len(frames))
     shifts_px = _shifts_px(frames, np.mean(frames[at_rest:], axis=0))
-    scatter_px = float(np.median(shifts_px[at_rest:]))
-    swinging = np.flatnonzero(shifts_px > max(settings.limit_px, 4.0 * scatter_px))
-    first_still = int(swinging[-1]) + 1 if len(swinging) else 0
-    # In the dark, shifts are noise; a rig that swings to the end has no picture at rest
-    settled = first_still <= at_rest and scatter_px <= settings.limit_px
-    return Settling(
-        wait_s=times_s[first_still] if settled else settings.longest_s,
-        settled=settled,
-        scatter_px=round(scatter_px, 5),
-        curve=tuple((round(t, 4), round(float(shift), 4)) for t, shift in zip(times_s, shifts_px, strict=True)),
-    )
+    curve = tuple((round(t, 4), round(float(shift), 4)) for t, shift in zip(times_s, shifts_px, strict=True))
+    return Settling(round(float(np.median(shifts_px[at_rest:])), 5), curve)
 
 
 def _smooth(pixels: Pixels) -> NDArray[np.float32]:

@@ -32,7 +32,8 @@ _TO_DO: dict[StepKind, tuple[str, ...]] = {
         "Turn the lights on. From here on, move nothing until the dark-scene set is done.",
     ),
     "dark_scene": (
-        "Lights out. Cover every lamp, screen and indicator; the objects stay where they are.",
+        "Lights out. Cover every lamp, every indicator and all screens but this one, which you dim and turn away from "
+        "the scene. The objects stay where they are.",
         "Set the faint light for the scene, wait until your eyes are dark-adapted, and look for stray light.",
     ),
     "noise_reference": (
@@ -52,7 +53,8 @@ _TO_DO_AGAIN: dict[StepKind, tuple[str, ...]] = {
 _CHECK: dict[StepKind, str] = {
     "charuco": "Check that many corners are found and that no frame is saturated.",
     "bright": "Check focus and that no frame is saturated.",
-    "dark_scene": "Check that frames look empty: the scene shows only in the reconstruction.",
+    "dark_scene": "Check the SNR of each frame, and that stray light stays near 0 DN. Black and white are fixed: the "
+    "scene hardly shows before it is reconstructed.",
     "noise_reference": "Check that frames are even: a bright corner is stray light.",
     "dark": "Check that frames are even: a bright corner means that the cover leaks.",
     "flat": "Check that frames are even, bright, and not saturated.",
@@ -155,7 +157,8 @@ _STOP_S, _FRAME_S = 0.5, 0.2
 class Pace:
     """Tracks where the stage is (`here`), and learns how long a stop, a frame and a drift check (`check_s`) take.
 
-    It begins with the planned rest at each stop, and the planned time of a frame besides its exposure.
+    The rest at a stop, `rest_s` by the kind of step, is at first the planned one. So is the time of a frame besides its
+    exposure.
     """
 
     def __init__(self, stage: Gantry, clock: Clock, rest_s: float, readout_s: float) -> None:
@@ -163,7 +166,8 @@ class Pace:
         self._clock = clock
         self._stop_s: list[float] = []
         self._frame_s: dict[bool, list[float]] = {False: [], True: []}
-        self._guess_s = (_STOP_S + rest_s, _FRAME_S + readout_s)
+        self._guess_s = _FRAME_S + readout_s
+        self.rest_s = dict.fromkeys(TITLES, rest_s)
         self._departed_s = 0.0
         self._start: Point | None = None
         self._repeated = False
@@ -175,10 +179,11 @@ class Pace:
         self._departed_s, self._start = self._clock.now_s(), self.here
         self.here, self._repeated = None, False
 
-    def arrive(self, target: Point, *, timed: bool) -> None:
+    def arrive(self, target: Point, kind: StepKind, *, timed: bool) -> None:
         """Note that the stage is at rest at `target`; learn from the time it took if `timed`."""
         if timed and self._start is not None:
-            self._stop_s.append(self._clock.now_s() - self._departed_s - self._motion_s(self._start, target))
+            known_s = self._motion_s(self._start, target) + self.rest_s[kind]
+            self._stop_s.append(self._clock.now_s() - self._departed_s - known_s)
         self.here = target
 
     def finish_frame(self, begun_s: float, exposure_s: float) -> None:
@@ -192,8 +197,8 @@ class Pace:
 
     def remaining_s(self, frames: list[PlannedFrame], drift_checks: int) -> float:
         """Return how long `frames`, in this order, and a number of drift checks will take, without prompts."""
-        stop_s = median(self._stop_s) if self._stop_s else self._guess_s[0]
-        first_s = median(self._frame_s[False] or [self._guess_s[1]])
+        stop_s = median(self._stop_s or [_STOP_S])
+        first_s = median(self._frame_s[False] or [self._guess_s])
         again_s = median(self._frame_s[True] or [first_s])
         total_s = drift_checks * self.check_s
         here, last_step = self.here, None
@@ -201,7 +206,8 @@ class Pace:
             target = frame.stop.target
             arrives = target != here or frame.step != last_step
             if arrives:
-                total_s += stop_s + (self._motion_s(here, target) if here is not None else 0.0)
+                total_s += stop_s + self.rest_s[frame.kind]
+                total_s += self._motion_s(here, target) if here is not None else 0.0
             total_s += frame.exposure_s + (first_s if arrives else again_s)
             here, last_step = target, frame.step
         return total_s

@@ -45,6 +45,7 @@ class Capture:
             if self._drift.watch is not None:  # a capture that was killed may have left nothing but the last check
                 self._mark_unchecked("the capture ended")
             self._session.seal()
+            self._dialogue.show_status(self._session.frames[-1], "complete")
         finally:
             self._rig.camera.close()
             self._rig.stage.close()

@@ -95,10 +95,12 @@ class FrameTaker:
         self._session, self._rig, self._pace = dialogue.session, dialogue.rig, dialogue.pace
         self._settings = self._session.rig
         self._cooled_step: int | None = None
-        self._settle_s: float | None = None
         self._layouts: dict[str, str | None] = {}
         self._unkept_numbers = itertools.count(_FIRST_UNKEPT_NUMBER)
         self.last: PlannedFrame | None = None
+        self._measures = self._settings.settle.measure and self._rig.camera_sees_stage
+        for settling in self._session.journal.details("settling", Settling):
+            self._rest_as(settling)
 
     def take(self, frame: PlannedFrame) -> None:
         """Move to the node of a frame and take it; before the first frame of a step, wait for the sensor to be cool.
@@ -159,12 +161,11 @@ class FrameTaker:
         self._pace.depart()
         self._rig.stage.move_to(*target)
         self._drift.nodes += 1
-        measures = self._settle_s is None and frame.kind in LIT_KINDS
+        measures = self._measures and frame.kind in LIT_KINDS
         if measures:
-            self._settle_s = self._find_settling(frame)
-        # Rest after a measurement, too: its result may be the planned rest, or known from before an interruption
-        self._rig.clock.sleep_s(self._session.plan.settle_s if self._settle_s is None else self._settle_s)
-        self._pace.arrive(target, timed=not measures)
+            self._measure_settling(frame)
+        self._rig.clock.sleep_s(self._pace.rest_s[frame.kind])
+        self._pace.arrive(target, frame.kind, timed=not measures)
 
     def _expose(self, frame: PlannedFrame) -> None:
         """Take a frame at the present node; the order of these steps makes a kill at any moment harmless."""
@@ -223,30 +224,36 @@ class FrameTaker:
         if pixels is None:
             warning = "the file cannot be decoded here, so nothing was checked; look at it with the camera's program"
             return Findings({}, (warning,))
-        earlier_sharpness = [
-            committed.record.checks["sharpness"]
+        earlier = [
+            committed.record.checks
             for committed in self._session.valid().values()
-            if self._session.frames[committed.frame].step == frame.step and "sharpness" in committed.record.checks
+            if committed.frame != frame.number
+            and self._session.frames[committed.frame].step == frame.step
+            and self._session.frames[committed.frame].exposure_s == frame.exposure_s
         ]
-        return check_frame(pixels, frame.kind, self._settings.checks, self._settings.board, earlier_sharpness)
+        return check_frame(pixels, frame.kind, self._settings.checks, self._settings.board, earlier)
 
-    def _find_settling(self, frame: PlannedFrame) -> float:
-        """Return the rest in s after a move: measured earlier in this session, measured now, or planned."""
+    def _measure_settling(self, frame: PlannedFrame) -> None:
         settings = self._settings.settle
-        measured = self._session.journal.details("settling", Settling)
-        if measured:
-            return measured[-1].wait_s
-        if not (settings.measure and self._rig.camera_sees_stage):
-            return self._session.plan.settle_s
         self._dialogue.show_status(frame, "measuring how long the rig swings")
         settling = measure_settling(self._take_unkept, self._rig.clock, settings)
         self._session.journal.event("settling", frame=frame.number, **msgspec.to_builtins(settling))
-        if not settling.settled:
+        self._rest_as(settling)
+        kinds = {step.kind for step in self._session.plan.steps}
+        swinging = {kind for kind in kinds if settling.rest_s(kind, settings) is None}
+        if swinging:
             self._dialogue.warn(
-                f"the rig was not seen at rest within {settings.longest_s:g} s, which is the rest from now on; "
-                "light the scene, stiffen the rig or lower its acceleration, or set settle.measure = false"
+                f"the rig was not seen at rest to {max(map(settings.limit_of, swinging)):g} px within "
+                f"{settings.longest_s:g} s, which is the rest {'of board sweeps ' * (swinging == {'charuco'})}from now "
+                "on; light the scene, stiffen the rig or lower its acceleration, or set settle.measure = false"
             )
-        return settling.wait_s
+
+    def _rest_as(self, settling: Settling) -> None:
+        """Let the rest at each stop be the measured one; where none was seen, it is as long as the measurement."""
+        self._measures, settings = False, self._settings.settle
+        for kind in self._pace.rest_s:
+            rest_s = settling.rest_s(kind, settings)
+            self._pace.rest_s[kind] = settings.longest_s if rest_s is None else rest_s
 
     def _take_unkept(self, exposure_s: float) -> Pixels:
         exposure = self._rig.camera.expose(exposure_s, next(self._unkept_numbers))

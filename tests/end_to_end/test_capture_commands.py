@@ -107,10 +107,10 @@ def test_check_moves_nothing_and_counts_frames(shell: Shell) -> None:
         result = shell.result("check", shell.rig)
         assert not move.called
         assert not home.called
-    assert result["frames"] == 501
-    assert result["disk_bytes"] == 501 * (2 * 64 * 48 + 512)
+    assert result["frames"] == 511
+    assert result["disk_bytes"] == 511 * (2 * 64 * 48 + 512)
     assert 300.0 < result["duration_s"] < 1000.0
-    assert "501 frames in 11 steps" in shell.words
+    assert "511 frames in 11 steps" in shell.words
 
 
 def test_check_remembers_settings_of_stage(shell: Shell) -> None:
@@ -191,12 +191,12 @@ def test_capture_resumes_after_ctrl_c(small: Shell) -> None:
     with mock.patch.object(SimulatedLab, "expose", interrupted):
         assert small.run("capture", small.rig, small.session, "--yes") == 1
     assert signal.getsignal(signal.SIGINT) is before
-    assert "CaptureStopped: stopped with 7 of 42 frames taken; run the same command to go on" in small.words
+    assert "CaptureStopped: stopped with 7 of 43 frames taken; run the same command to go on" in small.words
     verdict = small.result("verify", small.session)["session"]
-    assert (verdict["present"], len(verdict["missing"]), verdict["sealed"]) == (7, 35, False)
-    assert "35 still to be taken" in small.words
-    assert small.result("capture", small.rig, small.session, "--yes")["taken"] == 35
-    assert "7 of 42 frames are there; going on" in small.words
+    assert (verdict["present"], len(verdict["missing"]), verdict["sealed"]) == (7, 36, False)
+    assert "36 still to be taken" in small.words
+    assert small.result("capture", small.rig, small.session, "--yes")["taken"] == 36
+    assert "7 of 43 frames are there; going on" in small.words
     assert small.result("capture", small.rig, small.session, "--yes")["taken"] == 0
     assert small.result("verify", small.session)["session"]["sealed"] is True
 

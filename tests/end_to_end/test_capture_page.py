@@ -91,10 +91,23 @@ def test_clicks_lead_through_capture(running: Running, browser: Tab) -> None:
     assert (verdict.problems, verdict.present, verdict.sealed) == ((), FRAMES, True)
     browser.wait_until("document.getElementById('frame').naturalWidth > 0")
     browser.wait_until("document.body.innerText.includes('00015_dark_0_r1_c1')")
-    assert f"of {FRAMES} frames" in browser.text()
+    browser.wait_until(f"document.body.innerText.includes('{FRAMES} of {FRAMES} frames')")
     assert browser.evaluate("document.querySelectorAll('#grid button').length") == 6
     assert browser.evaluate("document.querySelectorAll('#histogram path').length") == 1
     assert browser.complaints == []
+
+
+def test_page_shows_end_before_server_closes(browser: Tab) -> None:
+    panel = CapturePanel(unattended=True)
+    panel.show_status(Status("exposing", 1, 1, "Bright set", 8, 9, 1.0, (0, 0), ((0.5,),), ()))
+    with serve_page(panel) as address:
+        browser.open(address)
+        browser.wait_until("document.getElementById('title').textContent === 'Bright set'")
+        panel.show_status(Status("complete", 1, 1, "Bright set", 9, 9, 0.0, (0, 0), ((1.0,),), ()))
+        panel.end("Complete. Next: faintfield run session")
+    assert browser.evaluate("document.getElementById('title').textContent") == panel.outcome
+    assert browser.evaluate("document.getElementById('count').textContent") == "9 of 9 frames"
+    assert browser.evaluate("document.getElementById('buttons').children.length") == 0
 
 
 def test_terminal_and_page_agree(running: Running, browser: Tab, capsys: pytest.CaptureFixture[str]) -> None:

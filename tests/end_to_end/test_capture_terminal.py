@@ -63,12 +63,12 @@ def test_keys_lead_through_capture(tmp_path: Path) -> None:
         terminal.press(key)
     terminal.press("\n")
     terminal.wait_for("▀▀▀▀")
-    terminal.wait_for("board_corners")
+    terminal.wait_for("board corners")
     for sweep in range(2, 7):
         terminal.wait_for(f"Step {sweep} of 11: Board sweep {sweep}")
         terminal.press("s")
     terminal.wait_for("Step 7 of 11: Bright set")
     terminal.press("q")
     assert terminal.end() == 1
-    assert "CaptureStopped: stopped with 4 of 42 frames taken" in terminal.seen.replace("\r\n", " ")
+    assert "CaptureStopped: stopped with 4 of 43 frames taken" in terminal.seen.replace("\r\n", " ")
     assert verify(session).present == 4

@@ -180,6 +180,7 @@ def check_controls(browser: Tab) -> None:
     browser.wait_until("document.querySelector('label[for=depth]').textContent === '400 mm'")
     browser.wait_until("document.getElementById('left-picture').src.includes('plane_000_view')")
     assert not np.array_equal(shown_levels(browser, "left"), at_500_mm)
+    assert "0%" in browser.evaluate("document.getElementById('right-picture').style.clipPath")  # all of it is shown
     # The right picture begins where the line of the wipe stands
     browser.set_slider("wipe", 30)
     assert "30%" in browser.evaluate("document.getElementById('right-picture').style.clipPath")

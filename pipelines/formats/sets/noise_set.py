@@ -17,8 +17,10 @@ from faintfield.pipelines.formats.reading import is_file
 from faintfield.pipelines.formats.results.noise import NoiseFrame, TemperatureRange
 from faintfield.pipelines.formats.toml_files import inside, read_toml
 from faintfield.pipelines.formats.units import MAX_EXPOSURE_S, MAX_PERIOD_PX, sound_mosaic
+from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.session.resume import present_settings
 from faintfield.rig.session.session import PLAN, has_session, taken_frames
+from faintfield.rig.simulation.lab import flat_photons_per_s
 
 FILE_NAME = "noise.toml"
 
@@ -146,6 +148,8 @@ def _of_session(folder: Path) -> tuple[NoiseSet, list[float]]:
         if planned.kind not in ("dark", "flat"):
             continue
         photons_per_s = rig.step[planned.step].photons_per_s
+        if planned.kind == "flat" and photons_per_s is None and isinstance(rig.camera, SimulatedSettings):
+            photons_per_s = flat_photons_per_s(rig.camera)
         frame = NoiseFrame(
             file=str(path.relative_to(folder)),
             kind=planned.kind,

@@ -19,7 +19,7 @@ def values(frame: Pixels, kind: StepKind, limits: CheckSettings = CheckSettings(
 
 
 def warns(word: str, frame: Pixels, kind: StepKind, earlier: list[float] | None = None) -> bool:
-    findings = check_frame(frame, kind, CheckSettings(), (), earlier or [])
+    findings = check_frame(frame, kind, CheckSettings(), (), [{"sharpness": value} for value in earlier or []])
     return any(word in warning for warning in findings.warnings)
 
 
@@ -36,7 +36,7 @@ def scene(kind: str) -> Pixels:
 
 @pytest.mark.parametrize("kind", TITLES)
 def test_good_frames_give_no_warning(kind: StepKind) -> None:
-    findings = check_frame(scene(kind), kind, CheckSettings(), (BOARD,), [0.1])
+    findings = check_frame(scene(kind), kind, CheckSettings(), (BOARD,), [{"sharpness": 0.1}])
     assert findings.warnings == ()
     if kind == "charuco":
         assert findings.values["board_corners"] == 8 * 5
@@ -140,3 +140,18 @@ def test_warning_of_boards_out_of_view(corners: list[int], warning: str | None) 
     warnings = board_warnings(frames[len(corners) - 1], frames, dict(enumerate(corners)), 6)
     assert len(warnings) == (warning is not None)
     assert all(text.startswith(warning or "") for text in warnings)
+
+
+def test_dark_scene_states_snr_and_new_light() -> None:
+    """The light of one part has the power of eq. (4), and evenly spread light counts from the darkest frame on."""
+    generator = np.random.default_rng(8)
+    frame = generator.normal(100.0, 7.0, (480, 640))
+    frame[120:180, 320:400] += generator.normal(2.0, 0.7, (60, 80))
+    first = check_frame(frame, "dark_scene", CheckSettings()).values
+    assert first["snr"] == pytest.approx((2.0**2 + 0.7**2) / 7.0**2, abs=0.06)
+    assert first["darkest_dn"] == pytest.approx(100.0, abs=0.5)
+    assert first["stray_dn"] == 0.0
+    later = check_frame(frame + 5.0, "dark_scene", CheckSettings(), (), [first, {"darkest_dn": 110.0}])
+    assert later.values["stray_dn"] == pytest.approx(5.0)
+    assert later.values["snr"] == pytest.approx(first["snr"])
+    assert later.warnings == ()

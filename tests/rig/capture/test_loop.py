@@ -49,8 +49,8 @@ def test_operator_is_led_through_all_steps(folder: Path) -> None:
         (prompt.key, prompt.title, "go") for prompt in operator.prompts
     ]
     last = operator.statuses[-1]
-    assert (last.step, last.steps, last.done, last.total) == (3, 3, FRAMES - 1, FRAMES)
-    assert last.grid == ((-1.0, -1.0, -1.0), (-1.0, 0.75, -1.0))
+    assert (last.step, last.steps, last.done, last.total) == (3, 3, FRAMES, FRAMES)
+    assert last.grid == ((-1.0, -1.0, -1.0), (-1.0, 1.0, -1.0))
     for frame, committed, path in taken_frames(folder):
         assert path.is_file()
         assert committed.record.position_mm == pytest.approx(list(frame.stop.target), abs=0.02)
@@ -153,6 +153,13 @@ def test_stage_rests_before_every_frame(folder: Path) -> None:
 
 
 def test_settling_is_measured_once_per_session(folder: Path) -> None:
+    rests_s: dict[int, float] = {}
+    expose = SimulatedLab.expose
+
+    def watched(lab: SimulatedLab, exposure_s: float, number: int) -> NDArray[np.uint16]:
+        rests_s[number] = lab.still_s()
+        return expose(lab, exposure_s, number)
+
     swinging = replace(
         SMALL_RIG,
         camera=SimulatedSettings(size_px=(160, 120)),
@@ -161,16 +168,26 @@ def test_settling_is_measured_once_per_session(folder: Path) -> None:
         step=(StepSettings("charuco", 0.05), StepSettings("dark_scene", 0.1)),
         settle=SettleSettings(exposure_s=0.05),
     )
-    assert isinstance(capture(folder, Operator({}, {2: "stop"}), swinging), CaptureStopped)
-    assert capture(folder, settings=swinging) is None
+    with mock.patch.object(SimulatedLab, "expose", watched):
+        assert isinstance(capture(folder, Operator({}, {2: "stop"}), swinging), CaptureStopped)
+        assert capture(folder, settings=swinging) is None
     with Journal(folder / "journal.sqlite", read_only=True) as journal:
         (settling,) = journal.details("settling", Settling)
-    assert settling.settled
+    measured_s = settling.rest_s("bright", swinging.settle)
     # The swing of 1.5 mm along both axes, seen at 540 mm, decays by e every 0.25 s; frames are 0.1 s apart, and the
     # controller's reports take the first 0.2 s to 0.4 s
     shift_px = 2**0.5 * 1.5 * 200 / 540
     rest_s = 0.25 * np.log(shift_px / swinging.settle.limit_px)
-    assert rest_s - 0.4 <= settling.wait_s <= rest_s - 0.2 + 0.2
+    assert measured_s is not None
+    assert rest_s - 0.4 <= measured_s <= rest_s - 0.2 + 0.2
+    # A board waits for less swing than the scene
+    of_boards_s = settling.rest_s("charuco", swinging.settle)
+    assert of_boards_s is not None
+    assert of_boards_s >= measured_s + 0.3
+    frames = taken_frames(folder)
+    boards, scene = ([rests_s[taken.intent] for frame, taken, _ in frames if frame.step == step] for step in (0, 1))
+    assert min(boards) >= of_boards_s
+    assert measured_s <= min(scene) <= max(scene) < of_boards_s
     shifts = [shift for _, shift in settling.curve]
     assert shifts[0] > 5 * max(shifts[-10:])
 
@@ -216,7 +233,7 @@ def test_remaining_time_sums_motions_stops_exposures_checks() -> None:
     pace.depart()
     assert pace.here is None
     bench.clock.sleep_s(motion_s + 4.0)
-    pace.arrive(b, timed=True)
+    pace.arrive(b, "bright", timed=True)
     assert pace.here == b
     for exposure_s, besides_s in ((5.0, 0.9), (5.0, 0.4), (7.0, 0.6)):
         begun_s = bench.clock.now_s()

@@ -43,12 +43,11 @@ def noisy_camera(clock: SimulatedClock, shift_px: Callable[[float], float], ligh
     ids=["one shift", "slight shift above the limit", "slight shift below the limit"],
 )
 def test_settling_ends_when_the_shift_does(shift_px: Callable[[float], float], light: float, rest_s: float) -> None:
-    clock = SimulatedClock()
-    settling = measure_settling(
-        noisy_camera(clock, shift_px, light), clock, SettleSettings(exposure_s=0.05, limit_px=0.1)
-    )
-    assert settling.settled
-    assert rest_s <= settling.wait_s <= rest_s + 0.2
+    clock, settings = SimulatedClock(), SettleSettings(exposure_s=0.05, limit_px=0.1)
+    settling = measure_settling(noisy_camera(clock, shift_px, light), clock, settings)
+    measured_s = settling.rest_s("bright", settings)
+    assert measured_s is not None
+    assert rest_s <= measured_s <= rest_s + 0.2
 
 
 @pytest.mark.parametrize(
@@ -57,10 +56,9 @@ def test_settling_ends_when_the_shift_does(shift_px: Callable[[float], float], l
     ids=["never at rest", "dark"],
 )
 def test_motion_and_darkness_are_not_rest(shift_px: Callable[[float], float], light: float) -> None:
-    clock = SimulatedClock()
-    settling = measure_settling(noisy_camera(clock, shift_px, light), clock, SettleSettings(exposure_s=0.05))
-    assert not settling.settled
-    assert settling.wait_s == 3.0
+    clock, settings = SimulatedClock(), SettleSettings(exposure_s=0.05)
+    settling = measure_settling(noisy_camera(clock, shift_px, light), clock, settings)
+    assert settling.rest_s("bright", settings) is None
 
 
 def shifted(x_px: float, y_px: float) -> NDArray[np.float64]:
@@ -79,12 +77,13 @@ def test_curve_shows_the_shift_of_each_frame() -> None:
         clock.sleep_s(exposure_s + 0.09)
         return shifted(*next(waiting))
 
-    settling = measure_settling(expose, clock, SettleSettings(exposure_s=0.01, longest_s=0.85))
+    settings = SettleSettings(exposure_s=0.01, longest_s=0.85)
+    settling = measure_settling(expose, clock, settings)
     times_s, curve_px = zip(*settling.curve, strict=True)
     assert times_s == pytest.approx([0.1 * k for k in range(9)], abs=1e-6)
     assert curve_px == pytest.approx([math.hypot(*shift) for shift in shifts_px], abs=0.03)
-    assert settling.settled
-    assert settling.wait_s == pytest.approx(0.3)  # 0.05 px after it do no harm
+    assert settling.rest_s("bright", settings) == pytest.approx(0.3)  # 0.05 px after it do no harm
+    assert settling.rest_s("charuco", settings) == pytest.approx(0.4)  # but to the corners of a board
     assert settling.scatter_px == pytest.approx(0.0, abs=1e-4)
 
 
@@ -96,7 +95,7 @@ def test_slow_camera_takes_six_frames_at_least() -> None:
         clock.sleep_s(1.0)
         return frames.pop(0)
 
-    settling = measure_settling(expose, clock, SettleSettings(longest_s=2.0))
+    settings = SettleSettings(longest_s=2.0)
+    settling = measure_settling(expose, clock, settings)
     assert frames == []
-    assert settling.settled
-    assert settling.wait_s == pytest.approx(4.0)
+    assert settling.rest_s("bright", settings) == pytest.approx(4.0)

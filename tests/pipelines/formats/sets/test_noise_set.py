@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from faintfield.calib.estimate import Estimate
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import sha256
 from faintfield.pipelines.formats.results.noise import NoiseFrame
@@ -22,6 +23,7 @@ from faintfield.pipelines.formats.sets.noise_set import (
 from faintfield.rig.plan import StepKind
 from faintfield.rig.session.session import taken_frames
 from faintfield.rig.simulation.lab import SimulatedCamera, SimulatedLab
+from faintfield.rig.simulation.optics import SimulatedSensor
 from tests.calib.noise.darkroom import specimen
 from tests.pipelines.by_hand import FITTED, write_fitted_noise
 from tests.pipelines.conftest import SetMaker
@@ -151,3 +153,11 @@ def test_only_darks_beyond_the_limit_are_named(tmp_path: Path, capfd: pytest.Cap
     )
     alone = load_noise_set(write_frames(tmp_path / "set", take_set(*specimen(1))))
     assert not [warning for warning in alone.warnings if "away from the scene" in warning]
+
+
+def test_simulated_flats_give_efficiency_without_warning(tmp_path: Path) -> None:
+    record = measure_sensor(captured(tmp_path, rig_toml(["dark", "flat"], rows=1, columns=1)))
+    assert record.warnings == []
+    assert isinstance(record.quantum_efficiency, Estimate)
+    low, high = record.quantum_efficiency.ci95 or (0.0, 0.0)
+    assert low < SimulatedSensor().quantum_efficiency < high
