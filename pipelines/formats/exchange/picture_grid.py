@@ -24,7 +24,7 @@ from faintfield.pipelines.errors import BadValue, WrongBitDepth
 from faintfield.pipelines.formats.exchange.arranged_grid import arrange_grid
 from faintfield.pipelines.formats.exchange.hci import described_grid, write_true_depth
 from faintfield.pipelines.formats.exchange.image_grid import ImageGrid, find_grid
-from faintfield.pipelines.formats.exchange.imported_set import read_picture, write_imported_set
+from faintfield.pipelines.formats.exchange.imported_set import check_set_free, read_picture, write_imported_set
 from faintfield.pipelines.formats.exchange.options import GridOptions
 from faintfield.pipelines.formats.files import require_room
 from faintfield.pipelines.formats.frames import IMAGE_SUFFIXES, RAW_SUFFIXES, pages_in, read_frame
@@ -59,6 +59,7 @@ class ImportedGrid(msgspec.Struct, frozen=True):
 
 def import_pictures(src: Path, out: Path, options: GridOptions) -> ImportedGrid:
     """Make an elemental set of the pictures in a folder or a file, put in order by what they show."""
+    check_set_free(out, options, src)
     recorded = {name: value for name, value in asdict(options).items() if name != "overwrite"}
     pitch_mm, fx_px, disparity_px = options.pitch_mm, options.fx_px, options.disparity_px
     described = described_grid(src)
