@@ -28,7 +28,7 @@ from faintfield.pipelines.formats.exchange.imported_light import (
 )
 from faintfield.pipelines.formats.exchange.options import GridOptions, ImportOptions
 from faintfield.pipelines.formats.files import check_free, sha256, write_json, writing_folder
-from faintfield.pipelines.formats.frames import RAW_SUFFIXES, Frame, exif_exposure_s, read_frame
+from faintfield.pipelines.formats.frames import RAW_SUFFIXES, Frame, exif_exposure_s, picture_kind, read_frame
 from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.formats.provenance import Provenance, provenance
 from faintfield.pipelines.formats.reading import is_file
@@ -46,9 +46,6 @@ from faintfield.pipelines.formats.units import MAX_ANGLE_RAD, MAX_LENGTH_MM, Uni
 
 # Largest error of the columns of a rotation in length and right angles, as rounded numbers have it.
 _ROTATION_TOLERANCE = 1e-2
-
-# Files whose compression changes values, and with them the noise.
-_LOSSY_SUFFIXES = {".jpg", ".jpeg"}
 
 
 @dataclass(frozen=True)
@@ -227,7 +224,7 @@ def write_imported_set(
             _view(_copy(image.path, folder, first, tone), image, images[reference])
             for image in progress(images, "copying pictures")
         ]
-        lossy = inputs[-1].suffix.lower() in _LOSSY_SUFFIXES
+        lossy = picture_kind(inputs[-1]) == ".jpg"  # whose compression changes values, and with them the noise
         complete, origin = complete_noise(sensor, Pictures(folder, views, first, tone, lossy))
         settings = ElementalSetFile(
             format=1,

@@ -27,7 +27,7 @@ from faintfield.pipelines.formats.exchange.image_grid import ImageGrid, find_gri
 from faintfield.pipelines.formats.exchange.imported_set import check_set_free, read_picture, write_imported_set
 from faintfield.pipelines.formats.exchange.options import GridOptions
 from faintfield.pipelines.formats.files import require_room
-from faintfield.pipelines.formats.frames import IMAGE_SUFFIXES, RAW_SUFFIXES, pages_in, read_frame
+from faintfield.pipelines.formats.frames import IMAGE_SUFFIXES, RAW_SUFFIXES, pages_in, picture_kind, read_frame
 from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.formats.reading import is_file
 from faintfield.pipelines.formats.sets.elemental_file import Arrangement
@@ -148,7 +148,7 @@ def _unpacked(src: Path, options: GridOptions, running: tuple[int, int] | None) 
 def _divide_file(src: Path, folder: Path, rows: int | None, columns: int | None) -> tuple[ImageGrid, _Views]:
     """Return the grid of the views in one file, as files of their own that are not written yet, and these views."""
     readable = IMAGE_SUFFIXES - RAW_SUFFIXES
-    if src.suffix.lower() not in readable:
+    if picture_kind(src) not in readable:
         raise BadValue(
             f"{src}: is no file that views are unpacked from (these are {', '.join(sorted(readable))}); name a folder "
             "of pictures, a TIFF with a picture for each view, or a picture that holds them in rows and columns"
