@@ -144,7 +144,7 @@ def check_free(
             kept = [name for name in held if not any(fnmatchcase(name, pattern) for pattern in replace_only)]
     if kept:
         raise OutputExists(
-            f"{out}: holds files already ({_some(kept)}) that are not overwritten; name a new or empty folder"
+            f"{out}: holds files already ({some(kept)}) that are not overwritten; name a new or empty folder"
         )
     for path in reads:
         # A link counts both where it leads and where it lies
@@ -152,12 +152,13 @@ def check_free(
             raise OutputExists(f"{out}: holds {path}, which is read; name another folder")
     if held and not overwrite:
         raise OutputExists(
-            f"{out}: holds an earlier result ({_some(held)}); give --overwrite to replace it, or name another folder"
+            f"{out}: holds an earlier result ({some(held)}); give --overwrite to replace it, or name another folder"
         )
 
 
-def _some(names: Sequence[str]) -> str:
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+def some(names: Sequence[str], join: str = ", ") -> str:
+    """Return the first three of some names, and how many more there are."""
+    return join.join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 @contextmanager

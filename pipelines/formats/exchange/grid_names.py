@@ -105,9 +105,14 @@ def pictures_in(folder: Path, *, every: bool = False) -> tuple[list[Path], list[
             "them; leave one kind in the folder"
         )
     # Pictures of another kind whose names differ in their numbers only are views, too
-    forms = {re.sub(_WHOLE, "0", path.stem) for path in common}
-    foreign = [path for path in rest if re.sub(_WHOLE, "0", path.stem) not in forms]
+    forms = {name_form(path) for path in common}
+    foreign = [path for path in rest if name_form(path) not in forms]
     return _leave_out(pictures, foreign, remarks, f"of another kind than the {count} {kind} files"), remarks
+
+
+def name_form(path: Path) -> str:
+    """Return a name without suffix and with 0 for each number: alike for pictures of one series."""
+    return re.sub(_WHOLE, "0", path.stem)
 
 
 def _kinds_of(files: Sequence[Path]) -> dict[Path, str]:
