@@ -329,6 +329,11 @@ def folders_in(folder: Path) -> list[Path]:
     return sorted(Path(entry) for entry in _list_folder(folder) if _is_folder(entry))
 
 
+def files_in(folder: Path) -> list[Path]:
+    """Return what is in a folder but folders, in order; MissingFile if it cannot be listed."""
+    return sorted(Path(entry) for entry in _list_folder(folder) if not _is_folder(entry))
+
+
 def _list_folder(folder: Path) -> list[os.DirEntry[str]]:
     with naming_unreadable(folder, "make it readable, or move it away"), os.scandir(folder) as entries:
         return list(entries)

@@ -94,9 +94,9 @@ def open_set(
     if has_session(folder):
         elemental_set = load_session(folder, scene, geometry)
         out = out or folder / RECONSTRUCTIONS / ("" if scene == "dark_scene" else scene)
-    elif out is None:
-        raise WrongUsage("no folder for the results is named; give --out")
     else:
         elemental_set = load_set(folder)
+        if out is None:
+            raise WrongUsage("no folder for the results is named; give --out")
         elemental_set = elemental_set if geometry is None else with_measured_geometry(elemental_set, geometry)
     return keeping_frames(elemental_set, out), out
