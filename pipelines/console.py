@@ -7,13 +7,9 @@ import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sized
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.text import Text
-
-if TYPE_CHECKING:
-    from rich.progress import Progress
 
 console = Console(stderr=True, highlight=False, soft_wrap=True, emoji=False)
 
@@ -63,36 +59,45 @@ def inform(text: str) -> None:
     logger.info(line)
 
 
-def progress[T](items: Iterable[T], label: str, total: int | None = None) -> Generator[T]:
+def progress[T](
+    items: Iterable[T],
+    label: str,
+    total: int | None = None,
+    *,
+    cost: Callable[[T], float] | None = None,
+    total_cost: float | None = None,
+) -> Generator[T]:
     """Yield `items`; draw a bar with the time left on a terminal, else say every 10 s how many are done.
 
-    `total` is the number of items, if they have no length.
+    `total` is the number of items, if they have no length. Where items differ in what they cost, by a known `cost`, the
+    time left follows from that and the `total_cost`.
     """
+    report = _Report(label, len(items) if total is None and isinstance(items, Sized) else total, total_cost)
     # Redraw only on a terminal: the thread of a generator that its caller abandons would block the exit
-    if not console.is_terminal:
-        report = _Report(label, len(items) if total is None and isinstance(items, Sized) else total)
-        with _said_while(report):
-            for item in items:
-                yield item
-                report.done += 1
-        return
-    with _bar() as bar:
-        _bars.append(label)
-        try:
-            yield from bar.track(items, description=visible(label), total=total)
-        finally:
-            _bars.remove(label)
+    with _drawn(report) if console.is_terminal else _said_while(report):
+        for item in items:
+            yield item
+            report.advance(cost(item) if cost else 1.0)
 
 
-def _bar() -> "Progress":
+@contextmanager
+def _drawn(report: "_Report") -> Iterator[None]:
+    """Draw the bar of a report."""
     from rich import progress as parts  # help loads this module, and draws no bar
 
-    columns = (
-        parts.TextColumn("{task.description}", markup=False),
-        *(parts.BarColumn(), parts.MofNCompleteColumn(), parts.TimeElapsedColumn()),
-        *(parts.TextColumn("to go"), parts.TimeRemainingColumn()),
-    )
-    return parts.Progress(*columns, console=console, transient=True)
+    class State(parts.ProgressColumn):
+        def render(self, task: parts.Task) -> Text:
+            return Text(report.state())
+
+    columns = (parts.TextColumn("{task.description}", markup=False), parts.BarColumn(), State())
+    with parts.Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task(visible(report.label), total=report.total)
+        report.on_advance = lambda: bar.advance(task)
+        _bars.append(report.label)
+        try:
+            yield
+        finally:
+            _bars.remove(report.label)
 
 
 @contextmanager
@@ -109,17 +114,50 @@ def working(label: str) -> Iterator[None]:
 
 @dataclass(eq=False)
 class _Report:
-    """Lines about work that takes long: the first after 2 s, then one every 10 s, with the steps done if they count."""
+    """Lines about work that takes long: the first after 2 s, then one every 10 s, with the steps done if they count.
+
+    `total_cost` is what all steps cost, by default one each.
+    """
 
     label: str
     total: int | None = None
-    done: int = 0
+    total_cost: float | None = None
     clock: Callable[[], float] = time.monotonic
 
     def __post_init__(self) -> None:
         self.spoke = False
-        self._started = self.clock()
+        self.done = 0
+        self.on_advance: Callable[[], object] = lambda: None
+        self._started = self._advanced = self.clock()
         self._due = self._started + _FIRST_LINE_S
+        self._cost_left = float(self.total or 0) if self.total_cost is None else self.total_cost
+        self._cost_done = 0.0
+
+    def advance(self, cost: float = 1.0) -> None:
+        """Count one more step as done."""
+        self._advanced = self.clock()
+        self.done += 1
+        self._cost_done += cost
+        self._cost_left -= cost
+        self.on_advance()
+
+    def state(self) -> str:
+        """Return the steps done, the time since the beginning, and about how long the rest takes."""
+        steps = "" if self.total is None else f"{self.done} of {self.total}, "
+        left_s = self.left_s()
+        left = "" if left_s is None else f", about {_duration(left_s)} to go"
+        return f"{steps}{_duration(self.clock() - self._started)}{left}"
+
+    def left_s(self) -> float | None:
+        """Return about how long the remaining steps take, None before it can be known.
+
+        While a step goes on, this falls by the time that passes, down to what the steps after it take.
+        """
+        if not self.total or not 0 < self.done < self.total:
+            return None
+        per_cost_s = (self._advanced - self._started) / self._cost_done
+        left_s = per_cost_s * self._cost_left
+        return left_s - min(self.clock() - self._advanced, left_s / (self.total - self.done))
 
     def wait_s(self) -> float:
         """Return the time until the next line."""
@@ -132,12 +170,7 @@ class _Report:
             return None
         self._due = now + _NEXT_LINE_S
         self.spoke = True
-        passed_s = now - self._started
-        steps = "" if self.total is None else f"{self.done} of {self.total}, "
-        left = ""
-        if self.total and self.done:
-            left = f", about {_duration(passed_s * (self.total - self.done) / self.done)} to go"
-        return f"{self.label}: {steps}{_duration(passed_s)}{left}"
+        return f"{self.label}: {self.state()}"
 
 
 def _duration(seconds: float) -> str:

@@ -8,12 +8,13 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import takewhile
 from json import dumps
 from pathlib import Path
 from typing import Annotated, Literal
 
 import msgspec
-from cyclopts import App, CycloptsError, CycloptsPanel, Group, Parameter
+from cyclopts import App, CycloptsError, CycloptsPanel, Group, Parameter, UnusedCliTokensError
 
 import faintfield
 from faintfield.pipelines.console import framed_console, inform, visible
@@ -77,13 +78,31 @@ _START = """Start with: faintfield demo first-demo
 
 The --help of every command ends with an example; docs/guide.md leads from the parts list to the first plane."""
 
+
+def _words_of_usage(failure: CycloptsError) -> str:
+    """Return what is wrong with the words of a command, and of words without a place what to do with them."""
+    unused = failure.unused_tokens if isinstance(failure, UnusedCliTokensError) else None
+    if not unused or failure.app is None:
+        return str(failure)
+    repeatable = {item.name for item in failure.app.assemble_argument_collection() if item.token_count()[1]}
+    tokens = failure.root_input_tokens or []
+    words = [part for token in tokens for part in (token.split("=", 1) if token.startswith("--") else [token])]
+    for option, *values in (words[place:] for place, word in enumerate(words) if word in repeatable):
+        if values[1:2] == unused[:1]:
+            several = [values[0], *takewhile(unused.__contains__, values[1:])]
+            calls = " ".join(f"{option} {value}" for value in several)
+            return f"{option} takes one value each time; repeat it for several: {calls}"
+    command = " ".join((app.name[0], *(failure.command_chain or ())))
+    return f"{' '.join(unused)}: no place for this; put a name with spaces in quotes, or see {command} --help"
+
+
 app = App(
     name="faintfield",
     help="See in the dark: reconstruct the planes of a scene from a grid of photon-starved images.",
     help_epilogue=_START,
     version=lambda: faintfield.__version__,
     error_console=framed_console,
-    error_formatter=lambda failure: CycloptsPanel(visible(str(failure))),
+    error_formatter=lambda failure: CycloptsPanel(visible(_words_of_usage(failure))),
     help_format="plaintext",  # the help of a command is in Markdown, which takes long to load
     default_parameter=Parameter(negative=()),
     result_action="return_value",

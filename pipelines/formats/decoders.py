@@ -30,6 +30,10 @@ type Accept = Callable[[int, int, int], None]
 # What the content of a PNG or JPEG file begins with.
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 
+# Likewise of others; a BMP has the size of its second header at byte 14.
+_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_BMP_HEADER_BYTES = (12, 40, 52, 56, 64, 108, 124)
+
 # Number of channels of a PNG, by its colour type; a palette is decoded to colours.
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}
 
@@ -64,7 +68,7 @@ _NETPBM = re.compile(
 _NETPBM_CHANNELS = {b"P5": 1, b"P6": 3, b"Pf": 1, b"PF": 3}
 
 # Bytes in which the header of such a file ends, and those of an OpenEXR file.
-_MAX_HEADER_BYTES, _MAX_EXR_HEADER_BYTES = 4096, 1_000_000
+MAX_HEADER_BYTES, _MAX_EXR_HEADER_BYTES = 4096, 1_000_000
 
 # Ways in which a BMP may be stored: uncompressed, with or without masks of its colours.
 _BMP_UNCOMPRESSED = (0, 3, 6)
@@ -74,6 +78,23 @@ _EXR = b"\x76\x2f\x31\x01"
 # Messages of the libraries are dropped: the failure says it all.
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+
+
+def kind_of_content(head: bytes) -> str | None:
+    """Return the suffix of the kind of picture whose file has this beginning, None if it is none that is decoded here.
+
+    A raw file is a TIFF by its beginning.
+    """
+    if head.startswith((_PNG, _JPEG)):
+        return ".png" if head.startswith(_PNG) else ".jpg"
+    if head.startswith(_TIFF):
+        return ".tif"
+    if head.startswith(_EXR):
+        return ".exr"
+    if head.startswith(b"BM") and int.from_bytes(head[14:18], "little") in _BMP_HEADER_BYTES:
+        return ".bmp"
+    netpbm = _NETPBM.match(head)
+    return None if netpbm is None else ".pfm" if netpbm[1] in (b"Pf", b"PF") else ".ppm"
 
 
 def decode_tiff(file: BufferedReader, path: Path, accept: Accept, number: int | None = None) -> NDArray[Any]:
@@ -211,7 +232,7 @@ def decode_netpbm(file: BufferedReader, path: Path, accept: Accept) -> tuple[NDA
 
     Whole numbers have 8 bits, or 16 if white is above 255; float ones are as they stand in the file, top row first.
     """
-    header = _NETPBM.match(file.read(_MAX_HEADER_BYTES))
+    header = _NETPBM.match(file.read(MAX_HEADER_BYTES))
     if header is None:
         raise ValueError("not a PGM, PPM or PFM file, or truncated")
     kind, width, height = header[1], int(header[2]), int(header[3])

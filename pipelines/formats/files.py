@@ -6,7 +6,7 @@ import os
 import secrets
 import shutil
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -79,21 +79,17 @@ def write_record(path: Path, record: msgspec.Struct) -> None:
 
 @contextmanager
 def writing_folder(
-    out: Path, *, replace_if: str | None = None, replace_only: Collection[str] = (), reads: Iterable[Path] = ()
+    out: Path,
+    *,
+    replace_if: str | None = None,
+    replace_only: Collection[str] = (),
+    overwrite: bool = True,
+    reads: Iterable[Path] = (),
 ) -> Iterator[Path]:
-    """Yield a temporary folder, which becomes `out` when the block ends without an exception.
-
-    An earlier `out` is replaced if it is empty, holds the file `replace_if`, or only names that match the patterns
-    `replace_only`; OutputExists if it holds something else, or a path of `reads`.
-    """
+    """Yield a temporary folder, which becomes `out` when the block ends without an exception; see `check_free`."""
+    check_free(out, replace_if=replace_if, replace_only=replace_only, overwrite=overwrite, reads=reads)
     with translated_write_errors(out):
         out = out.resolve()
-        check_free(out, replace_if=replace_if, replace_only=replace_only)
-    for path in reads:
-        # A link counts both where it leads and where it lies
-        if any(place.resolve().is_relative_to(out) for place in (path, path.parent)):
-            raise OutputExists(f"{out}: holds {path}, which is read; name another folder")
-    with translated_write_errors(out):
         out.parent.mkdir(parents=True, exist_ok=True)
         building = out.with_name(f".{out.name}.{secrets.token_hex(4)}")  # named first, as in `writing`
         try:
@@ -124,16 +120,45 @@ def _put_in_place(building: Path, out: Path) -> None:
     shutil.rmtree(replaced, ignore_errors=True)
 
 
-def check_free(out: Path, *, replace_if: str | None = None, replace_only: Collection[str] = ()) -> None:
-    """Refuse `out` if it holds anything, unless it holds the file `replace_if`, or only names of `replace_only`."""
-    if not out.exists() or (replace_if is not None and (out / replace_if).is_file()):
-        return
-    if not out.is_dir():
-        raise OutputExists(f"{out}: is a file, and a folder is to be written there; name another place")
-    kept = [path.name for path in out.iterdir() if not any(fnmatchcase(path.name, name) for name in replace_only)]
+def check_free(
+    out: Path,
+    *,
+    replace_if: str | None = None,
+    replace_only: Collection[str] = (),
+    overwrite: bool = True,
+    reads: Iterable[Path] = (),
+) -> None:
+    """Refuse a folder that would be replaced, and is none that may be; before the work that leads to its content.
+
+    An earlier `out` may be replaced if it is empty or, to `overwrite`, if it holds the file `replace_if`, or only names
+    that match the patterns `replace_only`. Raises OutputExists if it is another, or holds a path of `reads`.
+    """
+    with translated_write_errors(out):
+        out = out.resolve()
+        if out.exists() and not out.is_dir():
+            raise OutputExists(f"{out}: is a file, and a folder is to be written there; name another place")
+        held = sorted(path.name for path in out.iterdir()) if out.exists() else []
+        if replace_if is not None and (out / replace_if).is_file():
+            kept = []
+        else:
+            kept = [name for name in held if not any(fnmatchcase(name, pattern) for pattern in replace_only)]
     if kept:
-        named = ", ".join(sorted(kept)[:3]) + (f" and {len(kept) - 3} more" if len(kept) > 3 else "")
-        raise OutputExists(f"{out}: holds files already ({named}) that are not overwritten; name a new or empty folder")
+        raise OutputExists(
+            f"{out}: holds files already ({some(kept)}) that are not overwritten; name a new or empty folder"
+        )
+    for path in reads:
+        # A link counts both where it leads and where it lies
+        if any(place.resolve().is_relative_to(out) for place in (path, path.parent)):
+            raise OutputExists(f"{out}: holds {path}, which is read; name another folder")
+    if held and not overwrite:
+        raise OutputExists(
+            f"{out}: holds an earlier result ({some(held)}); give --overwrite to replace it, or name another folder"
+        )
+
+
+def some(names: Sequence[str], join: str = ", ") -> str:
+    """Return the first three of some names, and how many more there are."""
+    return join.join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 @contextmanager
@@ -175,6 +200,12 @@ def exclusive(folder: Path) -> Iterator[None]:
         with suppress(OSError):
             folder.rmdir()
         os.close(descriptor)
+
+
+def check_results_folder(folder: Path) -> None:
+    """Refuse a folder of results that cannot be, or is busy, before the work that leads to them; see `exclusive`."""
+    with exclusive(folder):
+        pass
 
 
 def remove(path: Path) -> None:
@@ -296,6 +327,11 @@ def files_below(directory: Path, name: str) -> list[Path]:
 def folders_in(folder: Path) -> list[Path]:
     """Return the folders in a folder, in order; MissingFile if it cannot be listed."""
     return sorted(Path(entry) for entry in _list_folder(folder) if _is_folder(entry))
+
+
+def files_in(folder: Path) -> list[Path]:
+    """Return what is in a folder but folders, in order; MissingFile if it cannot be listed."""
+    return sorted(Path(entry) for entry in _list_folder(folder) if not _is_folder(entry))
 
 
 def _list_folder(folder: Path) -> list[os.DirEntry[str]]:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from faintfield.calib.lens import MAX_PIXELS, MAX_SIDE_PX
 from faintfield.pipelines.errors import InputError, MissingFile, UnknownFormat, UnreadableImage, WrongSize
 from faintfield.pipelines.formats.decoders import (
+    MAX_HEADER_BYTES,
     NETPBM_SUFFIXES,
     OVERHEAD_BYTES,
     Accept,
@@ -28,16 +29,20 @@ from faintfield.pipelines.formats.decoders import (
     decode_netpbm,
     decode_photo,
     decode_tiff,
+    kind_of_content,
 )
 from faintfield.pipelines.formats.reading import is_file, opened
 from faintfield.pipelines.formats.units import MAX_EXPOSURE_S, MAX_FRAME_BYTES
 from faintfield.rig.files import require_size
 
-TIFF_SUFFIXES = {".tif", ".tiff"}
-PHOTO_SUFFIXES = {".png", ".jpg", ".jpeg"}
+_TIFF_SUFFIXES = {".tif", ".tiff"}
+_PHOTO_SUFFIXES = {".png", ".jpg", ".jpeg"}
 RAW_SUFFIXES = {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw", ".3fr", ".iiq"}
-PLAIN_SUFFIXES = NETPBM_SUFFIXES | {".bmp", ".exr"}
-IMAGE_SUFFIXES = TIFF_SUFFIXES | PHOTO_SUFFIXES | PLAIN_SUFFIXES | RAW_SUFFIXES
+_PLAIN_SUFFIXES = NETPBM_SUFFIXES | {".bmp", ".exr"}
+IMAGE_SUFFIXES = _TIFF_SUFFIXES | _PHOTO_SUFFIXES | _PLAIN_SUFFIXES | RAW_SUFFIXES
+
+# Suffixes of one kind of picture, and that by which `picture_kind` calls it.
+_ALIKE = {".tiff": ".tif", ".jpeg": ".jpg", ".pnm": ".ppm", ".pgm": ".ppm"}
 
 _COLOUR_NAMES = {"R": "red", "G": "green", "B": "blue"}
 _RGB = ("red", "green", "blue")
@@ -162,10 +167,6 @@ def read_frame(
     """
     if not is_file(path):
         raise MissingFile(f"{path}: no such image file; put it there or correct the name")
-    suffix = path.suffix.lower()
-    if suffix not in IMAGE_SUFFIXES:
-        readable = ", ".join(sorted(IMAGE_SUFFIXES))
-        raise UnknownFormat(f"{path}: '{suffix}' is not a format that is read; use one of {readable}")
 
     def accept(width: int, height: int, size_bytes: int) -> None:
         _require_sane_size(path, width, height, size_bytes)
@@ -179,9 +180,13 @@ def read_frame(
     if expected_px is not None and page is None:
         most = expected_px[0] * expected_px[1] * _MAX_PIXEL_BYTES
     with opened(path) as file:
+        kind = _kind(file, path)
+        if kind is None:
+            readable = ", ".join(sorted(IMAGE_SUFFIXES))
+            raise UnknownFormat(f"{path}: '{path.suffix}' is not a format that is read; use one of {readable}")
         try:
             require_size(file, most + OVERHEAD_BYTES)  # decoders read what a header states before they tell its size
-            frame = _decoded(file, path, suffix, accept, page)
+            frame = _decoded(file, path, kind, accept, page)
         except InputError:
             raise
         except Exception as failure:  # decoders raise exceptions of a dozen types
@@ -212,9 +217,29 @@ def read_ahead[Item, Content](
                 content.cancel()
 
 
+def picture_kind(path: Path) -> str | None:
+    """Return the kind of picture in a file, as a suffix such as ".jpg", whatever its name; None if none is read.
+
+    A raw file is known by its suffix alone. So is a damaged one of any kind.
+    """
+    with opened(path) as file:
+        return _kind(file, path)
+
+
+def _kind(file: BufferedReader, path: Path) -> str | None:
+    suffix = path.suffix.lower()
+    if suffix in RAW_SUFFIXES:
+        return suffix
+    kind = kind_of_content(file.peek(MAX_HEADER_BYTES))
+    # Raw files of other makers are TIFFs, too, whose first picture is a small one
+    if kind is None or (kind == ".tif" and suffix not in IMAGE_SUFFIXES | {""}):
+        return _ALIKE.get(suffix, suffix) if suffix in IMAGE_SUFFIXES else None
+    return kind
+
+
 def pages_in(path: Path) -> int:
     """Return how many pictures of one size and type a file holds, one after the other; 1 for all files but TIFF."""
-    if path.suffix.lower() not in TIFF_SUFFIXES:
+    if picture_kind(path) != ".tif":
         return 1
     with opened(path) as file:
         try:
@@ -233,16 +258,16 @@ def _require_sane_size(path: Path, width: int, height: int, size_bytes: int) -> 
         )
 
 
-def _decoded(file: BufferedReader, path: Path, suffix: str, accept: Accept, page: int | None) -> Frame:
-    if suffix in RAW_SUFFIXES:
+def _decoded(file: BufferedReader, path: Path, kind: str, accept: Accept, page: int | None) -> Frame:
+    if kind in RAW_SUFFIXES:
         return _read_raw(file, path, accept)
     white_dn = None
-    if suffix in NETPBM_SUFFIXES:
+    if kind in NETPBM_SUFFIXES:
         pixels, white_dn = decode_netpbm(file, path, accept)
-    elif suffix in TIFF_SUFFIXES:
+    elif kind == ".tif":
         pixels = decode_tiff(file, path, accept, page)
     else:
-        decode = {".bmp": decode_bmp, ".exr": decode_exr}.get(suffix, decode_photo)
+        decode = {".bmp": decode_bmp, ".exr": decode_exr}.get(kind, decode_photo)
         pixels = decode(file, path, accept)
     return Frame(pixels[:, :, :3] if pixels.ndim == 3 and pixels.shape[2] == 4 else pixels, saturation_dn=white_dn)
 

@@ -118,13 +118,18 @@ def _check(elemental_set: ElementalSet, folders: Iterable[Path], request: Reques
         )
     if not request.with_depth_map:
         return
+    refuse_surfaces(folders)
+    check_views(elemental_set, "a depth map")
+    check_overlap(elemental_set, _range_mm(request))
+
+
+def refuse_surfaces(folders: Iterable[Path]) -> None:
+    """Refuse folders that hold a surface, and so can hold no depth map (OutputExists)."""
     for folder in folders:
         if (folder / SURFACE_FILE).exists():
             raise OutputExists(
                 f"{folder}: holds a surface, whose files have the names of the depth map's; give another --out"
             )
-    check_views(elemental_set, "a depth map")
-    check_overlap(elemental_set, _range_mm(request))
 
 
 def _range_mm(request: Request) -> tuple[float, float]:

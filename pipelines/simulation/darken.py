@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.console import progress
 from faintfield.pipelines.errors import BadValue
-from faintfield.pipelines.formats.files import write_json, writing_folder
+from faintfield.pipelines.formats.files import check_free, write_json, writing_folder
 from faintfield.pipelines.formats.frames import ChannelLayout
 from faintfield.pipelines.formats.image_files import ONE_PIXEL, mask_picture, write_plane, write_png
 from faintfield.pipelines.formats.provenance import provenance
@@ -44,12 +44,13 @@ class Darkened(msgspec.Struct, frozen=True):
 
 def darken_set(folder: Path, out: Path, options: DarkeningOptions, *, overwrite: bool = False) -> Darkened:
     """Expose each view of a bright set anew with few photons, and write the dark set; BadValue if none has the SNR."""
+    check_free(out, replace_if=FILE_NAME, overwrite=overwrite, reads=[folder])
     bright = load_set(folder)
     layouts = bright.layouts
     light = _light(bright, bright.image_paths[bright.reference_view], layouts)
     region, scale_e = _region_and_scale(folder, light, options)
     photons = float(light[region].mean()) * scale_e / options.quantum_efficiency
-    with writing_folder(out, replace_if=FILE_NAME if overwrite else None, reads=[folder]) as target:
+    with writing_folder(out, replace_if=FILE_NAME, overwrite=overwrite, reads=[folder]) as target:
         _write_dark_views(bright, layouts, target, options, scale_e)
         write_png(target / OBJECT_REGION, mask_picture(region))
         origin = provenance("darken", options, bright.input_hashes())

@@ -52,7 +52,7 @@ def write_synthetic_set(out: Path, options: SyntheticOptions, *, overwrite: bool
     experiment = _experiment(options)
     sensor = experiment.sensor
     dark_e = sensor.dark_current_e_per_s * options.exposure_s
-    with writing_folder(out, replace_if=FILE_NAME if overwrite else None) as folder:
+    with writing_folder(out, replace_if=FILE_NAME, overwrite=overwrite) as folder:
         true = experiment.poses_rt_cam_ref(options.position_error_mm, options.rotation_error_mrad * 1e-3, generator)
         scene = render_scene(experiment, true, ("RG", "GB") if options.colour == "bayer" else None)
         if not scene.object_region.any():

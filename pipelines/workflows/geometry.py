@@ -30,6 +30,7 @@ from faintfield.calib.noise.strips import usable_cores
 from faintfield.pipelines.arguments import LensName
 from faintfield.pipelines.console import inform, progress, working
 from faintfield.pipelines.formats.exchange.mrcal import camera_model_text
+from faintfield.pipelines.formats.files import check_results_folder
 from faintfield.pipelines.formats.frames import read_ahead
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.results.geometry import (
@@ -89,6 +90,7 @@ def measure_stage(
     out = out or board_set.source.parent
     options = GeometryOptions(lens, tuple(depth_mm or DEFAULT_DEPTHS_MM), limit_px)
     settings = GeometrySettings(lens, options.depth_mm, limit_px)
+    check_results_folder(out)
     load_mrcal()  # fails at once if it is missing, not after all images were searched
     observations, size_px = _observe(board_set)
     with working("solving lens and poses"):

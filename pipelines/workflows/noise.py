@@ -9,7 +9,7 @@ from faintfield.pipelines.calibration.noise_comparison import CHANCE, NoiseCompa
 from faintfield.pipelines.calibration.noise_record import noise_maps, noise_record
 from faintfield.pipelines.console import inform, working
 from faintfield.pipelines.errors import MissingFile
-from faintfield.pipelines.formats.files import removed_if_empty
+from faintfield.pipelines.formats.files import check_results_folder, removed_if_empty
 from faintfield.pipelines.formats.large_arrays import maps_in_files
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, STANDARD, FitRecord, NoiseRecord, write_noise
 from faintfield.pipelines.formats.sets.noise_set import FILE_NAME, load_noise_set
@@ -33,6 +33,7 @@ def measure_sensor(folder: Path, out: Path | None = None) -> NoiseRecord:
         raise MissingFile(f"{folder}: no such folder; name a folder with {FILE_NAME} and frames")
     frames = load_noise_set(folder)
     out, title = out or frames.folder, frames.folder.resolve().name
+    check_results_folder(out)
     with removed_if_empty(out), maps_by(maps_in_files(out)):
         sensor = calibrate_sensor(frames)
         with working("drawing the pages"):

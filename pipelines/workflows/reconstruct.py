@@ -9,7 +9,7 @@ import msgspec
 from faintfield.pipelines.arguments import SceneKind
 from faintfield.pipelines.console import inform, working
 from faintfield.pipelines.errors import WrongUsage
-from faintfield.pipelines.formats.files import exclusive
+from faintfield.pipelines.formats.files import check_results_folder, exclusive
 from faintfield.pipelines.formats.results.records import REPORT_FILE
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, load_session, with_measured_geometry
@@ -17,8 +17,8 @@ from faintfield.pipelines.reconstruction.channels import keeping_frames
 from faintfield.pipelines.reconstruction.options import OF_PLANES, Options
 from faintfield.pipelines.reconstruction.planes.sweep import Runner, run_serially
 from faintfield.pipelines.reconstruction.planes.workers import make_runner
-from faintfield.pipelines.reconstruction.request import Request, resolve, select_planes
-from faintfield.pipelines.reconstruction.run import Outcome, reconstruct_set
+from faintfield.pipelines.reconstruction.request import Request, folder_of_method, resolve, select_planes
+from faintfield.pipelines.reconstruction.run import Outcome, reconstruct_set, refuse_surfaces
 from faintfield.pipelines.reconstruction.surface.reconstruct import reconstruct_surface
 from faintfield.pipelines.reconstruction.surface.request import SURFACE_FOLDER, SurfaceRequest, select_surface
 from faintfield.rig.session.session import has_session
@@ -44,6 +44,10 @@ def reconstruct_folder(
     runner = make_runner(options.workers, options.scheduler)
     planes = select_planes(options)
     elemental_set, out = open_set(folder, out, scene, geometry)
+    # Before depths are searched
+    check_results_folder(out)
+    if options.depth_map:
+        refuse_surfaces(folder_of_method(out, method, planes.methods) for method in planes.methods)
     return reconstruct_and_report(elemental_set, out, resolve(planes, elemental_set, out), runner)
 
 
@@ -90,9 +94,9 @@ def open_set(
     if has_session(folder):
         elemental_set = load_session(folder, scene, geometry)
         out = out or folder / RECONSTRUCTIONS / ("" if scene == "dark_scene" else scene)
-    elif out is None:
-        raise WrongUsage("no folder for the results is named; give --out")
     else:
         elemental_set = load_set(folder)
+        if out is None:
+            raise WrongUsage("no folder for the results is named; give --out")
         elemental_set = elemental_set if geometry is None else with_measured_geometry(elemental_set, geometry)
     return keeping_frames(elemental_set, out), out

@@ -26,6 +26,12 @@ def test_version_is_printed(done: Command) -> None:
         (("nonsense",), 'Unknown command "nonsense"'),
         (("simulate", "OUT", "--seeds", "3"), "Did you mean --seed?"),
         (("simulate", "OUT", "--snr", "nan"), "got nan."),
+        (("reconstruct", "SET", "--depth-mm", "500", "700", "--out", "OUT"), "--depth-mm 500 --depth-mm 700"),
+        (("reconstruct", "SET", "--depth=3", "4", "5"), "repeat it for several: --depth 3 --depth 4 --depth 5"),
+        (
+            ("verify", "a", "b"),
+            "b: no place for this; put a name with spaces in quotes",
+        ),
         (("darken", "SET", "OUT", "--quantum-efficiency", "1.5"), "at most 1, got 1.5."),
     ],
 )

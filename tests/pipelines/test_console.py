@@ -18,22 +18,43 @@ from tests.pipelines.conftest import Command, assert_refused
 
 def test_lines_are_due_after_2_and_12_s() -> None:
     now = 100.0
-    report = _Report("solving", total=8, done=2, clock=lambda: now)
+    report = _Report("solving", total=8, clock=lambda: now)
     lines = {}
     for tenth in range(250):
         now = 100 + tenth / 10
+        if tenth in (50, 100):
+            report.advance()
         if (line := report.line()) is not None:
             lines[tenth / 10] = line
     assert list(lines) == [2.0, 12.0, 22.0]
-    assert lines[12.0] == "solving: 2 of 8, 12 s, about 36 s to go"
+    assert lines[2.0] == "solving: 0 of 8, 2 s"
+    assert lines[12.0] == "solving: 2 of 8, 12 s, about 28 s to go"
+    assert lines[22.0] == "solving: 2 of 8, 22 s, about 25 s to go"
     assert report.wait_s() == pytest.approx(32 - 24.9)
+
+
+@pytest.mark.parametrize("costs", [[1.0] * 6, [1.0, 1.0, 2.0, 2.0, 1.0, 1.0]])
+def test_time_to_go_never_grows(costs: list[float]) -> None:
+    now = 0.0
+    report = _Report("solving", total=len(costs), total_cost=sum(costs), clock=lambda: now)
+    left = []
+    for cost in costs:
+        for _ in range(int(40 * cost)):
+            now += 1
+            left.append(report.left_s())
+        report.advance(cost)
+    known = [seconds for seconds in left if seconds is not None]
+    assert left[:40] == [None] * 40
+    assert known == sorted(known, reverse=True)
+    assert known[0] == 40 * (sum(costs) - 1) - 1
+    assert report.left_s() is None
 
 
 def test_part_speaks_for_whole_unless_short(monkeypatch: pytest.MonkeyPatch) -> None:
     lines, seconds = Queue[str](), itertools.count(0.0, 20.0)  # each reading of the clock is 20 s after the last
 
-    def report(label: str, total: int | None = None) -> _Report:
-        return _Report(label, total, clock=lambda: 0.0 if label == "short" else next(seconds))
+    def report(label: str, total: int | None = None, total_cost: float | None = None) -> _Report:
+        return _Report(label, total, total_cost, clock=lambda: 0.0 if label == "short" else next(seconds))
 
     monkeypatch.setattr(console, "inform", lines.put)
     monkeypatch.setattr(console, "_Report", report)

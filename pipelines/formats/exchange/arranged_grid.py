@@ -128,7 +128,7 @@ def _choose_order(grid: ImageGrid, inspect: _Inspect, *, fixed: bool) -> tuple[l
     if grid.guessed and not inspection.order.is_certain and (line := _line_of_views(grid, inspection, inspect)):
         return line
     if grid.ordered and rows != columns:
-        by_column = [(place % rows, place // rows) for place in range(len(nodes))]
+        by_column = [(place % rows, place // rows) for row, column in nodes for place in [row * columns + column]]
         other = inspect(by_column)
         # The order as documented unless the other agrees clearly more
         if other.failure is None and other.axes.level > inspection.axes.level + _MIN_LEVEL_GAIN:
@@ -246,8 +246,6 @@ def _print_table(grid: ImageGrid, record: Arrangement, inspection: GridInspectio
             lines["pitch"] = f"columns {record.pitch_ratio:.3f} times as far apart as rows"
         if record.relative_light:
             lines["light"] = f"{min(record.relative_light):.2f} … {max(record.relative_light):.2f} of the typical view"
-        if record.missing:
-            lines["missing"] = ", ".join(map(str, record.missing))
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     for heading, text in lines.items():
         table.add_row(heading, text)

@@ -21,6 +21,7 @@ from faintfield.pipelines.formats.exchange.imported_set import (
     ExportedSet,
     ImportedSet,
     PosedImage,
+    check_set_free,
     export_posed,
     import_posed,
 )
@@ -83,12 +84,13 @@ def read_model(folder: Path, pictures: Path | None = None) -> list[PosedImage]:
 
 def import_model(src: Path, out: Path, options: ImportOptions) -> ImportedSet:
     """Make an elemental set of a model and its images."""
+    check_set_free(out, options)
     return import_posed(out, _model_files(src), read_model(src, options.images), options, "import colmap")
 
 
 def export_model(set_path: Path, out: Path, *, binary: bool, overwrite: bool) -> ExportedSet:
     """Write the lens and poses of a set or session as a model without points."""
-    return export_posed(set_path, out, "mm", MODEL_FILES if overwrite else (), partial(write_model, binary=binary))
+    return export_posed(set_path, out, "mm", MODEL_FILES, partial(write_model, binary=binary), overwrite=overwrite)
 
 
 def _model_files(folder: Path) -> tuple[Path, Path]:

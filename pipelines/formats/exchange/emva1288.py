@@ -15,7 +15,7 @@ import numpy as np
 
 from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.errors import BadValue, MissingFile
-from faintfield.pipelines.formats.files import sha256, write_json, write_whole, writing_folder
+from faintfield.pipelines.formats.files import check_free, sha256, write_json, write_whole, writing_folder
 from faintfield.pipelines.formats.frames import RAW_SUFFIXES, Frame, read_frame
 from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.formats.provenance import provenance
@@ -63,6 +63,7 @@ class Descriptor:
 
 def import_data(descriptor: Path, out: Path, *, overwrite: bool = False) -> ImportedFrames:
     """Make a noise set of the images that a descriptor names."""
+    check_free(out, replace_if=NOISE_SET_FILE, overwrite=overwrite)
     read = read_descriptor(descriptor)
     sources = [
         inside(descriptor.parent, PureWindowsPath(frame.file).as_posix(), f"{descriptor}: image")
@@ -74,8 +75,8 @@ def import_data(descriptor: Path, out: Path, *, overwrite: bool = False) -> Impo
     names = [f"frames/{index:05d}_{source.name}" for index, source in enumerate(sources)]
     frames = [msgspec.structs.replace(frame, file=name) for name, frame in zip(names, read.frames, strict=True)]
     saturation_dn = float(2**read.bits - 1)
-    replace = NOISE_SET_FILE if overwrite else None
-    with writing_folder(out, replace_if=replace, reads=[descriptor, *sources]) as folder:
+    reads = [descriptor, *sources]
+    with writing_folder(out, replace_if=NOISE_SET_FILE, overwrite=overwrite, reads=reads) as folder:
         (folder / "frames").mkdir()
         for source, name in progress(list(zip(sources, names, strict=True)), "copying frames"):
             shutil.copyfile(source, folder / name)
@@ -95,6 +96,7 @@ def export_data(folder: Path, out: Path, *, overwrite: bool = False) -> Exported
     MissingFile, BadValue
         There is no such folder, or a flat states no photons.
     """
+    check_free(out, replace_if=DESCRIPTOR, overwrite=overwrite)
     if not folder.exists():
         raise MissingFile(f"{folder}: no such folder; name a noise set or a session")
     noise_set = load_noise_set(folder)
@@ -116,8 +118,8 @@ def export_data(folder: Path, out: Path, *, overwrite: bool = False) -> Exported
     region = (slice(*settings.region.rows), slice(*settings.region.columns)) if settings.region else np.s_[:, :]
     height, width = first.pixels_dn[region].shape
     lines = [f"v {_RELEASE}", f"n {bits} {width} {height}"]
-    replace, reads = DESCRIPTOR if overwrite else None, [noise_set.folder, *(path for path, _ in sources)]
-    with writing_folder(out, replace_if=replace, reads=reads) as building:
+    reads = [noise_set.folder, *(path for path, _ in sources)]
+    with writing_folder(out, replace_if=DESCRIPTOR, overwrite=overwrite, reads=reads) as building:
         (building / "images").mkdir()
         last = None
         for index, (source, conditions) in enumerate(progress(sources, "writing images")):

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from faintfield.pipelines.errors import BadValue, MissingFile
-from faintfield.pipelines.formats.frames import IMAGE_SUFFIXES
+from faintfield.pipelines.formats.frames import IMAGE_SUFFIXES, picture_kind
 from faintfield.pipelines.formats.reading import is_file, is_folder
 from faintfield.pipelines.formats.toml_files import inside
 
@@ -20,11 +20,9 @@ _COMPANION = re.compile(
     re.IGNORECASE,
 )
 
-# Files that nobody takes for pictures; others are named with their kind.
-_NO_PICTURES = {".txt", ".md", ".json", ".toml", ".csv", ".cfg", ".xml", ".yaml", ".yml", ".html", ".pdf", ".py", ".m"}
-
-# Suffixes of one kind of file.
-_ALIKE = {".tiff": ".tif", ".jpeg": ".jpg", ".pnm": ".ppm", ".pgm": ".ppm"}
+# Files that nobody takes for views; others are named with their kind. A .thm of a camera is a small JPEG.
+_TEXTS = {".txt", ".md", ".json", ".toml", ".csv", ".cfg", ".xml", ".yaml", ".yml", ".html", ".pdf", ".py", ".m"}
+_NO_PICTURES = _TEXTS | {".thm"}
 
 # Largest row, column, running number or position: times and serial numbers are larger.
 _MAX_NUMBER = 1e9
@@ -67,7 +65,8 @@ def pictures_in(folder: Path, *, every: bool = False) -> tuple[list[Path], list[
     Raises
     ------
     MissingFile
-        There is no such folder, or it holds no picture that is read; the kinds that it holds are named.
+        There is no such folder, or it holds no picture that is read, or more files of another kind; the kinds that it
+        holds are named.
     BadValue
         It holds pictures of several kinds under the same names.
     """
@@ -75,7 +74,9 @@ def pictures_in(folder: Path, *, every: bool = False) -> tuple[list[Path], list[
         raise MissingFile(f"{folder}: no such folder; name the folder that holds the pictures")
     entries = sorted(folder.iterdir(), key=lambda path: by_number(path.name))
     files = [path for path in entries if not path.name.startswith(".") and is_file(path)]
-    pictures = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES]
+    candidates = [path for path in files if path.suffix.lower() not in _NO_PICTURES]
+    kinds = _kinds_of(candidates)
+    pictures = list(kinds)
     if not pictures:
         if not files and (folders := [path.name for path in entries if is_folder(path)]):
             raise MissingFile(f"{folder}: holds folders only, such as {folders[0]}; name the one with the pictures")
@@ -84,14 +85,18 @@ def pictures_in(folder: Path, *, every: bool = False) -> tuple[list[Path], list[
             f"{folder}: holds {kinds_held}; convert pictures to PNG or TIFF (read are "
             f"{', '.join(sorted(IMAGE_SUFFIXES))}), or name the folder that holds them"
         )
-    unread = [path for path in files if path.suffix.lower() not in IMAGE_SUFFIXES | _NO_PICTURES]
+    unread = [path for path in candidates if path not in kinds]
     remarks = [f"left out: {_count_kinds(unread)}, which are not read"] if unread else []
     if every:
         return pictures, remarks
     masks = [path for path in pictures if _COMPANION.search(path.stem)]
+    if max(Counter(path.suffix.lower() for path in unread).values(), default=0) > len(pictures) - len(masks):
+        raise MissingFile(
+            f"{folder}: holds {_count_kinds(unread)}, which are not read, and only {_count_kinds(pictures)} of those "
+            f"that are ({pictures[0].name}); convert the views to PNG or TIFF, or leave nothing else in the folder"
+        )
     pictures = _leave_out(pictures, masks, remarks, "by their names no views")
-    kinds = {path: _ALIKE.get(path.suffix.lower(), path.suffix.lower()) for path in pictures}
-    kind, count = Counter(kinds.values()).most_common(1)[0]
+    kind, count = Counter(kinds[path] for path in pictures).most_common(1)[0]
     common = [path for path in pictures if kinds[path] == kind]
     rest = [path for path in pictures if kinds[path] != kind]
     if named_alike := {path.stem for path in common} & {path.stem for path in rest}:
@@ -100,9 +105,24 @@ def pictures_in(folder: Path, *, every: bool = False) -> tuple[list[Path], list[
             "them; leave one kind in the folder"
         )
     # Pictures of another kind whose names differ in their numbers only are views, too
-    forms = {re.sub(_WHOLE, "0", path.stem) for path in common}
-    foreign = [path for path in rest if re.sub(_WHOLE, "0", path.stem) not in forms]
+    forms = {name_form(path) for path in common}
+    foreign = [path for path in rest if name_form(path) not in forms]
     return _leave_out(pictures, foreign, remarks, f"of another kind than the {count} {kind} files"), remarks
+
+
+def name_form(path: Path) -> str:
+    """Return a name without suffix and with 0 for each number: alike for pictures of one series."""
+    return re.sub(_WHOLE, "0", path.stem)
+
+
+def _kinds_of(files: Sequence[Path]) -> dict[Path, str]:
+    """Return the kind of each picture, by content; some with other suffixes than pictures have are no views."""
+    kinds = {path: kind for path in files if (kind := picture_kind(path))}
+    named = {path for path in kinds if path.suffix.lower() in IMAGE_SUFFIXES}
+    views = Counter(kinds[path] for path in named if not _COMPANION.search(path.stem))
+    others = Counter(kinds[path] for path in kinds.keys() - named)
+    # Where most have the suffix of their kind, others are copies, as of programs that edit pictures
+    return {path: kind for path, kind in kinds.items() if path in named or others[kind] > views[kind]}
 
 
 def _count_kinds(paths: Sequence[Path]) -> str:

@@ -12,8 +12,15 @@ from numpy.typing import NDArray
 from faintfield.calib.arrangement.views import Node
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.errors import BadValue, MissingFile
-from faintfield.pipelines.formats.exchange.grid_names import Places, pictures_in, places_by_habit, places_by_pattern
+from faintfield.pipelines.formats.exchange.grid_names import (
+    Places,
+    name_form,
+    pictures_in,
+    places_by_habit,
+    places_by_pattern,
+)
 from faintfield.pipelines.formats.exchange.imported_set import PosedImage
+from faintfield.pipelines.formats.files import some
 from faintfield.rig.plan import centre_node, grid_nodes
 
 # Largest ratio of missing pictures to those found; beyond it, the numbers in the names are not rows and columns.
@@ -117,28 +124,23 @@ def find_grid(
 ) -> ImageGrid:
     """Return the pictures of a folder by node.
 
-    With the size of the grid, `rows` and `columns`, pictures are taken in the order of their names; else names tell,
-    by a pattern or by habit, see `grid_names`. `running` is the size for names with running numbers, if a file beside
-    the pictures states it.
+    With the size of the grid, `rows` and `columns`, pictures are taken in the order of their names, which tell where
+    some are missing; else names tell, by a pattern or by habit, see `grid_names`. `running` is the size for names with
+    running numbers, if a file beside the pictures states it.
 
     Raises
     ------
     MissingFile
-        There is no such folder, it holds no pictures that are read, or half of the nodes have none.
+        There is no such folder, it holds no pictures that are read, or half of the nodes have none, or names do not
+        tell which.
     BadValue
-        A name has no row and column, two pictures have the same, or a pattern matches not all names.
+        A name has no row and column, two pictures have the same, there are more than nodes, or a pattern matches not
+        all names.
     """
     paths, remarks = pictures_in(folder, every=pattern is not None)
     names = [path.name for path in paths]
     if pattern is None and (rows or columns):
-        rows, columns = rows or 1, columns or 1
-        if len(paths) != rows * columns:
-            raise MissingFile(
-                f"{folder}: holds {len(paths)} pictures, a grid of {rows} x {columns} needs {rows * columns}; "
-                "correct --rows and --columns, or add the missing ones" + "".join(f" ({text})" for text in remarks)
-            )
-        grid_paths = dict(zip(grid_nodes(rows, columns), paths, strict=True))
-        return ImageGrid(grid_paths, remarks=remarks, ordered=True, sources=paths)
+        return _grid_in_order(folder, paths, rows or 1, columns or 1, remarks)
     if pattern is None and len(paths) == 1:
         return ImageGrid({(0, 0): paths[0]}, remarks=remarks, sources=paths)
     if running is None and pattern is not None and rows and columns:
@@ -162,7 +164,69 @@ def find_grid(
     grid_paths = dict(sorted(zip(nodes, paths, strict=True)))
     grid = ImageGrid(grid_paths, measured, remarks, by_index, by_index and running is None, list(grid_paths.values()))
     _check_size(folder, grid, rows, columns)
+    remarks += _missing_remark(grid.paths, *grid.size)
     return grid
+
+
+def _grid_in_order(folder: Path, paths: list[Path], rows: int, columns: int, remarks: list[str]) -> ImageGrid:
+    """Return the pictures at the nodes in order, row by row, or without those that are missing by their names."""
+    count, size = len(paths), rows * columns
+    left_out = "".join(f" ({text})" for text in remarks)
+    if count > size:
+        usual = Counter(map(name_form, paths)).most_common(1)[0][0]
+        unlike = [path.name for path in paths if name_form(path) != usual]
+        alike = [path.name for path in paths if name_form(path) == usual]
+        extra = [*unlike, *reversed(alike)][: count - size]
+        raise BadValue(
+            f"{folder}: holds {count} pictures, {count - size} too many for a grid of {rows} x {columns}: "
+            f"{some(extra)}, unlike the others by name, or the last; move what is no view away, or correct --rows and "
+            f"--columns{left_out}"
+        )
+    nodes = list(grid_nodes(rows, columns))
+    if count < size:
+        told = _nodes_by_name([path.name for path in paths], rows, columns)
+        if told is None or 2 * count <= size:
+            which, them = ("which one is", "it") if size - count == 1 else ("which are", "them")
+            raise MissingFile(
+                f"{folder}: holds {count} pictures, {size - count} fewer than a grid of {rows} x {columns} has, and "
+                f"their names do not tell {which} missing; add {them}, name all by row and column (view_r0_c0.png), or "
+                f"correct --rows and --columns{left_out}"
+            )
+        nodes = told
+    grid_paths = dict(zip(nodes, paths, strict=True))
+    remarks = [*remarks, *_missing_remark(grid_paths, rows, columns)]
+    return ImageGrid(grid_paths, remarks=remarks, ordered=True, sources=paths)
+
+
+def _nodes_by_name(names: Sequence[str], rows: int, columns: int) -> list[Node] | None:
+    """Return the nodes of names in order that leave some of a grid out, None if the names do not tell them.
+
+    They tell by row and column, or by running numbers whose first and last are there.
+    """
+    try:
+        places = places_by_habit(names)
+    except BadValue:
+        return None
+    if "index" in places:
+        numbers = np.array(places["index"], int)
+        nodes = [divmod(place, columns) for place in (numbers - numbers.min()).tolist()]
+        told = nodes[-1] == (rows - 1, columns - 1)
+    else:
+        nodes = _count_from_zero(nodes_of(places)[0])
+        told = "row" in places and tuple(np.max(nodes, axis=0) + 1) == (rows, columns)
+    return nodes if told and nodes == sorted(set(nodes)) else None
+
+
+def _missing_remark(nodes: Collection[Node], rows: int, columns: int) -> list[str]:
+    """Return a sentence that names the nodes of a grid without a picture; none if all have one."""
+    missing = [f"row {row}, column {column}" for row, column in grid_nodes(rows, columns) if (row, column) not in nodes]
+    if not missing:
+        return []
+    one = len(missing) == 1
+    return [
+        f"warning: {len(missing)} of {rows * columns} pictures {'is' if one else 'are'} missing, counted from 0: "
+        f"{some(missing, '; ')}; the set is made without {'it' if one else 'them'}"
+    ]
 
 
 def _count_from_zero(nodes: Sequence[Node]) -> list[Node]:

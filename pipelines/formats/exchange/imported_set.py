@@ -27,8 +27,8 @@ from faintfield.pipelines.formats.exchange.imported_light import (
     without_curve,
 )
 from faintfield.pipelines.formats.exchange.options import GridOptions, ImportOptions
-from faintfield.pipelines.formats.files import sha256, write_json, writing_folder
-from faintfield.pipelines.formats.frames import RAW_SUFFIXES, Frame, exif_exposure_s, read_frame
+from faintfield.pipelines.formats.files import check_free, sha256, write_json, writing_folder
+from faintfield.pipelines.formats.frames import RAW_SUFFIXES, Frame, exif_exposure_s, picture_kind, read_frame
 from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.formats.provenance import Provenance, provenance
 from faintfield.pipelines.formats.reading import is_file
@@ -46,9 +46,6 @@ from faintfield.pipelines.formats.units import MAX_ANGLE_RAD, MAX_LENGTH_MM, Uni
 
 # Largest error of the columns of a rotation in length and right angles, as rounded numbers have it.
 _ROTATION_TOLERANCE = 1e-2
-
-# Files whose compression changes values, and with them the noise.
-_LOSSY_SUFFIXES = {".jpg", ".jpeg"}
 
 
 @dataclass(frozen=True)
@@ -120,12 +117,20 @@ def import_posed(
 
 
 def export_posed(
-    set_path: Path, out: Path, unit: str, held: Sequence[str], write: Callable[[Path, list[PosedImage]], None]
+    set_path: Path,
+    out: Path,
+    unit: str,
+    held: Sequence[str],
+    write: Callable[[Path, list[PosedImage]], None],
+    *,
+    overwrite: bool,
 ) -> ExportedSet:
     """Write lens and poses of a set or session into a folder, by `write` from the folder and the views.
 
-    Lengths are in `unit`, or relative. An earlier export, a folder with files of the patterns `held` only, is replaced.
+    Lengths are in `unit`, or relative. An earlier export, a folder with files of the patterns `held` only, is replaced
+    to `overwrite`.
     """
+    check_free(out, replace_only=held, overwrite=overwrite)
     elemental_set = load_set_or_session(set_path)
     points_px = elemental_set.principal_points_px.tolist()
     parts = zip(elemental_set.settings.view, points_px, elemental_set.poses_rt_cam_ref, strict=True)
@@ -134,7 +139,7 @@ def export_posed(
         for view, (cx_px, cy_px), pose in parts
     ]
     unit = stated_length(elemental_set, unit)
-    with writing_folder(out, replace_only=held) as folder:
+    with writing_folder(out, replace_only=held, overwrite=overwrite) as folder:
         write(folder, views)
     return ExportedSet(str(out), len(views), unit)
 
@@ -166,6 +171,11 @@ def _nodes(images: Sequence[PosedImage]) -> Sequence[tuple[int, int] | None]:
     matches = [re.search(r"r([0-9]{1,5})_c([0-9]{1,5})$", image.path.stem) for image in images]
     nodes = [(int(numbers[1]), int(numbers[2])) for numbers in matches if numbers is not None]
     return nodes if len(set(nodes)) == len(images) else [None] * len(images)
+
+
+def check_set_free(out: Path, options: ImportOptions | GridOptions, *sources: Path) -> None:
+    """Refuse a folder that an imported set cannot be written to, before anything is read; see `check_free`."""
+    check_free(out, replace_if=FILE_NAME, overwrite=options.overwrite, reads=sources)
 
 
 def write_imported_set(
@@ -209,12 +219,12 @@ def write_imported_set(
         )
     tone = tone_of(path, first, options)
     inputs = [*models, *(sources or [image.path for image in images])]
-    with writing_folder(out, replace_if=FILE_NAME if options.overwrite else None, reads=inputs) as folder:
+    with writing_folder(out, replace_if=FILE_NAME, overwrite=options.overwrite, reads=inputs) as folder:
         views = [
             _view(_copy(image.path, folder, first, tone), image, images[reference])
             for image in progress(images, "copying pictures")
         ]
-        lossy = inputs[-1].suffix.lower() in _LOSSY_SUFFIXES
+        lossy = picture_kind(inputs[-1]) == ".jpg"  # whose compression changes values, and with them the noise
         complete, origin = complete_noise(sensor, Pictures(folder, views, first, tone, lossy))
         settings = ElementalSetFile(
             format=1,

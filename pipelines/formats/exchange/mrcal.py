@@ -18,6 +18,7 @@ from faintfield.pipelines.formats.exchange.imported_set import (
     ExportedSet,
     ImportedSet,
     PosedImage,
+    check_set_free,
     export_posed,
     import_posed,
 )
@@ -77,6 +78,7 @@ def camera_model_text(lens: Lens, lens_model: str, rt_cam_ref: ArrayLike) -> str
 
 def import_camera_models(src: Path, out: Path, options: ImportOptions) -> ImportedSet:
     """Make an elemental set of the models in a folder and their images."""
+    check_set_free(out, options)
     options = replace(options, mm_per_unit=options.mm_per_unit or _MM_PER_M)
     models = read_camera_models(src, options.images or src)
     return import_posed(out, list(models), list(models.values()), options, "import mrcal")
@@ -94,7 +96,7 @@ def export_camera_models(set_path: Path, out: Path, *, overwrite: bool) -> Expor
             model = next(name for name, count in _COUNTS.items() if count >= len(view.lens.distortion))
             write_whole(file, camera_model_text(view.lens, model, view.rt_cam_world))
 
-    return export_posed(set_path, out, "m", [f"*{SUFFIX}"] if overwrite else (), write)
+    return export_posed(set_path, out, "m", [f"*{SUFFIX}"], write, overwrite=overwrite)
 
 
 def read_camera_models(folder: Path, images: Path) -> dict[Path, PosedImage]:

@@ -20,6 +20,7 @@ from faintfield.pipelines.formats.exchange.imported_set import (
     ExportedSet,
     ImportedSet,
     PosedImage,
+    check_set_free,
     export_posed,
     import_posed,
     pose_of,
@@ -80,6 +81,7 @@ class _Transforms(_Intrinsics, omit_defaults=True, kw_only=True):
 
 def import_transforms(src: Path, out: Path, options: ImportOptions) -> ImportedSet:
     """Make an elemental set of a `transforms.json` and its images."""
+    check_set_free(out, options)
     path = src / FILE_NAME if is_folder(src) else src
     return import_posed(out, [path], read_transforms(path, options.images), options, "import nerfstudio")
 
@@ -92,7 +94,7 @@ def export_transforms(set_path: Path, out: Path, *, overwrite: bool) -> Exported
     BadValue
         The distortion has terms for which nerfstudio has no names.
     """
-    return export_posed(set_path, out, "mm", [FILE_NAME] if overwrite else (), _write_transforms)
+    return export_posed(set_path, out, "mm", [FILE_NAME], _write_transforms, overwrite=overwrite)
 
 
 def read_transforms(path: Path, images: Path | None = None) -> list[PosedImage]:

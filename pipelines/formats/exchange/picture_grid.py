@@ -24,10 +24,10 @@ from faintfield.pipelines.errors import BadValue, WrongBitDepth
 from faintfield.pipelines.formats.exchange.arranged_grid import arrange_grid
 from faintfield.pipelines.formats.exchange.hci import described_grid, write_true_depth
 from faintfield.pipelines.formats.exchange.image_grid import ImageGrid, find_grid
-from faintfield.pipelines.formats.exchange.imported_set import read_picture, write_imported_set
+from faintfield.pipelines.formats.exchange.imported_set import check_set_free, read_picture, write_imported_set
 from faintfield.pipelines.formats.exchange.options import GridOptions
 from faintfield.pipelines.formats.files import require_room
-from faintfield.pipelines.formats.frames import IMAGE_SUFFIXES, RAW_SUFFIXES, pages_in, read_frame
+from faintfield.pipelines.formats.frames import IMAGE_SUFFIXES, RAW_SUFFIXES, pages_in, picture_kind, read_frame
 from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.formats.reading import is_file
 from faintfield.pipelines.formats.sets.elemental_file import Arrangement
@@ -59,6 +59,7 @@ class ImportedGrid(msgspec.Struct, frozen=True):
 
 def import_pictures(src: Path, out: Path, options: GridOptions) -> ImportedGrid:
     """Make an elemental set of the pictures in a folder or a file, put in order by what they show."""
+    check_set_free(out, options, src)
     recorded = {name: value for name, value in asdict(options).items() if name != "overwrite"}
     pitch_mm, fx_px, disparity_px = options.pitch_mm, options.fx_px, options.disparity_px
     described = described_grid(src)
@@ -147,7 +148,7 @@ def _unpacked(src: Path, options: GridOptions, running: tuple[int, int] | None) 
 def _divide_file(src: Path, folder: Path, rows: int | None, columns: int | None) -> tuple[ImageGrid, _Views]:
     """Return the grid of the views in one file, as files of their own that are not written yet, and these views."""
     readable = IMAGE_SUFFIXES - RAW_SUFFIXES
-    if src.suffix.lower() not in readable:
+    if picture_kind(src) not in readable:
         raise BadValue(
             f"{src}: is no file that views are unpacked from (these are {', '.join(sorted(readable))}); name a folder "
             "of pictures, a TIFF with a picture for each view, or a picture that holds them in rows and columns"

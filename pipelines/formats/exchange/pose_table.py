@@ -15,6 +15,7 @@ from faintfield.pipelines.formats.exchange.grid_names import picture_named
 from faintfield.pipelines.formats.exchange.imported_set import (
     ImportedSet,
     PosedImage,
+    check_set_free,
     import_posed,
     pose_of,
     read_picture,
@@ -43,6 +44,7 @@ def import_table(src: Path, out: Path, lens_options: LensOptions, options: Impor
     WrongUsage
         The lens cannot be, or the unit of positions is stated twice.
     """
+    check_set_free(out, options)
     poses, mm_per_unit = read_poses(src, options.images or src.parent)
     if options.mm_per_unit is not None and mm_per_unit is not None:
         raise WrongUsage(f"{src}: its header states the unit of positions; leave --mm-per-unit out")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.console import progress
 from faintfield.pipelines.errors import BadValue, InputError, import_optional
-from faintfield.pipelines.formats.files import writing_folder
+from faintfield.pipelines.formats.files import check_free, writing_folder
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.reading import read_json
 from faintfield.pipelines.formats.results.records import PlaneRecord
@@ -67,9 +67,10 @@ def export_planes(directory: Path, out: Path, *, overwrite: bool = False) -> Zar
         zarr or ome-zarr-models is not installed.
     """
     zarr, models = import_optional("zarr", "zarr"), import_optional("ome_zarr_models.v05", "zarr")
+    held = _HELD if _is_export(out) else ()
+    check_free(out, replace_only=held, overwrite=overwrite)
     stack = _stack_in(directory)
-    held = _HELD if overwrite and _is_export(out) else ()
-    with writing_folder(out, replace_only=held, reads=[stack.folder]) as building:
+    with writing_folder(out, replace_only=held, overwrite=overwrite, reads=[stack.folder]) as building:
         group = zarr.open_group(building, mode="w", zarr_format=3)
         _write_metadata(models, group, stack, directory.resolve().name)
         for index, record in enumerate(progress(stack.planes, "writing planes")):

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from faintfield.calib.lens import Lens
 from faintfield.calib.noise_model import Map, NoiseModel
 from faintfield.pipelines.console import inform
-from faintfield.pipelines.errors import BadValue
-from faintfield.pipelines.formats.files import sha256
-from faintfield.pipelines.formats.frames import ChannelLayout, Frame, layouts_of, read_frame
+from faintfield.pipelines.errors import BadValue, MissingFile
+from faintfield.pipelines.formats.files import files_in, sha256, some
+from faintfield.pipelines.formats.frames import IMAGE_SUFFIXES, ChannelLayout, Frame, layouts_of, read_frame
 from faintfield.pipelines.formats.plane_poses import Place, TiltedPlane
-from faintfield.pipelines.formats.reading import is_file
+from faintfield.pipelines.formats.reading import is_file, is_folder
 from faintfield.pipelines.formats.results.noise import NOISE_MAPS, FittedNoise, read_fitted_noise
 from faintfield.pipelines.formats.results.plane_files import plane_name
 from faintfield.pipelines.formats.results.records import Poses
@@ -217,6 +217,8 @@ def load_set(folder: Path) -> ElementalSet:
         A file is missing, a key is unknown, or a value is impossible; the message names it.
     """
     path = folder if is_file(folder) else folder / FILE_NAME
+    if not is_file(path):
+        _refuse_pictures(folder)
     folder = path.parent
     settings = read_set_file(path)
     camera, table = settings.camera, "camera"
@@ -234,6 +236,18 @@ def load_set(folder: Path) -> ElementalSet:
         unusable=noise.unusable,
         noise_reference=tuple(path for path in [folder / NOISE_REFERENCE] if is_file(path)),
     )
+
+
+def _refuse_pictures(folder: Path) -> None:
+    """Refuse a folder that is not there, and one of pictures that is no set yet (MissingFile)."""
+    if not is_folder(folder):
+        raise MissingFile(f"{folder}: no such folder; name a session, or a folder with {FILE_NAME}")
+    pictures = [path.name for path in files_in(folder) if path.suffix.lower() in IMAGE_SUFFIXES]
+    if pictures:
+        raise MissingFile(
+            f"{folder}: is a folder of pictures ({some(pictures)}), no set; make a set of them first by "
+            f"`faintfield import grid {folder} SET`, and name that"
+        )
 
 
 def _noise(folder: Path, settings: ElementalSetFile) -> FittedNoise:

@@ -53,6 +53,11 @@ class PlaneTask:
     solver: SolverOptions
     with_focus: bool
 
+    @property
+    def cost(self) -> int:
+        """Planes that are solved, a colour once for each of its lattices: about how long the task takes."""
+        return len(self.files) * sum(len(layout.lattices) for layout in self.layouts)
+
 
 class Channel:
     """One colour of a set in memory: what all of its tasks share."""
@@ -207,7 +212,10 @@ class Sweep:
         tasks = self._tasks()
         self._write_complete(planned)
         with closing(runner(self.elemental_set, out, tasks)) as done:
-            for task, messages in progress(done, "reconstructing planes", len(tasks)):
+            cost = sum(task.cost for task in tasks)
+            for task, messages in progress(
+                done, "reconstructing planes", len(tasks), cost=lambda result: result[0].cost, total_cost=cost
+            ):
                 for message in messages:
                     inform(message)
                 self._write_complete(task.files)

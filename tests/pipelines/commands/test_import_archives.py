@@ -113,6 +113,28 @@ def test_foreign_files_are_left_out_and_named(tmp_path: Path, done: Command) -> 
     assert first_pixels(tmp_path / "set") == [100 + index for index in range(9)]
 
 
+@pytest.mark.parametrize("suffix", [".jfif", ".JPEG_original", "", ".tiff"])
+def test_views_are_known_by_content(suffix: str, tmp_path: Path, done: Command) -> None:
+    src = folder_of(tmp_path / "src", [f"v_{r}_{c}.jpg" for r, c in NODES])
+    written = [path.rename(path.with_suffix(suffix)) for path in sorted(src.iterdir())]
+    write(src / "depth.png", picture(7))
+    words = done("import", "grid", src, tmp_path / "set", "--linear").stderr
+    assert "left out: 1 of 10 pictures, by their names no views (depth.png)" in words
+    assert [view.node for view in load_set(tmp_path / "set").settings.view] == NODES
+    inputs = json.loads((tmp_path / "set" / "provenance.json").read_text())["inputs"]
+    assert sorted(inputs) == [path.name for path in written]
+
+
+def test_views_that_are_not_read_are_refused(tmp_path: Path, faintfield: Command) -> None:
+    src = folder_of(tmp_path / "src", ["depth.png"])
+    for r, c in NODES:
+        (src / f"v_{r}_{c}.webp").write_bytes(b"RIFF\x10\0\0\0WEBPVP8 ")
+    ended = faintfield("import", "grid", src, tmp_path / "set")
+    words = "holds 9 .webp files, which are not read, and only 1 .png file of those that are (depth.png); convert the"
+    assert_refused(ended, "MissingFile", words)
+    assert not (tmp_path / "set").exists()
+
+
 def test_copies_of_another_kind_are_refused(tmp_path: Path, faintfield: Command) -> None:
     src = folder_of(tmp_path / "src", [f"v_{n}_{m}.{kind}" for n in "01" for m in "01" for kind in ("png", "bmp")])
     ended = faintfield("import", "grid", src, tmp_path / "set")

@@ -54,7 +54,10 @@ def test_nodes_are_last_two_numbers_of_names(tmp_path: Path, done: Command) -> N
         ([], (), "MissingFile", "holds nothing; convert pictures to PNG or TIFF"),
         (["r0_c0.tiff", "r1_c1.tiff"], (), "MissingFile", "the view in row 0 and column 1, counted from 0, is missing"),
         (["a1_1.tiff", "b1_1.tiff"], (), "BadValue", "is at node (1, 1) like a1_1.tiff"),
-        (["a.tiff", "b.tiff"], ("--rows", 3), "MissingFile", "holds 2 pictures, a grid of 3 x 1 needs 3"),
+        (["a.tiff", "b.tiff"], ("--rows", 3), "MissingFile", "fewer than a grid of 3 x 1 has, and their names do not"),
+        (["1.tiff", "2.tiff"], ("--rows", 3), "MissingFile", "their names do not tell which one is missing; add it"),
+        (["1.tiff", "2.tiff", "3.tiff"], ("--rows", 2), "BadValue", "holds 3 pictures, 1 too many for a grid of 2 x 1"),
+        (["1.tiff", "2.tiff", "all.tiff"], ("--rows", 2), "BadValue", "grid of 2 x 1: all.tiff, unlike the others by"),
         (["a.tiff"], ("--dark-current-e-per-s", 2), "BadValue", "states no exposure, without which 2 dark electrons"),
     ],
 )
@@ -64,6 +67,21 @@ def test_incomplete_grids_and_options_are_refused(
     ended = faintfield("import", "grid", _pictures(tmp_path / "src", names), tmp_path / "out", *options)
     assert_refused(ended, failure, words)
     assert [path.name for path in tmp_path.iterdir()] == ["src"]
+
+
+@pytest.mark.parametrize(
+    "names",
+    [_grid_names(range(2), range(3)), [f"IMG_{number}.tiff" for number in (98, 99, 100, 101, 102, 103)]],
+)
+def test_missing_pictures_are_named_and_done_without(names: list[str], tmp_path: Path, done: Command) -> None:
+    src = _pictures(tmp_path / "src", names)
+    (src / names[4]).unlink()
+    words = done("import", "grid", src, tmp_path / "out", "--rows", 2, "--columns", 3, "--linear").stderr
+    assert "1 of 6 pictures is missing, counted from 0: row 1, column 1; the set is made without it" in words
+    elemental_set = load_set(tmp_path / "out")
+    nodes = [view.node for view in elemental_set.settings.view]
+    assert nodes == [(0, 0), (0, 1), (0, 2), (1, 0), (1, 2)]
+    assert [int(read_frame(path).pixels_dn[0, 0]) for path in elemental_set.image_paths] == [0, 1, 2, 3, 5]
 
 
 def test_unlike_pictures_are_refused(tmp_path: Path, faintfield: Command) -> None:

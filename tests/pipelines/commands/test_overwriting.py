@@ -54,7 +54,7 @@ def test_only_earlier_outputs_are_replaced(
     call, onto_theirs = ([word.format(out=folder, **sources) for word in words.split()] for folder in (out, theirs))
     done(*call)
     before = files_in(out)
-    assert_refused(faintfield(*call), "OutputExists")
+    assert_refused(faintfield(*call), "OutputExists", "; give --overwrite to replace it, or ")
     (out / "notes.txt").touch()
     if merged:
         assert_refused(faintfield(*call, "--overwrite"), "OutputExists", "(notes.txt)")
@@ -71,6 +71,37 @@ def test_only_earlier_outputs_are_replaced(
     if "colmap" in words:
         done(*call, "--binary", "--overwrite")
         assert sorted(files_in(out)) == ["cameras.bin", "images.bin", "points3D.bin"]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        *(f"export {form} absent {{out}}" for form in ("colmap", "mrcal", "nerfstudio", "zarr", "emva1288")),
+        *(f"import {form} absent {{out}}" for form in ("grid", "colmap", "mrcal", "nerfstudio", "emva1288")),
+        "import poses absent {out} --fx-px 600",
+        *("simulate {out}", "darken absent {out}", "demo {out}", "figures {out}"),
+    ],
+)
+def test_output_is_checked_before_anything_else(words: str, tmp_path: Path, faintfield: Command) -> None:
+    if "zarr" in words:
+        pytest.importorskip("zarr")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "thesis.tex").touch()
+    ended = faintfield(*words.format(out=tmp_path / "out").split())
+    assert_refused(ended, "OutputExists", "holds files already (thesis.tex)")
+
+
+def test_results_folder_is_checked_before_depths_are_searched(
+    simulated_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, faintfield: Command
+) -> None:
+    monkeypatch.setattr("faintfield.pipelines.reconstruction.request.best_focus", pytest.fail)
+    monkeypatch.setattr("faintfield.pipelines.reconstruction.request.found_range_mm", pytest.fail)
+    (tmp_path / "file").touch()
+    ended = faintfield("reconstruct", simulated_scene, "--depth", "auto", "--out", tmp_path / "file")
+    assert_refused(ended, "CannotWrite", "file: File exists")
+    (tmp_path / "surface.json").touch()
+    words = ("--sweep", "auto", "--depth-map", "--out", tmp_path)
+    assert_refused(faintfield("reconstruct", simulated_scene, *words), "OutputExists", "holds a surface")
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
 from faintfield.recon.solver.penalties import total_variation
-from tests.pipelines.conftest import Command, Edit, run_undrawn
+from tests.pipelines.conftest import Command, Edit, assert_refused, run_undrawn
 from tests.pipelines.forms import read_record
 
 DEPTHS = ("--depth-mm", 500, "--depth-mm", 700)
@@ -235,3 +235,18 @@ def test_plane_without_light_is_called_black(scene: Path, edit: Edit, tmp_path: 
         words = ("--out", tmp_path / method, "--depth-mm", 500, "--method", method, "--prior", "tv")
         assert "1 of 1 planes are black" in done("reconstruct", scene, *words).stderr
         assert read_frame(tmp_path / method / "plane_00500.0.tiff").pixels_dn.max() < 1e-4
+
+
+@pytest.mark.parametrize(
+    "words", ["reconstruct {}", "reconstruct {} --out {out}", "darken {} {out}", "export colmap {} {out}"]
+)
+def test_folders_that_are_no_sets_are_named(words: str, tmp_path: Path, faintfield: Command) -> None:
+    pictures, options = tmp_path / "pictures", ["--depth", "auto"] if "reconstruct" in words else []
+    pictures.mkdir()
+    (pictures / "view.png").touch()
+    for folder, message in (
+        (tmp_path / "absent", "absent: no such folder; name a session, or a folder with elemental.toml"),
+        (pictures, "is a folder of pictures (view.png), no set; make a set of them first by `faintfield import grid "),
+    ):
+        ended = faintfield(*words.format(folder, out=tmp_path / "out").split(), *options)
+        assert_refused(ended, "MissingFile", message)
