@@ -25,6 +25,7 @@ NAMES = ("gain_dn_per_e", "read_noise_e", "dark_current_e_per_s", "linearity_err
 class Camera:
     """A sensor and the way it is lit; lengths of lists of frames are in `record`.
 
+    `vignetting` is the share of the light that the corners of the frame lack.
     `bend` and `third` are the coefficients of s = K Q (1 + bend x + third x²), x = Q over `full_e`.
     """
 
@@ -35,6 +36,7 @@ class Camera:
     offset_dn: float = 60.0
     dsnu_e: float = 10.0
     prnu: float = 0.01
+    vignetting: float = 0.0
     full_e: float = 40_000.0
     highest_dn: float = 4095.0
     well_e: float = np.inf
@@ -56,14 +58,14 @@ class Camera:
 
 
 def expose(
-    camera: Camera, pixels: dict[str, Array], charge_e: float, shift_dn: float, more: float, rng: np.random.Generator
+    camera: Camera, pixels: dict[str, Array], charge_e: float, dark_e: float, rng: np.random.Generator, **state: float
 ) -> NDArray[np.uint16]:
-    """Take one frame (row, column) of a mean charge; `more` scales its noise."""
-    mean_e = charge_e * pixels["response"]
+    """Take one frame (row, column) of mean charges by light and dark current; `more` in its state scales its noise."""
+    mean_e = charge_e * pixels["response"] + dark_e
     noise_e = rng.poisson(mean_e) - mean_e + rng.normal(0, 1, camera.shape) * pixels["read_e"]
     flips = pixels["telegraph"] * (rng.random(camera.shape) < 0.3) * 8 * camera.read_noise_e
-    electrons = np.minimum(mean_e + more * noise_e, pixels["well_e"]) + flips
-    dn = pixels["offset_dn"] + camera.mean_dn(electrons) + shift_dn + camera.jitter_dn * rng.standard_normal()
+    electrons = np.minimum(mean_e + state["more"] * noise_e, pixels["well_e"]) + flips
+    dn = pixels["offset_dn"] + camera.mean_dn(electrons) + state["shift_dn"] + camera.jitter_dn * rng.standard_normal()
     return np.asarray(np.clip(np.rint(dn), 0, camera.highest_dn), np.uint16)
 
 
@@ -71,8 +73,10 @@ def make_pixels(camera: Camera, rng: np.random.Generator) -> dict[str, Array]:
     """Return what differs from pixel to pixel."""
     normal = partial(rng.standard_normal, camera.shape)
     spread = np.exp(camera.read_spread * normal())
+    rows, columns = (np.linspace(-1, 1, size) for size in camera.shape)
+    light = 1 - camera.vignetting * np.add.outer(rows**2, columns**2) / 2
     return {
-        "response": 1 + camera.prnu * normal(),
+        "response": light / light.mean() * (1 + camera.prnu * normal()),
         "read_e": camera.read_noise_e * spread / np.sqrt(np.mean(spread**2)),
         "offset_dn": camera.offset_dn + camera.gain_dn_per_e * camera.dsnu_e * normal(),
         "telegraph": (rng.random(camera.shape) < camera.telegraph).astype(float),
@@ -101,8 +105,9 @@ def record(camera: Camera, session: Session, rng: np.random.Generator) -> list[S
         lamp = 1 + camera.light_error * rng.standard_normal()
         taken = []
         for k in range(frames):
-            charge = charge_e * lamp * (1 + camera.flicker * rng.standard_normal()) + dark_e
-            taken.append((f"{conditions} {k}", expose(camera, pixels, charge, shift, more, rng)))
+            charge = charge_e * lamp * (1 + camera.flicker * rng.standard_normal())
+            frame = expose(camera, pixels, charge, dark_e, rng, shift_dn=shift, more=more)
+            taken.append((f"{conditions} {k}", frame))
         return measure_series(taken, conditions, camera.highest_dn)
 
     current = camera.dark_current_e_per_s

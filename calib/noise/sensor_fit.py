@@ -107,6 +107,7 @@ def fit_series(
         # The Gaussian fit tells whether pixels differ in dark current, unless values are cut off.
         spread = not exact or fit.values.get("dcnu_dn2_per_s2", 0.0) > 3 * fit.standard_error("dcnu_dn2_per_s2")
         fit = fit_exact(counts, start, moments, gaussian.bend, exact=exact, try_spread=spread)
+        fit = replace(fit, chances=gaussian.chances)
         if exact:
             # The scatter between series grows these errors by the same factors.
             pairs = zip(gaussian.values, np.diag(gaussian.plain_covariance), np.diag(gaussian.covariance), strict=True)

@@ -213,6 +213,8 @@ class NoiseFit:
     sources : tuple of (array, int)
         Derivative of the covariance by the logarithm of each scatter between series that was measured from them, with
         its degrees of freedom.
+    chances : dict of float
+        Probability with which chance makes as much of each scatter, by the names of `Excess`.
     """
 
     values: dict[str, float]
@@ -220,6 +222,7 @@ class NoiseFit:
     log_likelihood: float
     sources: tuple[tuple[Array, int], ...] = ()
     plain_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    chances: dict[str, float] = field(default_factory=dict)
 
     @property
     def bend(self) -> Bend:
