@@ -178,7 +178,7 @@ def scatter_warnings(fitted: SeriesFit) -> list[str]:
             f"the levels of the flats scatter by {flicker:.1%} about the response; the intervals have grown by it: let "
             "the lamp settle, or measure its light with each flat"
         )
-    if fitted.flats and fitted.moments.bend_se == UNKNOWN_BEND_SE:
+    if fitted.flats and UNKNOWN_BEND_SE in fitted.moments.bend_se:
         warnings.append(
             f"the light of the flats is not known well enough to tell a bend of the response from the gain; the "
             f"intervals allow for {2 * UNKNOWN_BEND_SE:.1%} at the end of the range: state the photons of at least 3 "

@@ -127,7 +127,7 @@ def negative_log_likelihood(values: Mapping[str, Any], moments: Moments) -> Any:
         total += cost
     of_flats = flat_log_likelihood(values, moments)[0]
     if any(name in values for name in BENDS):
-        if np.isfinite(moments.bend_se):
+        if moments.bend_se:
             of_flats = of_flats + bend_log_prior(values, moments.range_dn, moments.bend_se)
         if moments.light.groups.size:
             levels = moments.flats.mean_dn, moments.flats.exposure_s, level_variances_dn2(values, moments)
