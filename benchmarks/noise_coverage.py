@@ -3,9 +3,13 @@
 Sensors that bend, saturate, drift, flicker and scatter are simulated here, apart from `calib`. Every repeat draws
 frames afresh and goes through the whole calibration. An interval holds if the truth is inside; quantities without a
 value count on their own. The intervals of a quantity should hold 93 to 97 % of the time, or there should be none.
+
+`--alarms` records sessions of ideal sensors instead, and counts the warnings and refusals, which all are false there.
 """
 
 import argparse
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -15,6 +19,7 @@ from numpy.typing import NDArray
 
 from faintfield.calib.errors import CalibrationError
 from faintfield.calib.noise import Conditions, NoiseCalibration, Series, calibrate, measure_series
+from faintfield.pipelines.calibration.noise_emva import measure_emva
 
 type Array = NDArray[np.float64]
 
@@ -25,6 +30,7 @@ NAMES = ("gain_dn_per_e", "read_noise_e", "dark_current_e_per_s", "linearity_err
 class Camera:
     """A sensor and the way it is lit; lengths of lists of frames are in `record`.
 
+    `vignetting` is the share of the light that the corners of the frame lack.
     `bend` and `third` are the coefficients of s = K Q (1 + bend x + third x²), x = Q over `full_e`.
     """
 
@@ -35,6 +41,7 @@ class Camera:
     offset_dn: float = 60.0
     dsnu_e: float = 10.0
     prnu: float = 0.01
+    vignetting: float = 0.0
     full_e: float = 40_000.0
     highest_dn: float = 4095.0
     well_e: float = np.inf
@@ -56,14 +63,14 @@ class Camera:
 
 
 def expose(
-    camera: Camera, pixels: dict[str, Array], charge_e: float, shift_dn: float, more: float, rng: np.random.Generator
+    camera: Camera, pixels: dict[str, Array], charge_e: float, dark_e: float, rng: np.random.Generator, **state: float
 ) -> NDArray[np.uint16]:
-    """Take one frame (row, column) of a mean charge; `more` scales its noise."""
-    mean_e = charge_e * pixels["response"]
+    """Take one frame (row, column) of mean charges by light and dark current; `more` in its state scales its noise."""
+    mean_e = charge_e * pixels["response"] + dark_e
     noise_e = rng.poisson(mean_e) - mean_e + rng.normal(0, 1, camera.shape) * pixels["read_e"]
     flips = pixels["telegraph"] * (rng.random(camera.shape) < 0.3) * 8 * camera.read_noise_e
-    electrons = np.minimum(mean_e + more * noise_e, pixels["well_e"]) + flips
-    dn = pixels["offset_dn"] + camera.mean_dn(electrons) + shift_dn + camera.jitter_dn * rng.standard_normal()
+    electrons = np.minimum(mean_e + state["more"] * noise_e, pixels["well_e"]) + flips
+    dn = pixels["offset_dn"] + camera.mean_dn(electrons) + state["shift_dn"] + camera.jitter_dn * rng.standard_normal()
     return np.asarray(np.clip(np.rint(dn), 0, camera.highest_dn), np.uint16)
 
 
@@ -71,8 +78,10 @@ def make_pixels(camera: Camera, rng: np.random.Generator) -> dict[str, Array]:
     """Return what differs from pixel to pixel."""
     normal = partial(rng.standard_normal, camera.shape)
     spread = np.exp(camera.read_spread * normal())
+    rows, columns = (np.linspace(-1, 1, size) for size in camera.shape)
+    light = 1 - camera.vignetting * np.add.outer(rows**2, columns**2) / 2
     return {
-        "response": 1 + camera.prnu * normal(),
+        "response": light / light.mean() * (1 + camera.prnu * normal()),
         "read_e": camera.read_noise_e * spread / np.sqrt(np.mean(spread**2)),
         "offset_dn": camera.offset_dn + camera.gain_dn_per_e * camera.dsnu_e * normal(),
         "telegraph": (rng.random(camera.shape) < camera.telegraph).astype(float),
@@ -101,8 +110,9 @@ def record(camera: Camera, session: Session, rng: np.random.Generator) -> list[S
         lamp = 1 + camera.light_error * rng.standard_normal()
         taken = []
         for k in range(frames):
-            charge = charge_e * lamp * (1 + camera.flicker * rng.standard_normal()) + dark_e
-            taken.append((f"{conditions} {k}", expose(camera, pixels, charge, shift, more, rng)))
+            charge = charge_e * lamp * (1 + camera.flicker * rng.standard_normal())
+            frame = expose(camera, pixels, charge, dark_e, rng, shift_dn=shift, more=more)
+            taken.append((f"{conditions} {k}", frame))
         return measure_series(taken, conditions, camera.highest_dn)
 
     current = camera.dark_current_e_per_s
@@ -180,11 +190,102 @@ CASES: dict[str, tuple[Camera, Session]] = {
     "pairs": (replace(PLAIN, bend=-0.02), replace(TO_SATURATION, flat_frames=2, dark_frames=2)),
 }
 
+IDEAL = replace(PLAIN, prnu=0.0)
+SESSION = Session((0.01, 3.0, 10.0, 30.0), 6, (4e3, 8e3, 12e3, 18e3, 24e3, 32e3), 4)
+IDEAL_CASES: dict[str, tuple[Camera, Session]] = {
+    "48 x 48, even light": (IDEAL, SESSION),
+    "40 x 64, PRNU 1 %, vignetting 45 %": (replace(IDEAL, shape=(40, 64), prnu=0.01, vignetting=0.45), SESSION),
+    "64 x 96, three levels, vignetting 45 %": (
+        replace(IDEAL, shape=(64, 96), vignetting=0.45),
+        replace(SESSION, charges_e=(1e3, 3e3, 6e3), flat_frames=3),
+    ),
+    "48 x 48, 2 frames of each, vignetting 30 %, bend 2 %": (
+        replace(IDEAL, bend=-0.02, vignetting=0.3),
+        replace(SESSION, flat_frames=2, dark_frames=2),
+    ),
+    "32 x 40, one dim level, 12 frames": (
+        replace(IDEAL, shape=(32, 40)),
+        replace(SESSION, charges_e=(2e3,), flat_frames=12, dark_frames=10),
+    ),
+}
+
+# Rates of false alarms that are stated for a session, by words of a warning, and of what else the result says.
+WARNINGS = {
+    "the noise of the series scatters": 1e-3,
+    "the dark level drifts": 1e-3,
+    "the levels of the flats scatter": 1e-3,
+    "the dark level against exposure time": 1e-4,
+    "% off the model's": 1e-6,
+    "are stated, their level is that of": 1e-4,
+    "series of flats are left out": 1e-6,
+    "values are cut off": 1e-6,
+    "the gain differs": 6e-4,
+    "the offset differs": 6e-4,
+    "jump between two levels": 1e-3,
+    "PRNU is not measured": 1e-6,
+}
+RESULTS = {
+    "PRNU or a part of it hidden": 5e-3,
+    "DSNU, DCNU or a part hidden": 7e-3,
+    "jitter, line noise or flicker hidden": 4e-3,
+    "PRNU's interval off": 0.05,
+    "PRNU's pixel part's interval off": 0.05,
+    "no gain": 1e-4,
+    "a map of the gain": 2e-3,
+    "hot pixels": 2e-3,
+    "noisy pixels": 1e-2,
+    "dead pixels": 1e-6,
+}
+
+
+def find_alarms(camera: Camera, series: list[Series]) -> Iterator[str]:
+    """Yield the name of each false alarm of a session of an ideal sensor."""
+    try:
+        result = calibrate(series, camera.highest_dn)
+    except CalibrationError as failure:
+        yield f"refused: {type(failure).__name__}"
+        return
+    for warning in result.warnings:
+        if "light of the flats is not known" not in warning:  # which says what is recorded, and is no alarm
+            yield next((words for words in WARNINGS if words in warning), warning)
+    everything = result.estimates | measure_emva("", series, result, {}).estimates
+    hidden = [name for name, found in everything.items() if "less scatter" in (found.why or "")]
+    for group, starts in zip(RESULTS, (("prnu",), ("dsnu", "dcnu"), ("frame", "row", "column", "lamp")), strict=False):
+        if any(name.startswith(starts) for name in hidden):
+            yield group
+    for name, alarm in (("prnu", "PRNU's interval off"), ("prnu_pixel", "PRNU's pixel part's interval off")):
+        low, high = everything[name].ci95 or (0.0, np.inf)
+        if not low <= camera.prnu <= high:
+            yield alarm
+    if everything["gain_dn_per_e"].value is None:
+        yield "no gain"
+    if result.pixels.gain is not None:
+        yield "a map of the gain"
+    for kind in ("hot", "noisy", "dead"):
+        if getattr(result.pixels, kind).any():
+            yield f"{kind} pixels"
+
+
+def count_alarms(label: str, camera: Camera, session: Session, repeats: int, first_seed: int) -> None:
+    """Print the rate of each false alarm of ideal sessions beside the one that is stated."""
+    counts: Counter[str] = Counter()
+    for seed in range(first_seed, first_seed + repeats):
+        counts.update(set(find_alarms(camera, record(camera, session, np.random.default_rng(seed)))))
+    stated = WARNINGS | RESULTS
+    print(f"{label}; {repeats} sessions", flush=True)
+    for name in [*stated, *(name for name in counts if name not in stated)]:
+        if name in RESULTS or counts[name]:
+            limit = f"stated {stated[name]:.2g}" if name in stated else "none stated"
+            print(f"  {name:40s} {counts[name]:4d}  {counts[name] / repeats:.2%}  {limit}", flush=True)
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("cases", nargs="*", choices=[*CASES, []], default=[])
+    parser.add_argument("cases", nargs="*", choices=[*CASES, *IDEAL_CASES, []], default=[])
+    parser.add_argument("--alarms", action="store_true", help="count false alarms of ideal sensors")
     parser.add_argument("--repeats", type=int, default=300)
     parser.add_argument("--seed", type=int, default=1000)
     arguments = parser.parse_args()
-    for chosen in arguments.cases or CASES:
-        study(chosen, *CASES[chosen], arguments.repeats, arguments.seed)
+    cases, run = (IDEAL_CASES, count_alarms) if arguments.alarms else (CASES, study)
+    for chosen in arguments.cases or cases:
+        run(chosen, *cases[chosen], arguments.repeats, arguments.seed)

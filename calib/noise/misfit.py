@@ -21,8 +21,9 @@ from faintfield.calib.noise.strips import Array
 # is more than this fraction: less does not matter.
 _MAX_PROBABILITY, _MIN_SIGMAS, _NEGLIGIBLE_FRACTION = 1e-4, 6.0, 0.02
 
-# Scatter between series that is named in a warning: of noise and light as a fraction, of levels over the read noise.
-_NOTABLE_FRACTION, _NOTABLE_DRIFT = 0.005, 0.1
+# Scatter between series that is named in a warning: of noise and light as a fraction, of levels over the read noise. A
+# good model makes as much with this probability at most; intervals grow earlier.
+_NOTABLE_FRACTION, _NOTABLE_DRIFT, _MAX_SCATTER_CHANCE = 0.005, 0.1, 1e-3
 
 
 @dataclass(frozen=True)
@@ -159,7 +160,8 @@ def scatter_warnings(fitted: SeriesFit) -> list[str]:
         )
     read_dn = float(np.exp(0.5 * values["log_read_dn2"]))
     noise, drift, flicker = (
-        float(np.sqrt(variance)) for variance in (excess.variance2, excess.drift_dn2, excess.light2)
+        float(np.sqrt(getattr(excess, name))) if fitted.fit.chances.get(name, 1.0) <= _MAX_SCATTER_CHANCE else 0.0
+        for name in ("variance2", "drift_dn2", "light2")
     )
     if noise > _NOTABLE_FRACTION:
         warnings.append(
@@ -176,7 +178,7 @@ def scatter_warnings(fitted: SeriesFit) -> list[str]:
             f"the levels of the flats scatter by {flicker:.1%} about the response; the intervals have grown by it: let "
             "the lamp settle, or measure its light with each flat"
         )
-    if fitted.flats and fitted.moments.bend_se == UNKNOWN_BEND_SE:
+    if fitted.flats and UNKNOWN_BEND_SE in fitted.moments.bend_se:
         warnings.append(
             f"the light of the flats is not known well enough to tell a bend of the response from the gain; the "
             f"intervals allow for {2 * UNKNOWN_BEND_SE:.1%} at the end of the range: state the photons of at least 3 "

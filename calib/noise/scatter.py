@@ -8,6 +8,7 @@ response. A fourth is that of the noise over blocks of pixels, which is wider th
 
 from collections.abc import Iterable, Sequence
 from dataclasses import astuple, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy import stats
@@ -49,8 +50,16 @@ _MAX_SHARE, _MIN_FREEDOM = 0.1, 4
 # Rounds of fits in which the scatter is measured, and its relative change at which they end.
 _MAX_ROUNDS, _SETTLED = 5, 0.02
 
-# Degrees of freedom of an excess variance, and its share in the variance that it is part of.
-type Known = tuple[int, float]
+
+class Known(NamedTuple):
+    """Degrees of freedom of an excess variance, its share in the variance that it is part of, and the chance of it.
+
+    The chance is the probability with which a good model leaves residuals as large.
+    """
+
+    freedom: int
+    share: float
+    chance: float = 1.0
 
 
 def _dispersion(noise: Sequence[SeriesNoise], variances_dn2: Iterable[Array | float]) -> float:
@@ -85,19 +94,24 @@ def measure_excess(fit: NoiseFit, moments: Moments, darks: Sequence[Series]) -> 
         flats=_dispersion(of_flats, (flat_variances_of_nodes(fit, group) for group in of_flats)),
     )
     variance2, noise_known = _noise_scatter(fit, moments, excess)
-    drift_dn2, drift_known = _drift(fit, moments, trend_dn2(darks))
+    drift_dn2, drift_known = _drift(fit, moments, trend(darks))
     light = moments.light
     bends = sum(name.startswith("nonlinearity") for name in fit.values)
-    light2, light_known = 0.0, (0, 1.0)
+    light2, light_known = 0.0, Known(0, 1.0)
     if light.groups.size:
         signal = light_signal(fit, moments)
         slope = charge_slope(fit.values, signal)
         still = replace(moments, excess=replace(excess, drift_dn2=drift_dn2))
         variance = np.array(level_variances_dn2(fit.values, still), float) * slope**2
-        light2, _ = scatter_of_levels(light, signal, variance, bends)
-        light_known = (light.freedom - bends, _share(variance / signal**2, light2))
+        light2, deviance = scatter_of_levels(light, signal, variance, bends)
+        freedom = light.freedom - bends
+        light_known = Known(freedom, _share(variance / signal**2, light2), _chance(deviance, freedom))
     excess = replace(excess, variance2=variance2, drift_dn2=drift_dn2, light2=light2)
     return excess, {"variance2": noise_known, "drift_dn2": drift_known, "light2": light_known}
+
+
+def _chance(deviance: float, freedom: float) -> float:
+    return float(stats.chi2.sf(deviance, freedom)) if freedom >= 1 else 1.0
 
 
 def _share(chance: Array, excess: float) -> float:
@@ -133,30 +147,32 @@ def _noise_scatter(fit: NoiseFit, moments: Moments, excess: Excess) -> tuple[flo
     chance = 2 * wider[use] / freedom[use] + series.rounding2[use]
     target, columns = (measured - ROUNDING_DN2)[use] / noise[use], design[use] / noise[use][:, None]
     left = target.size - int(np.linalg.matrix_rank(columns / np.maximum(np.abs(columns).max(0), 1e-300)))
-    variance2, _ = scatter_of_line(columns, target, chance, np.ones_like(chance), left)
-    return variance2, (left, _share(chance, variance2))
+    variance2, deviance = scatter_of_line(columns, target, chance, np.ones_like(chance), left)
+    return variance2, Known(left, _share(chance, variance2), _chance(deviance, left))
 
 
-def trend_dn2(darks: Sequence[Series]) -> float:
-    """Return the square of the drift of the black level during a series, where all darks drift alike; else zero.
+def trend(darks: Sequence[Series]) -> tuple[float, float]:
+    """Return the square of the drift of the black level during a series, and its probability by chance.
 
-    It goes on from series to series, where it may pass for dark current.
+    It is zero unless all darks drift alike. It goes on from series to series, where it may pass for dark current.
     """
     several = [dark for dark in darks if dark.frames > 1]
     if len(several) < 3:
-        return 0.0
+        return 0.0, 1.0
     rises = np.array([np.polyfit(np.arange(item.frames), item.levels_dn, 1)[0] for item in several])
     error = float(rises.std(ddof=1)) / np.sqrt(rises.size)
-    if 2 * stats.t.sf(abs(float(rises.mean())) / max(error, 1e-300), rises.size - 1) > _MAX_TREND_CHANCE:
-        return 0.0
-    return float(rises.mean() * np.mean([item.frames for item in several])) ** 2
+    chance = 2 * float(stats.t.sf(abs(float(rises.mean())) / max(error, 1e-300), rises.size - 1))
+    if chance > _MAX_TREND_CHANCE:
+        return 0.0, chance
+    return float(rises.mean() * np.mean([item.frames for item in several])) ** 2, chance
 
 
-def _drift(fit: NoiseFit, moments: Moments, trend2: float) -> tuple[float, Known]:
+def _drift(fit: NoiseFit, moments: Moments, of_series: tuple[float, float]) -> tuple[float, Known]:
     """Return the variance of the dark levels about their straight line, and what is known of it.
 
     It is at least the square of the trend within the series.
     """
+    trend2, trend_chance = of_series
     darks, t = moments.darks, moments.darks.exposure_s
     noise = np.array(dark_variances_dn2(fit.values, t), float) / moments.pixels
     chance = (fit.values.get("jitter_dn2", 0.0) + noise) / darks.frames
@@ -169,7 +185,9 @@ def _drift(fit: NoiseFit, moments: Moments, trend2: float) -> tuple[float, Known
         return float(np.sum(((darks.mean_dn - line) * weight) ** 2))
 
     drift2 = grown_variance(deviance, left)
-    return (trend2, (0, 1.0)) if drift2 < trend2 else (drift2, (left, _share(chance, drift2)))
+    if drift2 < trend2:
+        return trend2, Known(0, 1.0, trend_chance)
+    return drift2, Known(left, _share(chance, drift2), _chance(deviance(0.0), left))
 
 
 def fit_with_excess(moments: Moments, darks: Sequence[Series], bends: int) -> tuple[NoiseFit, Moments]:
@@ -189,13 +207,14 @@ def fit_with_excess(moments: Moments, darks: Sequence[Series], bends: int) -> tu
             break
         fit = problem.fit(excess, fit.values)
     sources = []
-    for name, (freedom, share) in known.items():
+    for name, (freedom, share, _) in known.items():
         if (value := getattr(moments.excess, name)) > 0 and freedom > 0:
             grown = problem.covariance(fit.values, replace(moments.excess, **{name: 1.1 * value}))
             # Residuals tell the whole of these variances, not only the excess.
             sources.append(((grown - fit.covariance) / (0.1 * share), freedom))
     plain = problem.covariance(fit.values, NO_EXCESS)
-    return replace(fit, sources=tuple(sources), plain_covariance=plain), moments
+    chances = {name: item.chance for name, item in known.items()}
+    return replace(fit, sources=tuple(sources), plain_covariance=plain, chances=chances), moments
 
 
 def _first_light2(moments: Moments, bends: int) -> float:

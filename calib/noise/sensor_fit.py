@@ -14,7 +14,12 @@ from faintfield.calib.noise.likelihood.exact import censored_start, fit_exact, g
 from faintfield.calib.noise.likelihood.gaussian_fit import NoiseFit, dark_variances_dn2, flat_variances_dn2
 from faintfield.calib.noise.likelihood.marginal import Counts
 from faintfield.calib.noise.likelihood.moments import Moments, gather_moments
-from faintfield.calib.noise.likelihood.response import MEASURED_BEND_SE, UNKNOWN_BEND_SE, choose_bends
+from faintfield.calib.noise.likelihood.response import (
+    MEASURED_BEND_SE,
+    SECOND_BEND_SE,
+    UNKNOWN_BEND_SE,
+    choose_bends,
+)
 from faintfield.calib.noise.scatter import fit_with_excess, without_odd
 from faintfield.calib.noise.series import Series, any_suspect, sample_index
 from faintfield.calib.noise.strips import Mask
@@ -107,6 +112,7 @@ def fit_series(
         # The Gaussian fit tells whether pixels differ in dark current, unless values are cut off.
         spread = not exact or fit.values.get("dcnu_dn2_per_s2", 0.0) > 3 * fit.standard_error("dcnu_dn2_per_s2")
         fit = fit_exact(counts, start, moments, gaussian.bend, exact=exact, try_spread=spread)
+        fit = replace(fit, chances=gaussian.chances)
         if exact:
             # The scatter between series grows these errors by the same factors.
             pairs = zip(gaussian.values, np.diag(gaussian.plain_covariance), np.diag(gaussian.covariance), strict=True)
@@ -144,18 +150,22 @@ def _fit_gaussian(
     light = without_odd(light, signal, level_dn2, choose_bends(light, signal, level_dn2))
     moments = replace(moments, light=light)
     bends = choose_bends(light, signal, level_dn2)
-    measured = replace(moments, range_dn=range_dn, bend_se=MEASURED_BEND_SE)
+    measured = replace(moments, range_dn=range_dn, bend_se=(MEASURED_BEND_SE,))
     if bends:
         fit, grown = fit_with_excess(measured, darks, bends)
         if grown.excess.light2 < MAX_LIGHT_ERROR**2:
             return fit, fit, grown
-    unknown = replace(measured, light=replace(light, group=np.full(light.group.shape, -1), odd=()))
+    unknown = replace(
+        measured,
+        light=replace(light, group=np.full(light.group.shape, -1), odd=()),
+        bend_se=(MEASURED_BEND_SE, SECOND_BEND_SE),
+    )
     free = None
     if np.unique(np.round(moments.flats.mean_dn, -1)).size >= 3:
-        free, grown = fit_with_excess(unknown, darks, 1)
+        free, grown = fit_with_excess(unknown, darks, 2)
         if abs(free.values["nonlinearity_per_dn"]) > 3 * free.standard_error("nonlinearity_per_dn"):
             return free, free, grown
-    fit, grown = fit_with_excess(replace(unknown, bend_se=UNKNOWN_BEND_SE), darks, 1)
+    fit, grown = fit_with_excess(replace(unknown, bend_se=(UNKNOWN_BEND_SE, SECOND_BEND_SE)), darks, 2)
     return fit, free, grown
 
 

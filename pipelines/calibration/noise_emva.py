@@ -11,6 +11,7 @@ from faintfield.calib.estimate import Estimate
 from faintfield.calib.noise import NoiseCalibration, Series
 from faintfield.calib.noise.emva.nonuniformity import Nonuniformity, TemporalNoise, nonuniformity, temporal_noise
 from faintfield.calib.noise.emva.quantities import derived_quantities, gather_inputs
+from faintfield.calib.noise.maps.photo_response import smooth_part
 from faintfield.calib.noise.strips import map_of, mean_over
 from faintfield.calib.noise.temperature import dark_current_doubling
 from faintfield.pipelines.formats.results.noise import EmvaImageRecord, EmvaRecord
@@ -145,7 +146,7 @@ def _bright_image(darks: list[Series], calibration: NoiseCalibration) -> MeanIma
     dark = _dark_image(darks, calibration, flat.conditions.exposure_s, nearest=True)
     if dark is None:
         return None
-    response, vignetting = calibration.response, calibration.maps.vignetting
+    response = calibration.response
 
     def signal(rows: slice) -> NDArray[np.float64]:
         return np.asarray(flat.mean_of(rows) - dark.values[rows])
@@ -153,19 +154,20 @@ def _bright_image(darks: list[Series], calibration: NoiseCalibration) -> MeanIma
     def charge(rows: slice) -> NDArray[np.float64]:
         return signal(rows) if response is None else response.charge_dn(signal(rows))
 
-    def smooth(rows: slice) -> NDArray[np.float64]:
-        if vignetting is None:
-            return np.ones(used[rows].shape)
-        return np.maximum(vignetting[rows], 1e-3, dtype=np.float64)
+    # Smoothed by itself, an image loses the same share of its pattern and of its noise
+    mean = mean_over(charge, used)
+    smooth = smooth_part(map_of(lambda rows: charge(rows) / mean, used.shape), used)
 
-    signal_dn, mean, slope = mean_over(signal, used), mean_over(charge, used), 1.0
-    if response is not None:  # PRNU is that of the charge, which a bend of the response compresses
-        ends = response.charge_dn(np.array([0.99, 1.01]) * signal_dn)
-        slope = float(ends[1] - ends[0]) / (0.02 * signal_dn)
-    image = map_of(lambda rows: charge(rows) / smooth(rows) / mean, used.shape, np.float64)
-    noise = temporal_noise(flat, used) + dark.noise
-    weight = mean_over(lambda rows: 1 / smooth(rows) ** 2, used) * (slope / mean) ** 2
-    return MeanImage(flat, image, noise.scaled(weight), signal_dn)
+    def per_dn(rows: slice) -> NDArray[np.float64]:
+        """Return the derivative of the image by the signal; a bend of the response compresses bright pixels."""
+        of_light = 1 / (mean * np.maximum(smooth[rows], 1e-3, dtype=np.float64))
+        return np.asarray(of_light if response is None else of_light * response.slope(signal(rows)))
+
+    image = map_of(
+        lambda rows: charge(rows) / mean / np.maximum(smooth[rows], 1e-3, dtype=np.float64), used.shape, np.float64
+    )
+    noise = temporal_noise(flat, used, per_dn) + temporal_noise(dark.series, used, per_dn)
+    return MeanImage(flat, image, noise, mean_over(signal, used))
 
 
 def _spreads(
@@ -176,7 +178,8 @@ def _spreads(
     if image is None or needed.value is None:
         return {names.format(part): Estimate(None, why=needed.why or _NO_PAIR.format(kind)) for part in parts}
     scale = 1 / needed.value if kind == "dark" else 1.0
-    spreads = nonuniformity(image.values, ~calibration.maps.unusable, image.noise, scale)
+    used = ~calibration.maps.unusable
+    spreads = nonuniformity(image.values, used, image.noise, scale, smoothed=kind == "flat")
     return {names.format(part): getattr(spreads, part) for part in parts}
 
 

@@ -5,14 +5,15 @@ over frames is known from the scatter of the frames, and is taken out.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.estimate import Estimate, root
-from faintfield.calib.noise.maps.photo_response import running_mean
+from faintfield.calib.noise.maps.photo_response import kept_freedom, running_mean
 from faintfield.calib.noise.series import Series
 from faintfield.calib.noise.strips import Array, Mask, map_of, mean_over, over_strips, total_of
 
@@ -37,10 +38,6 @@ class TemporalNoise:
     variances: Array
     errors: Array
 
-    def scaled(self, factor: float) -> "TemporalNoise":
-        """Return the noise of an image that is multiplied by √factor."""
-        return TemporalNoise(self.variances * factor, self.errors * factor)
-
     def __add__(self, other: "TemporalNoise") -> "TemporalNoise":
         errors = np.array([*map(math.hypot, self.errors, other.errors)])
         return TemporalNoise(self.variances + other.variances, errors)
@@ -56,31 +53,50 @@ class Nonuniformity:
     pixel: Estimate
 
 
-def temporal_noise(series: Series, used: Mask) -> TemporalNoise:
-    """Return what temporal noise leaves in the mean image of a series of at least two frames."""
-    pixels, again = used.sum() * _freedom_share(used), series.frames - 1
-    within = mean_over(lambda strip: series.within_dn2[strip], used) * float(used.sum()) / (again * pixels)
+def temporal_noise(series: Series, used: Mask, weight: Callable[[slice], Array] | None = None) -> TemporalNoise:
+    """Return what temporal noise leaves in the mean image of a series of at least two frames.
+
+    `weight` returns by what the image is multiplied, for some rows (row, column); bright pixels are noisier.
+    """
+    pixels, again, size = used.sum() * _freedom_share(used), series.frames - 1, float(used.sum())
+    per_square = size / (again * pixels)
+    within = mean_over(lambda strip: series.within_dn2[strip], used) * per_square
     # The level of a frame is subtracted from its rows, and takes one degree of freedom of each set of means
     rows, columns = (size - 1 for size in used.shape)
     row, column = series.row_noise_dn2 * (1 + 1 / rows), series.column_noise_dn2 * (1 + 1 / columns)
+    if weight is not None:
+        # What pixels of a line share is multiplied by the mean weight, what is left in means of pixels by their own
+        weighted = mean_over(lambda strip: series.within_dn2[strip] * weight(strip) ** 2, used) * per_square
+        shared = mean_over(weight, used) ** 2
+        row, column = (
+            shared * line + (weighted - shared * within) * count / size
+            for line, count in zip((row, column), used.shape, strict=True)
+        )
+        within = weighted
     variances = np.array([within, row, column]) / series.frames
     return TemporalNoise(variances, variances * np.sqrt(2 / (again * np.array([pixels, rows, columns]))))
 
 
-def nonuniformity(image: NDArray[Any], used: Mask, noise: TemporalNoise, scale: float = 1.0) -> Nonuniformity:
+def nonuniformity(
+    image: NDArray[Any], used: Mask, noise: TemporalNoise, scale: float = 1.0, *, smoothed: bool = False
+) -> Nonuniformity:
     """Return the spreads of an image times a scale, each an unbiased difference of variances under its root.
 
     With the means of M rows and N columns subtracted, the rest has the variance s_pixel² + σ², where σ² is the temporal
-    noise that is left; the means of rows have s_row² + s_pixel²/N and theirs. A difference has the errors of both.
+    noise that is left; the means of rows have s_row² + s_pixel²/N and theirs. A difference has the errors of both. An
+    image that is `smoothed` is one over its `smooth_part`, which takes some of each.
     """
     rows, columns, squares = _parts(image, used)
-    freedom = used.sum() * _freedom_share(used)
+    freedom = _Freedom(used.sum() * _freedom_share(used), rows.size - 1, columns.size - 1)
+    if smoothed:
+        kept = kept_freedom(used)
+        freedom = _Freedom(kept.pixels, kept.rows, kept.columns)
     across = used.sum() / rows.size, used.sum() / columns.size
-    scatter = squares / freedom
+    scatter = squares / freedom.pixels
     (of_pixel, of_row, of_column), errors = noise.variances.tolist(), noise.errors.tolist()
-    pixel, pixel_se = scatter - of_pixel, math.hypot(scatter * math.sqrt(2 / freedom), errors[0])
-    row, row_se = _of_means(rows, of_row + pixel / across[0], errors[1])
-    column, column_se = _of_means(columns, of_column + pixel / across[1], errors[2])
+    pixel, pixel_se = scatter - of_pixel, math.hypot(scatter * math.sqrt(2 / freedom.pixels), errors[0])
+    row, row_se = _of_means(rows, freedom.rows, of_row + pixel / across[0], errors[1])
+    column, column_se = _of_means(columns, freedom.columns, of_column + pixel / across[1], errors[2])
     total_se = float(np.sqrt(pixel_se**2 + row_se**2 + column_se**2))
     return Nonuniformity(
         total=root(pixel + row + column, total_se, scale),
@@ -90,11 +106,17 @@ def nonuniformity(image: NDArray[Any], used: Mask, noise: TemporalNoise, scale: 
     )
 
 
-def _of_means(means: Array, noise: float, noise_se: float) -> tuple[float, float]:
+class _Freedom(NamedTuple):
+    pixels: float
+    rows: float
+    columns: float
+
+
+def _of_means(means: Array, freedom: float, noise: float, noise_se: float) -> tuple[float, float]:
     """Return the variance of means beyond their noise, with its standard error."""
-    variance = float(means.var(ddof=1))
+    variance = float(np.sum((means - means.mean()) ** 2)) / freedom
     # Means that happen to scatter little are known no better than those that scatter as their noise does
-    se = max(variance, noise) * math.sqrt(2 / (means.size - 1))
+    se = max(variance, noise) * math.sqrt(2 / freedom)
     return variance - noise, math.hypot(se, noise_se)
 
 

@@ -127,7 +127,7 @@ def negative_log_likelihood(values: Mapping[str, Any], moments: Moments) -> Any:
         total += cost
     of_flats = flat_log_likelihood(values, moments)[0]
     if any(name in values for name in BENDS):
-        if np.isfinite(moments.bend_se):
+        if moments.bend_se:
             of_flats = of_flats + bend_log_prior(values, moments.range_dn, moments.bend_se)
         if moments.light.groups.size:
             levels = moments.flats.mean_dn, moments.flats.exposure_s, level_variances_dn2(values, moments)
@@ -213,6 +213,8 @@ class NoiseFit:
     sources : tuple of (array, int)
         Derivative of the covariance by the logarithm of each scatter between series that was measured from them, with
         its degrees of freedom.
+    chances : dict of float
+        Probability with which chance makes as much of each scatter, by the names of `Excess`.
     """
 
     values: dict[str, float]
@@ -220,6 +222,7 @@ class NoiseFit:
     log_likelihood: float
     sources: tuple[tuple[Array, int], ...] = ()
     plain_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    chances: dict[str, float] = field(default_factory=dict)
 
     @property
     def bend(self) -> Bend:

@@ -135,8 +135,9 @@ class Moments:
         S, the products of the pixels' patterns in two series of darks, summed over pixels.
     light : Light
         Light of the flats, as far as it is known.
-    range_dn, bend_se : float
-        Signal at the end of the range, and the standard error of the bend there before it is measured.
+    range_dn, bend_se : float, tuple of float
+        Signal at the end of the range, and the standard errors of the bends there before they are measured; the last
+        one is that of all further bends.
     noise : tuple of SeriesNoise
         Sums of the noise of each series over groups of pixels.
     """
@@ -147,7 +148,7 @@ class Moments:
     scatter_dn2: Array
     light: Light = field(default_factory=lambda: known_light([]))
     range_dn: float = np.inf
-    bend_se: float = np.inf
+    bend_se: tuple[float, ...] = ()
     excess: Excess = NO_EXCESS
     noise: tuple[SeriesNoise, ...] = ()
 

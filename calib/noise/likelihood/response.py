@@ -28,6 +28,10 @@ BENDS = tuple(f"nonlinearity_per_dn{power}" for power in ("", "2", "3", "4", "5"
 # where nothing does. The second is the model error of an unbent sensor: 95 % of cameras bend by less than twice that.
 MEASURED_BEND_SE, UNKNOWN_BEND_SE = 0.3, 0.012
 
+# Likewise of κ₂ where only noise tells the bend. A signal s = K Q (1 + β Q/Q_end) has κ₂ s² = 2β² at the end, 0.08 %
+# for β = 2 % and 0.5 % for 5 %; without it, κ₁ and the gain are off.
+SECOND_BEND_SE = 0.0025
+
 # A light must span this factor to show a bend; so many levels beyond its scales give 1, 2, 3, 4 coefficients.
 _MIN_SPAN, _LEVELS_FOR_BENDS = 2.0, (2, 4, 7, 11)
 
@@ -195,10 +199,13 @@ def level_log_likelihood(
     return total
 
 
-def bend_log_prior(values: Mapping[str, Any], range_dn: float, bend_se: float) -> Any:
-    """Return ln of the normal density of the bends at the end of the range, of standard error `bend_se`."""
+def bend_log_prior(values: Mapping[str, Any], range_dn: float, bend_se: Sequence[float]) -> Any:
+    """Return ln of the normal density of the bends at the end of the range, of the standard errors `bend_se`.
+
+    The last one is that of all further bends.
+    """
     at_end = [values[name] * range_dn**power for power, name in enumerate(BENDS, 1) if name in values]
-    return -0.5 * sum((bend / bend_se) ** 2 for bend in at_end)
+    return -0.5 * sum((bend / bend_se[min(index, len(bend_se) - 1)]) ** 2 for index, bend in enumerate(at_end))
 
 
 def signal_of_charge(values: Mapping[str, float], charge: Array, range_dn: float) -> Array:

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from faintfield.calib.estimate import Estimate
 from faintfield.calib.noise.likelihood.response import charge_dn, charge_slope
+from faintfield.calib.noise.likelihood.rounding import ROUNDING_DN2
 from faintfield.calib.noise.maps.defects import noisy_pixels, telegraph_pixels, variance_ratio
 from faintfield.calib.noise.maps.gain import PixelGain, gain_of_regions, measure_gain, photon_transfer
-from faintfield.calib.noise.maps.photo_response import Response, measure_response
+from faintfield.calib.noise.maps.photo_response import Response, SignalNoise, measure_response
 from faintfield.calib.noise.maps.read_noise_map import PixelReadNoise, measure_read_noise
 from faintfield.calib.noise.maps.seams import Seam, find_seams
 from faintfield.calib.noise.sensor_fit import NoiseLikelihood, SeriesFit
@@ -26,6 +27,9 @@ from faintfield.calib.noise.strips import Array, Map, Mask, map_of, maps_of, mea
 
 # A step of the offsets is named from this fraction of the read noise, telegraph pixels from this share of all.
 _NOTABLE_STEP, _NOTABLE_SHARE = 0.1, 1e-4
+
+# Least variance of offset and dark signal, which stands for spreads that are zero or were not fitted.
+_MIN_SPREAD_DN2 = 1e-6, 1e-12
 
 _CENSORED = NoiseLikelihood.CENSORED
 
@@ -165,7 +169,7 @@ def measure_pixels(fitted: SeriesFit, hot: Mask, outlying: Mask) -> Pixels:
         if gain is not None and gain.seams:
             # A step of the gain is no spread of the pixels, and no smooth part of the response takes it out
             even = _response(fitted, levels, usable, gain_of_regions(gain.seams, usable.shape))
-            response = replace(response, prnu=even.prnu, prnu_se=even.prnu_se, why_no_prnu=even.why_no_prnu)
+            response = replace(response, spread2=even.spread2, spread2_se=even.spread2_se, why_no_prnu=even.why_no_prnu)
     seams = []
     if fitted.likelihood is not _CENSORED:
         read_dn = float(np.median(read.read_noise_dn))
@@ -275,9 +279,9 @@ def pixel_levels(
         Pixels whose dark signal the prior does not describe; only their own values determine it.
     """
     exposures = [series.conditions.dark_time_s for series in darks]
-    # The floors stand for spreads that are zero or were not fitted.
-    offset_prior = 1 / max(values["dsnu_dn2"] + pattern.variance_dn2, 1e-6)
-    signal_priors = 1e-12 if np.ptp(exposures) else 1e12, 1 / max(values.get("dcnu_dn2_per_s2", 0.0), 1e-12)
+    offset_prior = 1 / max(values["dsnu_dn2"] + pattern.variance_dn2, _MIN_SPREAD_DN2[0])
+    dcnu2 = max(values.get("dcnu_dn2_per_s2", 0.0), _MIN_SPREAD_DN2[1])
+    signal_priors = 1e-12 if np.ptp(exposures) else 1e12, 1 / dcnu2
     # Jitter moves the mean of a whole series off the straight line; that is no pixel's offset.
     levels = [mean_over(series.mean_of, ~hot) for series in darks]
 
@@ -322,9 +326,38 @@ def _response(fitted: SeriesFit, levels: PixelLevels, usable: Mask, relative_gai
         total[rows] = charge if relative_gain is None else charge / relative_gain[rows]
         return np.array(sums)
 
-    means = total_of(work, shape) / usable.size
-    noise = (
-        v / flat.frames * float(charge_slope(values, mean) ** 2)
-        for v, flat, mean in zip(fitted.flat_noise_dn2, flats, means, strict=True)
+    signals = total_of(work, shape) / usable.size
+    return measure_response(total, _signal_noise(fitted, signals), usable)
+
+
+def _signal_noise(fitted: SeriesFit, signals_dn: Array) -> SignalNoise:
+    """Return the noise of the sum of the flats' charges, in DN, given their mean signals (flat,)."""
+    values, frames = fitted.fit.values, fitted.moments.flats.frames
+    slope2 = np.square(charge_slope(values, signals_dn))
+    shot = float(np.exp(values["log_gain"]) * np.sum(np.maximum(charge_dn(values, signals_dn), 0.0) / frames))
+    read = float(np.exp(values["log_read_dn2"]) * np.sum(1 / frames))
+    by_parameter = np.array([{"log_gain": shot, "log_read_dn2": read}.get(name, 0.0) for name in values])
+    return SignalNoise(
+        shot,
+        read + ROUNDING_DN2 * float(np.sum(slope2 / frames)) + _offset_error_dn2(fitted),
+        float(np.sqrt(by_parameter @ fitted.fit.covariance @ by_parameter)),
     )
-    return measure_response(total, sum(noise), usable)
+
+
+def _offset_error_dn2(fitted: SeriesFit) -> float:
+    """Return the variance that the error of a pixel's offset and dark signal makes of the sum of its flats.
+
+    It is that of `pixel_levels` for a pixel of the usual noise.
+    """
+    values, times_s = fitted.fit.values, fitted.moments.darks.exposure_s
+    if fitted.likelihood is _CENSORED:  # one offset and dark signal for all
+        error, signal_error = max(values["dsnu_dn2"], 0.0), max(values.get("dcnu_dn2_per_s2", 0.0), 0.0)
+        return error * len(fitted.flats) ** 2 + signal_error * float(fitted.moments.flats.exposure_s.sum()) ** 2
+    weights = fitted.moments.darks.frames / np.array(fitted.dark_noise_dn2)
+    precision = np.diag([
+        1 / max(values["dsnu_dn2"], _MIN_SPREAD_DN2[0]),
+        1 / max(values.get("dcnu_dn2_per_s2", 0.0), _MIN_SPREAD_DN2[1]),
+    ])  # fmt: skip
+    design = np.stack([np.ones_like(times_s), times_s])
+    sums = np.array([len(fitted.flats), float(fitted.moments.flats.exposure_s.sum())])
+    return float(sums @ np.linalg.solve(precision + design * weights @ design.T, sums))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from faintfield.calib.estimate import Estimate, interval
+from faintfield.calib.estimate import Estimate, root
 from faintfield.calib.noise.strips import (
     Array,
     Map,
@@ -31,7 +31,10 @@ _WINDOW_PX, _CHUNK_PX = 15, 1 << 14
 # Rows whose products are summed at once.
 _ROWS = 256
 
-# Least value of the surface of fourth order; light that is as uneven is not fitted.
+# Order of the surface, the orders in row and column of its polynomials, and its least value; light that is as uneven is
+# not fitted.
+_ORDER = 4
+_LOW_ORDERS = tuple((row, column) for row in range(_ORDER + 1) for column in range(_ORDER + 1 - row))
 _MIN_SURFACE = 0.1
 
 # Largest ratio of the light over the image, by its quantiles, with which PRNU is measured.
@@ -49,9 +52,9 @@ class Response:
     ----------
     relative, vignetting, relative_se : array (row, column)
         Response over its mean, its smooth part, and the standard error of the rest.
-    prnu, prnu_se : float
-        Standard deviation of the rest relative to the mean (EMVA 1288's PRNU after its high-pass filter), and its
-        standard error.
+    spread2, spread2_se : float
+        Variance of the rest over the square of the mean (that of EMVA 1288's PRNU after its high-pass filter), and its
+        standard error. It may be negative by chance.
     dead : array (row, column), bool
         Pixels that respond less than half as much as their neighbourhood.
     why_no_prnu : str
@@ -61,27 +64,41 @@ class Response:
     relative: Map
     vignetting: Map
     relative_se: Map
-    prnu: float
-    prnu_se: float
+    spread2: float
+    spread2_se: float
     dead: Mask
     why_no_prnu: str = ""
+
+    @property
+    def prnu(self) -> float:
+        """Standard deviation of the rest relative to the mean."""
+        return float(np.sqrt(max(self.spread2, 0.0)))
 
     def prnu_estimate(self) -> Estimate:
         """Return PRNU with its interval, or the reason why it has none."""
         if self.why_no_prnu:
             return Estimate(None, why=self.why_no_prnu)
-        return interval(self.prnu, self.prnu_se)
+        return root(self.spread2, self.spread2_se)
 
 
-def measure_response(signal_dn: Map, noise_dn2: float, usable: Mask) -> Response:
+@dataclass(frozen=True)
+class SignalNoise:
+    """Variance of a signal at its mean: the part that grows with light, the rest, and the standard error of both."""
+
+    shot_dn2: float
+    dark_dn2: float
+    se_dn2: float = 0.0
+
+
+def measure_response(signal_dn: Map, noise: SignalNoise, usable: Mask) -> Response:
     """Separate vignetting from PRNU, and shrink the latter by its share of noise.
 
     Parameters
     ----------
     signal_dn : array (row, column)
         Means of the flat series minus offset and dark signal, summed over the series.
-    noise_dn2 : float
-        Variance of this sum for a pixel of mean signal.
+    noise : SignalNoise
+        Noise of this sum.
     usable : array (row, column), bool
         Pixels in use.
     """
@@ -92,24 +109,26 @@ def measure_response(signal_dn: Map, noise_dn2: float, usable: Mask) -> Response
     vignetting = running_mean(raw, usable, _width(raw.shape))
     why_no_prnu = _why_colour(raw, usable) or _why_uneven(vignetting, usable)
     if not why_no_prnu:
-        vignetting = _smooth(raw, usable)
+        vignetting = smooth_part(raw, usable)
 
     def pixel(rows: slice) -> Array:
         return np.asarray(np.divide(raw[rows], np.maximum(vignetting[rows], 1e-6), dtype=np.float64) - 1)
 
     # Shot noise grows less than the signal, so that brighter pixels have less of it in relation to their signal.
-    def noise(rows: slice) -> Array:
-        return np.asarray(noise_dn2 / mean**2 / np.maximum(vignetting[rows], 1e-6, dtype=np.float64))
+    def chance_of(rows: slice) -> Array:
+        light = np.maximum(vignetting[rows], 1e-6, dtype=np.float64)
+        return np.asarray((noise.shot_dn2 * light + noise.dark_dn2) / (mean * light) ** 2)
 
-    # The running mean holds a part of each pixel, which is missing from the rest
-    scatter2 = variance_over(pixel, usable) / mean_over(_kept_share(usable), usable)
-    mean_noise = mean_over(noise, usable)
-    spread2 = max(scatter2 - mean_noise, 0.0)
-    error2 = (spread2 + mean_noise) * np.sqrt(2 / usable.sum())
+    # The smooth part holds a part of each pixel, which is missing from the rest
+    scatter2 = variance_over(pixel, usable) / kept_freedom(usable).share
+    mean_chance = mean_over(chance_of, usable)
+    spread2 = scatter2 - mean_chance
+    known = noise.se_dn2 / (noise.shot_dn2 + noise.dark_dn2) * mean_chance
+    error2 = float(np.hypot(max(scatter2, mean_chance) * np.sqrt(2 / usable.sum()), known))
 
     def work(rows: slice) -> tuple[Map, Map]:
-        chance, smooth = noise(rows), vignetting[rows]
-        kept = spread2 / (spread2 + chance)
+        chance, smooth, found2 = chance_of(rows), vignetting[rows], max(spread2, 0.0)
+        kept = found2 / (found2 + chance)
         return smooth * (1 + np.where(usable[rows], kept * pixel(rows), 0.0)), smooth * np.sqrt(kept * chance)
 
     relative, relative_se = maps_of(work, raw.shape, (raw.dtype,) * 2)
@@ -117,8 +136,8 @@ def measure_response(signal_dn: Map, noise_dn2: float, usable: Mask) -> Response
         relative=relative,
         vignetting=vignetting,
         relative_se=relative_se,
-        prnu=float(np.sqrt(spread2)),
-        prnu_se=float(np.sqrt(spread2 + error2) - np.sqrt(spread2)),
+        spread2=spread2,
+        spread2_se=error2,
         dead=dead,
         why_no_prnu=why_no_prnu,
     )
@@ -174,7 +193,7 @@ def _width(shape: tuple[int, ...]) -> int:
     return int(max(_WINDOW_PX, min(shape) // 16) | 1)
 
 
-def _smooth(response: Map, usable: Mask) -> Map:
+def smooth_part(response: Map, usable: Mask) -> Map:
     """Return the smooth part: a surface of fourth order, times the running mean over the rest.
 
     The running mean is a sixteenth of the frame wide, over the usable pixels. Alone it would be off where the light
@@ -221,8 +240,60 @@ def _box(values: Map, window: int) -> Map:
     return np.asarray(cv2.blur(values, (window, window), borderType=cv2.BORDER_REPLICATE))
 
 
+@dataclass(frozen=True)
+class KeptFreedom:
+    """Degrees of freedom of independent pixels that are left when `smooth_part` is subtracted.
+
+    `total` are those of all usable pixels, `rows` and `columns` those of the means of rows and of columns, `pixels`
+    those of the rest. `share` is the total over the number of pixels.
+    """
+
+    total: float
+    rows: float
+    columns: float
+    share: float
+
+    @property
+    def pixels(self) -> float:
+        """Degrees of freedom without those of rows and columns."""
+        return max(self.total - self.rows - self.columns, 1.0)
+
+
+def kept_freedom(usable: Mask) -> KeptFreedom:
+    """Return the degrees of freedom that the surface and the running mean leave of each kind.
+
+    Of the surface P and the running mean B, (I − B)(I − P) is left; the squares of its elements are those of I − B
+    less those of I − B times the basis of P.
+    """
+    window = _width(usable.shape)
+    smoothed, rows, columns = 0.0, *(_kept_of_lines(size, window) for size in usable.shape)
+    bases = [_orthonormal(size) for size in usable.shape]
+    blurred = [ndimage.uniform_filter1d(basis, window, axis=0, mode="nearest") for basis in bases]
+    squares, means, both = (
+        [np.sum(a * b, axis=0) for a, b in zip(*pair, strict=True)]
+        for pair in ((bases, bases), (bases, blurred), (blurred, blurred))
+    )
+    for row, column in _LOW_ORDERS:
+        parts = [kind[0][row] * kind[1][column] for kind in (squares, means, both)]
+        smoothed += parts[0] - 2 * parts[1] + parts[2]
+    total = mean_over(_kept_share(usable), usable) * float(usable.sum()) - smoothed
+    return KeptFreedom(total, rows, columns, total / float(usable.sum()))
+
+
+def _orthonormal(size: int) -> Array:
+    """Return the polynomials up to the fourth order, orthonormal over the places of a line (place, order)."""
+    return np.asarray(np.linalg.qr(np.polynomial.legendre.legvander(np.linspace(-1, 1, size), _ORDER))[0])
+
+
+def _kept_of_lines(size: int, window: int) -> float:
+    own, squares = _line_weights(size, window)
+    basis = _orthonormal(size)
+    rest = basis - ndimage.uniform_filter1d(basis, window, axis=0, mode="nearest")
+    return max(float(np.sum(1 - 2 * own + squares) - np.square(rest).sum()), 1.0)
+
+
 def _kept_share(usable: Mask) -> Callable[[slice], Array]:
-    """Return the share of the variance of independent pixels that is left when `_smooth` is subtracted, by its rows.
+    """Return the share of independent pixels' variance that is left when the running mean is subtracted, by its rows.
 
     With the weights a_ij of the running mean it is 1 − 2 a_ii + Σ_j a_ij². At an edge of the frame the outermost pixel
     stands for those that are missing beyond.

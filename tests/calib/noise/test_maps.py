@@ -11,7 +11,13 @@ from faintfield.calib.noise import Conditions, NoiseCalibration, Series, calibra
 from faintfield.calib.noise.likelihood.response import quantum_efficiency
 from faintfield.calib.noise.maps.defects import outlying_pixels
 from faintfield.calib.noise.maps.measure import LinePattern, line_pattern, pixel_levels
-from faintfield.calib.noise.maps.photo_response import Response, _kept_share, measure_response, running_mean
+from faintfield.calib.noise.maps.photo_response import (
+    Response,
+    SignalNoise,
+    _kept_share,
+    measure_response,
+    running_mean,
+)
 from faintfield.calib.noise.maps.read_noise_map import PixelReadNoise, kept_of, measure_read_noise
 from faintfield.calib.noise.maps.seams import find_seams, share_of_seam
 from tests.calib.noise import darkroom
@@ -260,7 +266,7 @@ def test_quantum_efficiency_is_a_line_through_zero() -> None:
 def responding(response: Array, noise_dn2: float = 1.0, seed: int = 1) -> Response:
     """Measure the response to a signal of 10 000 DN with noise."""
     noise = np.sqrt(noise_dn2) * np.random.default_rng([seed, 1]).standard_normal(response.shape)
-    return measure_response(1e4 * response + noise, noise_dn2, np.ones(response.shape, bool))
+    return measure_response(1e4 * response + noise, SignalNoise(noise_dn2, 0.0), np.ones(response.shape, bool))
 
 
 def spread(seed: int) -> Array:
@@ -271,7 +277,7 @@ def test_prnu_lost_in_the_running_mean_is_restored() -> None:
     """Each sensor tells it to 1.3 %; the mean of 40 to 0.2 %, and the running mean takes 1 %."""
     responses = [responding(spread(seed), 400.0, seed) for seed in range(100, 140)]
     assert np.mean([response.prnu for response in responses]) == pytest.approx(0.01, rel=0.006)
-    z = np.array([(response.prnu - 0.01) / response.prnu_se for response in responses])
+    z = np.array([(response.spread2 - 0.01**2) / response.spread2_se for response in responses])
     assert abs(z.mean()) < 3 / np.sqrt(z.size)
     assert 0.7 < z.std() < 1.3
 
@@ -324,13 +330,15 @@ def test_response_is_vignetting_times_prnu() -> None:
     ]
     usable = np.ones(true.shape, bool)
     usable[100, 100] = False
-    response = measure_response(signals[0] + signals[1], 1.5 * noise_dn2, usable)
+    response = measure_response(signals[0] + signals[1], SignalNoise(1.5 * noise_dn2, 0.0), usable)
     assert not response.why_no_prnu
     assert np.argwhere(response.dead).tolist() == [[20, 30]]
-    assert response.prnu == pytest.approx(prnu, abs=3 * response.prnu_se)
+    assert response.spread2 == pytest.approx(prnu**2, abs=3 * response.spread2_se)
     # The scatter of the quotients of signal and vignetting is that of PRNU and noise together
     noise2 = noise_dn2 * 1.5 / (1.5 * level_dn) ** 2
-    assert response.prnu_se == pytest.approx((prnu**2 + noise2) * np.sqrt(2 / true.size) / (2 * prnu), rel=0.05)
+    assert response.prnu_estimate().se == pytest.approx(
+        (prnu**2 + noise2) * np.sqrt(2 / true.size) / (2 * prnu), rel=0.05
+    )
     inner = np.s_[12:-12, 12:-12]
     regular = (usable & ~response.dead)[inner]
     np.testing.assert_allclose(response.vignetting[inner], (vignetting / vignetting.mean())[inner], rtol=0.01)

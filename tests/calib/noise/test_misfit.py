@@ -12,7 +12,7 @@ from faintfield.calib.noise import Conditions, Series, calibrate, measure_series
 from faintfield.calib.noise.likelihood.gaussian_fit import NoiseFit
 from faintfield.calib.noise.likelihood.moments import gather_moments
 from faintfield.calib.noise.likelihood.response import Light
-from faintfield.calib.noise.scatter import trend_dn2, without_odd
+from faintfield.calib.noise.scatter import trend, without_odd
 from faintfield.calib.noise.temperature import Warmth, settle_temperature, with_doubling_error
 from tests.calib.noise.darkroom import Chip, dark_series, expose, flat_series, specimen, with_flats
 
@@ -105,7 +105,7 @@ def test_rise_within_series_is_drift_between_them(rise_dn: float) -> None:
         )
         for j, exposure_s in enumerate((0.1, 1.0, 5.0, 10.0))
     ]
-    assert trend_dn2(series) == pytest.approx((6 * rise_dn) ** 2, rel=0.1)
+    assert trend(series)[0] == pytest.approx((6 * rise_dn) ** 2, rel=0.1)
 
 
 SIGNAL = np.linspace(100.0, 3000.0, 24)
