@@ -69,6 +69,16 @@ def map_drawings(calibration: NoiseCalibration, side_px: int) -> Iterator[Drawin
     yield _unusable_pixels(calibration, side_px)
 
 
+def colour_scale(low: float, high: float, error: float) -> tuple[float, float, int]:
+    """Return first and last value of a scale for values from `low` to `high`, and its number of steps.
+
+    No step is smaller than the error. The number is odd, so that values that do not differ have the middle colour.
+    """
+    middle, half = (low + high) / 2, max((high - low) / 2, _MIN_SPAN_SE * error, 1e-6)
+    steps = int(min(2 * half / error, _MAX_STEPS) - 1) | 1 if error else _MAX_STEPS
+    return middle - half, middle + half, steps
+
+
 def _drawn(pixel_map: _PixelMap, usable: Mask, side_px: int) -> Drawing:
     """Return a map; one step of its colours is no smaller than the error of a pixel."""
     title, unit, values, *_ = pixel_map
@@ -79,15 +89,13 @@ def _drawn(pixel_map: _PixelMap, usable: Mask, side_px: int) -> Drawing:
         return Drawing(title, missing="it is the same for all pixels")
     error = pixel_map.error(usable)
     low, high = pixel_map.factor * (np.quantile(thinned(values, usable), [0.005, 0.995]) - pixel_map.less)
-    middle, half = (low + high) / 2, max((high - low) / 2, _MIN_SPAN_SE * error, 1e-6)
-    # An odd number, so that pixels that do not differ lie in the middle of a step and have one colour
-    steps = int(min(2 * half / error, _MAX_STEPS) - 1) | 1 if error else _MAX_STEPS
+    first, last, steps = colour_scale(low, high, error)
     figure, axes, look = _blank_map(values.shape)
-    look |= {"cmap": colormaps["viridis"].resampled(steps), "vmin": middle - half, "vmax": middle + half}
+    look |= {"cmap": colormaps["viridis"].resampled(steps), "vmin": first, "vmax": last}
     colour_bar(figure, axes.imshow(shown, **look), axes, unit)
     caption = f"Standard error of a pixel: {error:.2g} {unit}; no step of the colours is finer." if error else ""
-    if high - low < 2 * half / steps:
-        caption += " Pixels do not differ by more than that."
+    if high - low < (last - first) / steps:
+        caption += " The frames resolve no difference between 99 % of the pixels."
     return Drawing(title, caption, svg(figure))
 
 

@@ -74,7 +74,12 @@ def test_colour_phases_are_separate_planes(tmp_path: Path) -> None:
     chip, rng = specimen(4)
     chip.offset_dn[1::2, 0::2] += 50
     folder = write_frames(tmp_path, take_set(chip, rng, photons=(10000.0,)), mosaic=["RG", "GB"])
+    earlier = ("noise_page.png", "noise_page_B_r1c1.png", "emva1288_report.html")
+    for name in (*earlier, "noise_page_of_mine.png"):
+        (folder / name).touch()
     result = measure_sensor(folder)
+    assert not [name for name in earlier if (folder / name).exists()]
+    assert (folder / "noise_page_of_mine.png").exists()
     check_layout(folder / "noise.json", "noise_of_a_mosaic.json")
     assert isinstance(result.planes, list)
     assert [plane.colour for plane in result.planes] == ["R", "G", "G", "B"]
