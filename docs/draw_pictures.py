@@ -34,7 +34,7 @@ _TRUCK, _AIRPLANE = "plane_00500.0.tiff", "plane_00700.0.tiff"
 _DEPTHS_MM = (450.0, 750.0)
 _WIDTH_PX = 1000
 _MAIN = "from faintfield.pipelines.cli import main; main()"
-_PAGES = (("report", "report.html", 1250), ("stage", "geometry.html", 1250))
+_PAGES = (("report", "report.html", 1250), ("stage", "geometry.html", 1250), ("noise", "noise.html", 1750))
 
 # Widths and heights of the screens on which the viewer is shown.
 _SCREENS = ((1400, 1250), (1024, 1100), (390, 1500))
@@ -89,13 +89,8 @@ def draw_photographs(photographs: Path) -> None:
         write_png(_PICTURES / "photographs.png", shrunk(contact_sheet(pictures, 3), _WIDTH_PX))
 
 
-def draw_noise_page(demo: Path) -> None:
-    """Copy the page of a noise result at the width of the other pictures."""
-    _keep(_first(demo, "noise_page.png").read_bytes(), "noise")
-
-
 def draw_pages(demo: Path) -> None:
-    """Take the pages of a reconstruction and of a stage as a browser shows them, and the one of a capture."""
+    """Take the pages of a reconstruction, a stage and a sensor as a browser shows them, and the one of a capture."""
     with TemporaryDirectory() as scratch, open_browser(Path(scratch) / "browser") as tab:
         tab.call("Emulation.setScrollbarsHidden", hidden=True)
         for name, page, height_px in _PAGES:
@@ -219,7 +214,6 @@ if __name__ == "__main__":
         draw_viewer(finished, Path(sys.argv[2]))
         sys.exit()
     draw_planes(finished)
-    draw_noise_page(finished)
     draw_pages(finished)
     if data := os.environ.get("FAINTFIELD_DATA"):
         draw_photographs(Path(data) / "lightfield-chess")

@@ -22,9 +22,9 @@ def noise(*, compare: tuple[Path, Path]) -> "NoiseComparison": ...
 def noise(folder: Path | None = None, /, *, out: Path | None = None, compare: tuple[Path, Path] | None = None) -> Noise:
     """Measure offset, gain, read noise and dark current from dark frames, and flats if there are any.
 
-    Writes noise.json (numbers with 95 % intervals, or why there are none), noise_maps.npz (per pixel), a page of
-    plots, noise_page.png, and the report by EMVA 1288, emva1288_report.html. With --compare instead of FOLDER: tells
-    whether a camera has changed from one measurement to another, and writes nothing.
+    Writes noise.json (numbers with 95 % intervals, or why there are none), noise_maps.npz (per pixel), and noise.html,
+    a page with the numbers, plots of the fit, maps, and the report by EMVA 1288. With --compare instead of FOLDER:
+    tells whether a camera has changed from one measurement to another, and writes nothing.
 
     Parameters
     ----------

@@ -10,13 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.estimate import Estimate, StageFigure, StageReport
-from faintfield.pipelines.formats.files import file_within, folders_in, sha256
+from faintfield.pipelines.formats.files import folders_in, sha256
 from faintfield.pipelines.formats.provenance import Provenance
-from faintfield.pipelines.formats.reading import read_content
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_PAGE, GeometryRecord, LensRecord, read_geometry
-from faintfield.pipelines.formats.results.noise import NoiseRecord, read_noise
-from faintfield.pipelines.formats.units import MAX_PREVIEW_BYTES
-from faintfield.pipelines.pages.page import INK, Row, blank_drawing, figure, fixed, ink, smaller_uri, svg, template
+from faintfield.pipelines.formats.results.noise import NOISE_PAGES, NoiseRecord, read_noise
+from faintfield.pipelines.pages.page import (
+    INK,
+    Row,
+    blank_drawing,
+    colour_bar,
+    estimate_row,
+    figure,
+    fixed,
+    ink,
+    svg,
+    template,
+)
 
 if TYPE_CHECKING:
     from faintfield.calib.geometry import GeometrySettings
@@ -39,22 +48,20 @@ _LENS = (
     *((f"distortion {name}", "") for name in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
 )
 
-_NOISE_ROWS = (
-    ("offset_dn", "offset", "DN"),
-    ("gain_dn_per_e", "gain", "DN/e⁻"),
-    ("read_noise_e", "read noise, rms", "e⁻"),
-    ("dark_current_e_per_s", "dark current", "e⁻/s"),
-    ("dsnu_e", "offset differs between pixels by (DSNU)", "e⁻"),
-    ("dcnu_e_per_s", "dark current differs between pixels by (DCNU)", "e⁻/s"),
-    ("prnu", "response differs between pixels by (PRNU), of 1", ""),
-    ("quantum_efficiency", "quantum efficiency", "e⁻/photon"),
+# The quantities of a sensor that matter most: name, words, symbol, unit, factor to it.
+NOISE_QUANTITIES = (
+    ("gain_dn_per_e", "gain", "K", "DN/e⁻", 1.0),
+    ("read_noise_e", "read noise", "σ_d", "e⁻", 1.0),
+    ("dark_current_e_per_s", "dark current", "μ_I", "e⁻/s", 1.0),
+    ("offset_dn", "offset", "μ_y.dark", "DN", 1.0),
+    ("quantum_efficiency", "quantum efficiency", "η", "%", 100.0),
+    ("prnu", "response differs between pixels by", "PRNU", "%", 100.0),
+    ("dsnu_e", "offset differs between pixels by", "DSNU", "e⁻", 1.0),
+    ("dcnu_e_per_s", "dark current differs between pixels by", "DCNU", "e⁻/s", 1.0),
 )
 
 # The largest deviation is drawn at most this long, as a share of the pitch, so that it stays within its cell.
 _MAX_DRAWN_SHARE = 0.35
-
-# Quality of the noise page as WebP, on a scale to 100.
-_QUALITY = 80
 
 # Rotations are shown in mrad from here on, in µrad below.
 _COARSE_RAD = 1e-4
@@ -135,7 +142,7 @@ def node_drawing(geometry: GeometryRecord) -> str | None:
     dots.set_label(f"camera, deviation × {factor:g}")
     for start, end in zip(nominal, real, strict=True):
         axes.plot(*np.array([start, end]).T, color=INK, linewidth=0.8, alpha=0.7, zorder=2)
-    _colour_bar(figure, dots, axes, "along the normal (µm)")
+    colour_bar(figure, dots, axes, "along the normal (µm)")
     axes.set_aspect("equal")
     axes.margins(0.1)
     axes.invert_yaxis()
@@ -165,7 +172,7 @@ def _sigma_map(nodes: Sequence[tuple[int, int]], sigmas: Sequence[float], label:
     values[tuple((places - (top, left)).T)] = sigmas
     extent = (left - 0.5, left + columns - 0.5, top + rows - 0.5, top - 0.5)
     image = axes.imshow(values, cmap="cividis", vmin=0, extent=extent)
-    _colour_bar(figure, image, axes, label)
+    colour_bar(figure, image, axes, label)
     if values.size <= _MAX_WRITTEN:
         for (row, column), sigma in zip(nodes, sigmas, strict=True):
             colour = "black" if sigma > 0.6 * max(sigmas) else "white"
@@ -175,13 +182,6 @@ def _sigma_map(nodes: Sequence[tuple[int, int]], sigmas: Sequence[float], label:
     axes.locator_params(integer=True)
     ink(axes)
     return svg(figure)
-
-
-def _colour_bar(figure: Any, image: Any, axes: Any, label: str) -> None:
-    bar = figure.colorbar(image, ax=axes, shrink=0.8)
-    bar.set_label(label, color=INK)
-    bar.ax.tick_params(colors=INK)
-    bar.outline.set_edgecolor(INK)
 
 
 def _magnification(residuals: NDArray[np.float64], pitch_mm: float) -> float:
@@ -199,14 +199,14 @@ class Section[Record]:
     """A calibration on the page.
 
     `where` is the address of its file, and `used` tells if the planes were made with it. `pages` are the addresses of
-    its own pages, each with the page as a data URI if it is a picture. `unusable`, the number of unusable pixels by
+    its own pages. `unusable`, the number of unusable pixels by
     kind, is of a noise calibration; `drawing` and `maps` are of a geometry.
     """
 
     where: str
     sha256: str
     used: bool
-    pages: list[tuple[str, str | None]]
+    pages: list[str]
     made: Provenance[dict[str, object]] | None
     record: Record
     rows: list[Row]
@@ -228,31 +228,18 @@ def find_calibration(directory: Path, name: str) -> Path | None:
 def noise_section(directory: Path, path: Path, inputs: Set[str]) -> NoiseSection:
     """Return the section of a noise.json; `inputs` are the SHA-256 of the files that the planes were made from."""
     record = read_noise(path)
-    files = [file_within(path.parent, page.name) for page in sorted(path.parent.glob("noise_page*.png"))]
-    pages: list[tuple[str, str | None]] = [
-        (_link(directory, file), smaller_uri(read_content(file, MAX_PREVIEW_BYTES), _QUALITY)) for file in files
-    ]
     return Section(
         **_origin(directory, path, inputs),
-        pages=pages,
+        pages=[_link(directory, page) for name in NOISE_PAGES for page in sorted(path.parent.glob(name))],
         made=record.provenance,
         record=record,
         rows=[
-            _noise_row(measured, words, unit)
-            for name, words, unit in _NOISE_ROWS
+            estimate_row(measured, f"{words}, {symbol}", unit, factor)
+            for name, words, symbol, unit, factor in NOISE_QUANTITIES
             if isinstance(measured := getattr(record, name), Estimate)
         ],
         unusable={kind: len(getattr(record, f"{kind}_pixels")) for kind in ("hot", "noisy", "dead")},
     )
-
-
-def _noise_row(measured: Estimate, words: str, unit: str) -> Row:
-    if measured.value is None:
-        return Row(words, why=measured.why or "no reason stated")
-    # As many decimals as the standard error deserves
-    digits = int(np.clip(np.ceil(1 - np.log10(measured.se)), 0, 6)) if measured.se else 4
-    interval = " … ".join(f"{end:.{digits}f}" for end in measured.ci95) if measured.ci95 else "–"
-    return Row(words, f"{measured.value:.{digits}f}", interval, unit)
 
 
 def geometry_section(directory: Path, path: Path, inputs: Set[str]) -> GeometrySection:
@@ -262,7 +249,7 @@ def geometry_section(directory: Path, path: Path, inputs: Set[str]) -> GeometryS
     options = msgspec.structs.asdict(record.options)
     return Section(
         **_origin(directory, path, inputs),
-        pages=[(_link(directory, page), None)] if page.is_file() else [],
+        pages=[_link(directory, page)] if page.is_file() else [],
         made=Provenance(command=record.command, options=options, inputs=record.inputs, versions=record.versions),
         record=record,
         rows=stage_rows(record.stage),

@@ -1,221 +1,146 @@
-"""A page of plots to judge a noise calibration by, in the names and units of EMVA 1288."""
+"""The page `noise.html`: quantities of a sensor, the fit that they come from, maps, and the report by EMVA 1288."""
 
-import io
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
-from faintfield.calib.noise import Estimate, NoiseCalibration, TransferPoint
-from faintfield.calib.noise.emva.nonuniformity import spectrogram
-from faintfield.calib.noise.strips import over_strips, thinned, variance_over
-from faintfield.pipelines.formats.results.noise import STANDARD
+from faintfield.calib.noise import Estimate
+from faintfield.calib.noise.likelihood.rounding import ROUNDING_DN2
+from faintfield.pipelines.calibration.noise_emva import EmvaMeasurement
+from faintfield.pipelines.formats.results.noise import STANDARD, NoiseRecord
+from faintfield.pipelines.pages.calibration_pages import NOISE_QUANTITIES
+from faintfield.pipelines.pages.noise_plots import emva_drawings, fit_drawings
+from faintfield.pipelines.pages.page import Row, estimate_row, html_symbols, template
+from faintfield.pipelines.pages.pixel_maps import map_drawings
 
-_INK, _MODEL, _SECOND = "#1b1b1b", "#c23b22", "#2b6ca3"
+# Name, words, symbol, unit, factor to it.
+type _Quantity = tuple[str, str, str, str, float]
 
-_ROWS = (
-    ("gain_dn_per_e", "$K$", "DN/e⁻"),
-    ("offset_dn", r"$\mu_{y.\mathrm{dark}}(0)$", "DN"),
-    ("read_noise_e", r"$\sigma_d$", "e⁻"),
-    ("read_noise_dn", r"$K\sigma_d$", "DN"),
-    ("dark_current_e_per_s", r"$\mu_I$", "e⁻/s"),
-    ("dsnu_e", "DSNU (pixel)", "e⁻"),
-    ("dcnu_e_per_s", "DCNU", "e⁻/s"),
-    ("prnu", "PRNU (pixel)", ""),
-    ("quantum_efficiency", r"$\eta$", "e⁻/photon"),
-    ("frame_jitter_dn", "frame jitter", "DN"),
-    ("row_noise_dn", "row noise", "DN"),
-    ("column_noise_dn", "column noise", "DN"),
-)
+# Groups of lines by title. First those that matter most and how far the frames keep to the model, then EMVA 1288.
+_VALUES: dict[str, tuple[_Quantity, ...]] = {
+    "The sensor": (
+        *NOISE_QUANTITIES[:5],
+        ("saturation_e", "saturation capacity (full well, or end of the converter)", "μ_e.sat", "e⁻", 1.0),
+        *NOISE_QUANTITIES[5:],
+        ("frame_jitter_dn", "whole frames jitter by", "", "DN", 1.0),
+        ("row_noise_dn", "rows of a frame jitter by", "", "DN", 1.0),
+        ("column_noise_dn", "columns of a frame jitter by", "", "DN", 1.0),
+    ),
+    "Scatter of the series about the model, beyond chance": (
+        ("noise_error", "noise of a series, in variance", "", "%", 100.0),
+        ("drift_dn", "dark level of a series", "", "DN", 1.0),
+        ("light_error", "level of a series of flats", "", "%", 100.0),
+    ),
+}
+_EMVA: dict[str, tuple[_Quantity, ...]] = {
+    "Sensitivity": (
+        ("quantum_efficiency", "quantum efficiency", "η", "%", 100.0),
+        ("gain_dn_per_e", "system gain", "K", "DN/e⁻", 1.0),
+        ("gain_e_per_dn", "inverse of the gain", "1/K", "e⁻/DN", 1.0),
+        ("responsivity_dn_per_photon", "responsivity", "R", "DN/photon", 1.0),
+    ),
+    "Temporal dark noise": (
+        ("read_noise_e", "read noise: at zero exposure", "σ_d(0)", "e⁻", 1.0),
+        ("dark_noise_e", "dark noise: at the exposure stated above", "σ_d", "e⁻", 1.0),
+        ("read_noise_dn", "read noise, without rounding", "K σ_d(0)", "DN", 1.0),
+        ("dark_noise_dn", "read noise, with rounding", "σ_y.dark(0)", "DN", 1.0),
+    ),
+    "Range": (
+        ("threshold_photons", "absolute sensitivity threshold", "μ_p.min", "photons", 1.0),
+        ("threshold_e", "absolute sensitivity threshold", "μ_e.min", "e⁻", 1.0),
+        ("saturation_photons", "saturation capacity", "μ_p.sat", "photons", 1.0),
+        ("saturation_e", "saturation capacity", "μ_e.sat", "e⁻", 1.0),
+        ("snr_max", "largest signal-to-noise ratio", "SNR_max", "", 1.0),
+        ("dynamic_range", "dynamic range", "DR", "", 1.0),
+    ),
+    "Nonuniformity": (
+        ("dsnu_total_e", "dark signal, all", "DSNU", "e⁻", 1.0),
+        ("dsnu_total_dn", "dark signal, all", "DSNU", "DN", 1.0),
+        ("dsnu_row_e", "its row part", "DSNU.row", "e⁻", 1.0),
+        ("dsnu_column_e", "its column part", "DSNU.col", "e⁻", 1.0),
+        ("dsnu_pixel_e", "its pixel part", "DSNU.pixel", "e⁻", 1.0),
+        ("prnu_total", "response to light, all", "PRNU", "%", 100.0),
+        ("prnu_row", "its row part", "PRNU.row", "%", 100.0),
+        ("prnu_column", "its column part", "PRNU.col", "%", 100.0),
+        ("prnu_pixel", "its pixel part", "PRNU.pixel", "%", 100.0),
+    ),
+    "Linearity": (("linearity_error", "mean deviation of the fitted response from a line", "LE", "%", 100.0),),
+    "Dark current": (
+        ("dark_current_e_per_s", "dark current", "μ_I", "e⁻/s", 1.0),
+        ("dark_current_doubling_k", "temperature difference that doubles it", "T_d", "K", 1.0),
+    ),
+}
 
-_PLOTS_PER_ROW = 3
+# Ratios are given in decibels and bits, too.
+_RATIOS: dict[str, Callable[[float], float]] = {"dB": lambda ratio: 20 * np.log10(ratio), "bit": np.log2}
 
-# Largest number of pixels along the longer side of a map.
-_MAX_SHOWN_PX = 2000
-
-
-class _Plot(NamedTuple):
-    """One plot of the page; `missing` is the reason for leaving it out, None where it has something to show."""
-
-    title: str
-    draw: Callable[[Axes, NoiseCalibration], None]
-    missing: str | None = None
+# Number of pixels along the longer side of a map, at most: of the only one of its kind, and of one of several phases.
+_MAP_PX, _MAP_OF_PHASE_PX = 400, 200
 
 
-def draw_page(calibration: NoiseCalibration, title: str) -> bytes:
-    """Return the page as a PNG: the plots, and below them the names of those left out, with the reason."""
-    plots = _plots(calibration)
-    shown = [plot for plot in plots if plot.missing is None]
-    down = -(-len(shown) // _PLOTS_PER_ROW)
-    figure = Figure(figsize=(15.5, 0.4 + 4.7 * down), layout="constrained")
-    FigureCanvasAgg(figure)
-    # The grid is in half plots, so that a shorter last row can be centred
-    grid = figure.add_gridspec(down, 2 * _PLOTS_PER_ROW)
-    for index, plot in enumerate(shown):
-        row, column = divmod(index, _PLOTS_PER_ROW)
-        first = 2 * column + (down * _PLOTS_PER_ROW - len(shown) if row == down - 1 else 0)
-        axes = figure.add_subplot(grid[row, first : first + 2])
-        axes.set_title(plot.title)
-        plot.draw(axes, calibration)
-    how = f"{STANDARD}; likelihood: {calibration.likelihood}"
-    figure.suptitle(f"Noise calibration: {title.strip()}    ({how})", fontsize=13)
-    left_out = "; ".join(f"{plot.title} ({plot.missing})" for plot in plots if plot.missing)
-    if left_out:
-        figure.supxlabel(f"Not shown: {left_out}", fontsize=9, color="0.4")
-    page = io.BytesIO()
-    figure.savefig(page, format="png", dpi=110)
-    return page.getvalue()
-
-
-def _plots(calibration: NoiseCalibration) -> tuple[_Plot, ...]:
-    maps = calibration.maps
-    offset = calibration.estimates["offset_dn"].value or 0.0
-    cut_off = " (moments as they are, cut off)" if calibration.likelihood.startswith("censored") else ""
-    no_mass = None if calibration.histograms else "no gain, or values too wide apart"
-    return (
-        _Plot("Photon transfer" + cut_off, _photon_transfer),
-        _Plot("Dark signal against exposure time", _dark_signal),
-        _Plot("Results, 95 % intervals", _table),
-        _map("Offset less its mean (DSNU) [DN]", maps.offset_dn, maps.unusable, offset),
-        _map("Dark current [e⁻/s]", maps.dark_current_e_per_s, maps.unusable),
-        # Uniform if the model is complete.
-        _map("Temporal variance, measured / model", calibration.pixels.variance_ratio, maps.unusable),
-        _Plot("Dark values and the fitted mass function", _histograms, no_mass),
-        _Plot("Spectrogram of the offset (DSNU)", _spectrogram, _why_empty(maps.offset_dn, maps.unusable)),
-        _map("Relative response to light", maps.relative_response, maps.unusable),
+def noise_page(name: str, record: NoiseRecord, measured: Sequence[EmvaMeasurement]) -> str:
+    """Return the page about a sensor: of a mosaic, every table has columns and every drawing a part for each phase."""
+    known = [_known(phase) for phase in measured]
+    side_px = _MAP_PX if len(measured) == 1 else _MAP_OF_PHASE_PX
+    return template("noise.html").render(
+        name=name,
+        record=record,
+        measured=measured,
+        values=_table(_VALUES, known),
+        emva=_table(_EMVA, known),
+        fits=[fit_drawings(phase) for phase in measured],
+        maps=[list(map_drawings(phase.calibration, side_px)) for phase in measured],
+        emva_drawings=[emva_drawings(phase) for phase in measured],
+        standard=STANDARD,
+        sub=html_symbols,
     )
 
 
-def _photon_transfer(axes: Axes, calibration: NoiseCalibration) -> None:
-    offset = calibration.estimates["offset_dn"].value or 0.0
-    measured = [point for point in calibration.points if point.frames > 1]
-    for kind, colour in (("dark", _SECOND), ("flat", _INK)):
-        points = [point for point in measured if point.kind == kind]
-        if not points:
-            continue
-        mean = np.array([point.mean_dn - offset for point in points])
-        variance, error = _column(points, "variance_dn2"), _column(points, "variance_se_dn2")
-        axes.errorbar(mean, variance, 2 * error, fmt="o", ms=4, color=colour, capsize=2, label=f"{kind}s, ±2 s.e.")
-    order = sorted(measured, key=lambda point: point.model_mean_dn)
-    at = np.array([point.model_mean_dn - offset for point in order])
-    x = np.unique(np.concatenate([np.linspace(at[0], at[-1], 200), np.geomspace(0.1, max(at[-1], 1), 200)]))
-    axes.plot(x, np.interp(x, at, _column(order, "model_variance_dn2")), color=_MODEL, lw=1, label="model, eq. (1)")
-    if any(point.kind == "flat" for point in measured):
-        axes.set_xscale("symlog", linthresh=10)
-        axes.set_yscale("log")
-    axes.set(xlabel=r"$\mu_y - \mu_{y.\mathrm{dark}}(0)$ [DN]", ylabel=r"$\sigma_y^2$ [DN²]")
-    axes.legend(fontsize=8)
+def _known(measured: EmvaMeasurement) -> dict[str, Estimate]:
+    """Return the quantities of a phase by name, with some in units of other reports."""
+    known = {**measured.calibration.estimates, **measured.estimates}
+    gain = known["gain_dn_per_e"].value or 0.0
+    return known | {
+        "gain_e_per_dn": _mapped(known["gain_dn_per_e"], lambda value: 1 / value),
+        "dark_noise_dn": _mapped(known["read_noise_dn"], lambda noise_dn: np.sqrt(noise_dn**2 + ROUNDING_DN2)),
+        # DSNU in electrons is that in DN over K, whose own error is not in its interval
+        "dsnu_total_dn": _mapped(known["dsnu_total_e"], lambda electrons: electrons * gain),
+    }
 
 
-def _dark_signal(axes: Axes, calibration: NoiseCalibration) -> None:
-    points = [point for point in calibration.points if point.kind == "dark"]
-    t = _column(points, "exposure_s")
-    axes.plot(t, _column(points, "mean_dn"), "o", ms=4, color=_SECOND, label="mean of a series")
-    order = np.argsort(t)
-    model = _column(points, "model_mean_dn")
-    axes.plot(t[order], model[order], color=_MODEL, lw=1, label="model")
-    axes.set(xlabel="exposure time [s]", ylabel=r"$\mu_{y.\mathrm{dark}}$ [DN]")
-    # Legend and inset are placed beside the line, whether it rises or falls.
-    falls = model[order[-1]] < model[order[0]]
-    axes.legend(fontsize=8, loc="upper right" if falls else "upper left")
-    below = axes.inset_axes((0.1, 0.1, 0.34, 0.26) if falls else (0.56, 0.12, 0.42, 0.3))
-    below.axhline(0, color=_MODEL, lw=1)
-    below.plot(t, _column(points, "mean_dn") - model, "o", ms=3, color=_SECOND)
-    below.set_title("measured − model [DN]", fontsize=7)
-    below.tick_params(labelsize=7)
+def _mapped(known: Estimate, function: Callable[[float], float]) -> Estimate:
+    """Return a monotonic function of an estimate."""
+    if known.value is None:
+        return known
+    ends = sorted(float(function(end)) for end in known.ci95 or ())
+    return Estimate(float(function(known.value)), None, (ends[0], ends[1]) if ends else None)
 
 
-def _table(axes: Axes, calibration: NoiseCalibration) -> None:
-    axes.axis("off")
-    cells = [[label, *_value_and_interval(calibration.estimates[name]), unit] for name, label, unit in _ROWS]
-    widths = [0.26, 0.18, 0.34, 0.22]
-    table = axes.table(cells, colWidths=widths, loc="upper center", cellLoc="left", edges="horizontal")
-    table.auto_set_font_size(False)
-    table.set_fontsize(8.5)
-    table.scale(1, 1.35)
-    counts = {kind: int(getattr(calibration.pixels, kind).sum()) for kind in ("hot", "noisy", "dead")}
-    summary = ", ".join(f"{count} {kind}" for kind, count in counts.items())
-    axes.text(0.5, 0.0, f"{summary} pixels", ha="center", fontsize=9, transform=axes.transAxes)
+def _table(
+    quantities: Mapping[str, Sequence[_Quantity]], known: Sequence[Mapping[str, Estimate]]
+) -> list[tuple[str, list[list[Row]]]]:
+    """Return the lines of a table in groups by title, each with a cell of every phase."""
+    explained: list[dict[str, str]] = [{} for _ in known]  # the quantity that each reason was given for
+    groups = []
+    for title, lines in quantities.items():
+        rows = []
+        for key, words, symbol, unit, factor in lines:
+            versions: dict[str, Callable[[float], float]] = {unit: float}
+            if key in ("snr_max", "dynamic_range") and all(of_phase[key].value is not None for of_phase in known):
+                versions |= _RATIOS
+            for shown, function in versions.items():
+                cells = [
+                    estimate_row(_mapped(of_phase[key], function), words, shown, factor, symbol) for of_phase in known
+                ]
+                rows.append([_explained(cell, of_phase) for cell, of_phase in zip(cells, explained, strict=True)])
+        groups.append((title, rows))
+    return groups
 
 
-def _value_and_interval(estimate: Estimate) -> tuple[str, str]:
-    if estimate.value is None or estimate.ci95 is None:
-        return "—", "not identifiable"
-    digits = int(np.clip(np.ceil(-np.log10(estimate.se)), 0, 6)) if estimate.se else 3
-    low, high = estimate.ci95
-    return f"{estimate.value:.{digits}f}", f"{low:.{digits}f} … {high:.{digits}f}"
-
-
-def _map(title: str, values: NDArray[np.floating] | None, unusable: NDArray[np.bool_], less: float = 0.0) -> _Plot:
-    """Return the plot of one map less a number; its scale spans the usable pixels."""
-
-    def draw(axes: Axes, _: NoiseCalibration) -> None:
-        assert values is not None
-        low, high = np.quantile(thinned(values, ~unusable), [0.005, 0.995]) - less
-        height, width = values.shape
-        step = max(max(height, width) // _MAX_SHOWN_PX, 1)  # more pixels than the page has take seconds to draw
-        look: dict[str, Any] = {"extent": (-0.5, width - 0.5, height - 0.5, -0.5), "interpolation": "nearest"}
-        shown = values[::step, ::step] - less
-        image = axes.imshow(shown, vmin=low, vmax=max(high, low + 1e-6), cmap="viridis", **look)
-        axes.set(xlabel="column [px]", ylabel="row [px]")
-        axes.figure.colorbar(image, ax=axes, shrink=0.8)
-
-    return _Plot(title, draw, _why_empty(values, unusable))
-
-
-def _why_empty(values: NDArray[np.floating] | None, unusable: NDArray[np.bool_]) -> str | None:
-    if values is None:
-        return "not identifiable from these frames"
-    if unusable.all():
-        return "no usable pixel"
-
-    def ends(rows: slice) -> tuple[float, float]:
-        usable = values[rows][~unusable[rows]]
-        return float(usable.min(initial=np.inf)), float(usable.max(initial=-np.inf))
-
-    lows, highs = zip(*over_strips(ends, values.shape), strict=True)
-    return None if min(lows) < max(highs) else "the same for all pixels"
-
-
-def _histograms(axes: Axes, calibration: NoiseCalibration) -> None:
-    for histogram, colour in zip(calibration.histograms, (_SECOND, _INK), strict=False):
-        counted = histogram.count > 0
-        label = f"{histogram.exposure_s:g} s, {histogram.count.sum():,} values"
-        axes.plot(histogram.value_dn[counted], histogram.count[counted], ".", ms=4, color=colour, label=label)
-        axes.plot(histogram.value_dn, np.maximum(histogram.expected, 1e-3), color=_MODEL, lw=1)
-    axes.plot([], [], color=_MODEL, lw=1, label="fitted")
-    axes.set(xlabel="$y$ [DN]", ylabel="count", xlim=_value_range(calibration), yscale="log")
-    axes.set_ylim(bottom=0.5)
-    axes.locator_params(axis="x", nbins=6)
-    axes.legend(fontsize=8)
-
-
-def _value_range(calibration: NoiseCalibration) -> tuple[float, float]:
-    """Return the range of values between the quantiles 1e-4 and 1 - 1e-4."""
-    inner: list[float] = []
-    for histogram in calibration.histograms:
-        share = np.cumsum(histogram.count) / histogram.count.sum()
-        inner += histogram.value_dn[(share > 1e-4) & (share < 1 - 1e-4)].tolist()
-    return min(inner) - 3, max(inner) + 3
-
-
-def _spectrogram(axes: Axes, calibration: NoiseCalibration) -> None:
-    """Draw the amplitude spectra of the offset map; a peak is a fixed pattern with a period."""
-    offset, usable = calibration.maps.offset_dn, ~calibration.maps.unusable
-    share = float(usable.mean())
-    for axis, label, colour in ((1, "along rows (horizontal)", _SECOND), (0, "along columns (vertical)", _INK)):
-        spectrum = spectrogram(offset, usable, axis)
-        axes.plot(spectrum.frequency, np.sqrt(share * spectrum.power), lw=0.8, color=colour, label=label)
-    white = np.sqrt(share * variance_over(lambda rows: offset[rows], usable))
-    axes.axhline(white, color=_MODEL, lw=1, ls="--", label="same variance, no pattern")
-    axes.set_ylim(bottom=0)
-    axes.set(xlabel="spatial frequency [cycles/px]", ylabel="amplitude [DN]")
-    axes.legend(fontsize=8)
-
-
-def _column(points: list[TransferPoint], name: str) -> NDArray[np.float64]:
-    return np.array([getattr(point, name) for point in points], np.float64)
+def _explained(cell: Row, explained: dict[str, str]) -> Row:
+    """Return a cell that refers to an earlier one of the same phase with the same reason."""
+    if not cell.why:
+        return cell
+    words = f"{cell.words}, {cell.symbol}".removesuffix(", ")
+    first = explained.setdefault(cell.why, words)
+    return cell if first == words else cell._replace(why=f"as for {first}")

@@ -12,8 +12,10 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup, escape
 from matplotlib import rc_context
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 
+from faintfield.calib.estimate import Estimate
 from faintfield.pipelines.formats.units import StatedUnits
 
 # Colour of lines and text in drawings; in the SVG it is replaced by the page's own text colour, light or dark.
@@ -23,6 +25,10 @@ INK = "#010203"
 _SYMBOL = re.compile(
     r"\b(?:(?P<base>[A-Zμση]+)_(?P<low>[A-Za-z]+(?:\.[a-z]+)*)(?P<square>²?)|(?P<whole>DSNU|PRNU)\.(?P<part>[a-z]+))"
 )
+
+# The font of a drawing's text, and a picture within it.
+_FONT = re.compile(r"font-family: [^;\"]+; ")
+_EMBEDDED = re.compile(r"data:image/png;base64,([A-Za-z0-9+/=\s]+)")
 
 # Quality above 100, which OpenCV takes for WebP without losses.
 LOSSLESS = 101
@@ -55,6 +61,21 @@ def _environment() -> Environment:
     )
     environment.filters["figure"] = figure
     return environment
+
+
+def estimate_row(known: Estimate, words: str, unit: str, factor: float = 1.0, symbol: str = "") -> Row:
+    """Return the line of a quantity, its interval to two digits of half its width."""
+    if known.value is None:
+        return Row(words, unit=unit, why=known.why or "no reason stated", symbol=symbol)
+    value = known.value * factor
+    if known.ci95 is None:
+        return Row(words, f"{value:.4g}".replace("-", "−"), "", unit, symbol=symbol)
+    low, high = known.ci95[0] * factor, known.ci95[1] * factor
+    half = (high - low) / 2
+    scale = half if half > 0 else 1e-4 * abs(value) or 1.0
+    digits = int(np.clip(1 - np.floor(np.log10(scale)), -8, 8))
+    low_end, middle, high_end = (fixed(round(number, digits), digits) for number in (low, value, high))
+    return Row(words, middle, f"{low_end} … {high_end}", unit, symbol=symbol)
 
 
 def figure(value: float | None, digits: int = 3) -> str:
@@ -124,12 +145,14 @@ def blank_drawing(width_in: float, height_in: float, layout: Any = "constrained"
 
 
 def svg(figure: Figure) -> str:
-    """Return a drawing as SVG in the text colour of the page; equal drawings give equal text."""
+    """Return a drawing as SVG in the font and text colour of the page; equal drawings give equal text."""
     text, undated = io.StringIO(), {"Date": None, "Creator": None}
-    with rc_context({"svg.hashsalt": "faintfield"}):
+    with rc_context({"svg.hashsalt": "faintfield", "svg.fonttype": "none"}):
         figure.savefig(text, format="svg", transparent=True, bbox_inches="tight", pad_inches=0.05, metadata=undated)
     drawn = text.getvalue()
-    return drawn[drawn.index("<svg") :].replace(INK, "currentColor")
+    drawn = _FONT.sub("", drawn[drawn.index("<svg") :])
+    drawn = _EMBEDDED.sub(lambda match: smaller_uri(base64.b64decode(match[1])), drawn)
+    return drawn.replace(INK, "currentColor")
 
 
 def ink(axes: Axes) -> None:
@@ -140,3 +163,11 @@ def ink(axes: Axes) -> None:
     axes.yaxis.get_offset_text().set_color(INK)
     for label in (axes.xaxis.label, axes.yaxis.label, axes.title):
         label.set_color(INK)
+
+
+def colour_bar(figure: Figure, image: ScalarMappable, axes: Axes, label: str) -> None:
+    """Draw the scale of a picture's colours beside it."""
+    bar = figure.colorbar(image, ax=axes, shrink=0.8)
+    bar.set_label(label, color=INK)
+    bar.ax.tick_params(colors=INK)
+    bar.outline.set_edgecolor(INK)

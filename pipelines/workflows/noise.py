@@ -1,4 +1,4 @@
-"""A sensor measured from dark and flat frames, with its pages; two measurements compared: `faintfield noise`."""
+"""A sensor measured from dark and flat frames, with its page; two measurements compared: `faintfield noise`."""
 
 from pathlib import Path
 
@@ -13,8 +13,7 @@ from faintfield.pipelines.formats.files import check_results_folder, removed_if_
 from faintfield.pipelines.formats.large_arrays import maps_in_files
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, STANDARD, FitRecord, NoiseRecord, write_noise
 from faintfield.pipelines.formats.sets.noise_set import FILE_NAME, load_noise_set
-from faintfield.pipelines.pages.emva_page import EMVA_PAGE, emva_page
-from faintfield.pipelines.pages.noise_page import draw_page
+from faintfield.pipelines.pages.noise_page import noise_page
 
 _SHOWN = (
     ("gain_dn_per_e", "K, system gain", "DN/e⁻"),
@@ -28,7 +27,7 @@ _SHOWN = (
 
 
 def measure_sensor(folder: Path, out: Path | None = None) -> NoiseRecord:
-    """Measure a sensor from the frames in a folder, and write the result with its pages, there if not to `out`."""
+    """Measure a sensor from the frames in a folder, and write the result with its page, there if not to `out`."""
     if not folder.exists():
         raise MissingFile(f"{folder}: no such folder; name a folder with {FILE_NAME} and frames")
     frames = load_noise_set(folder)
@@ -36,16 +35,10 @@ def measure_sensor(folder: Path, out: Path | None = None) -> NoiseRecord:
     check_results_folder(out)
     with removed_if_empty(out), maps_by(maps_in_files(out)):
         sensor = calibrate_sensor(frames)
-        with working("drawing the pages"):
-            pages = {
-                f"noise_page{f'_{phase.name}' if phase.name else ''}.png": draw_page(
-                    phase.calibration, f"{title} {phase.name}"
-                )
-                for phase in sensor.phases
-            }
-            record = noise_record(sensor)
-            pages[EMVA_PAGE] = emva_page(title, record, sensor.phases).encode()
-        record = write_noise(out, record, noise_maps(sensor), pages)
+        record = noise_record(sensor)
+        with working("drawing the page"):
+            page = noise_page(title, record, sensor.phases)
+        record = write_noise(out, record, noise_maps(sensor), page)
     _inform_of(record)
     inform(f"{out / NOISE_FILE}")
     return record

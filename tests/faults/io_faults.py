@@ -69,11 +69,7 @@ _COMPUTATIONS = (
     "faintfield.calib.detection.detect_boards",
     "faintfield.rig.simulation.lab.lab_experiment",
     *(f"{_WORKFLOWS}.geometry.{name}" for name in ("calibrate_geometry", "stage_report", "transfer_sigma_at")),
-    *(
-        "faintfield.pipelines.calibration.noise.calibrate",
-        f"{_WORKFLOWS}.noise.emva_page",
-        f"{_WORKFLOWS}.noise.draw_page",
-    ),
+    *("faintfield.pipelines.calibration.noise.calibrate", f"{_WORKFLOWS}.noise.noise_page"),
     f"{_WORKFLOWS}.geometry.geometry_page",
     *(f"faintfield.pipelines.pages.calibration_pages.{name}" for name in ("node_drawing", "sigma_maps")),
 )

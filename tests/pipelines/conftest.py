@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.cli import run
 from faintfield.pipelines.formats.image_files import encoded
-from faintfield.pipelines.pages import calibration_pages, report_sets, viewer_data
+from faintfield.pipelines.pages import report_sets, viewer_data
 from faintfield.pipelines.pages.page import LOSSLESS, data_uri
 from faintfield.pipelines.reconstruction.depth import search as surface_depths
 from faintfield.pipelines.reconstruction.options import Options
@@ -113,7 +113,7 @@ def drawing_nothing() -> Iterator[pytest.MonkeyPatch]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Figure, "savefig", save)
-        for module in (calibration_pages, report_sets, viewer_data):
+        for module in (report_sets, viewer_data):
             patch.setattr(module, "smaller_uri", lambda content, quality=LOSSLESS: data_uri(content, ".png"))
         yield patch
 

@@ -1,6 +1,6 @@
 """The record of a sensor's noise, `noise.json` (docs/noise.md), its maps, and both as a reconstruction takes them."""
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -22,7 +22,11 @@ from faintfield.pipelines.formats.provenance import Provenance
 from faintfield.pipelines.formats.reading import is_file, read_arrays, read_json
 from faintfield.pipelines.formats.units import sound_mosaic
 
-NOISE_FILE, NOISE_MAPS = "noise.json", "noise_maps.npz"
+NOISE_FILE, NOISE_MAPS, NOISE_PAGE = "noise.json", "noise_maps.npz", "noise.html"
+
+# Patterns of the names of its pages; all but the first are of earlier versions.
+NOISE_PAGES = (NOISE_PAGE, "emva1288_report.html", "noise_page.png", "noise_page_*_r*c*.png")
+
 STANDARD = "EMVA 1288 release 4.0"
 
 # The quantities that a reconstruction needs.
@@ -205,10 +209,10 @@ def read_noise(path: Path) -> NoiseRecord:
     return read_json(path, NoiseRecord, what="the result of `faintfield noise`", remedy="run that again")
 
 
-def write_noise(
-    out: Path, record: NoiseRecord, maps: Iterable[tuple[str, NDArray[Any]]], pages: Mapping[str, bytes]
-) -> NoiseRecord:
-    """Write noise.json, its maps (row, column) one by one and its pages by file name; return it with the maps' hash.
+def write_noise(out: Path, record: NoiseRecord, maps: Iterable[tuple[str, NDArray[Any]]], page: str) -> NoiseRecord:
+    """Write noise.json, its maps (row, column) one by one and its page; return it with the maps' hash.
+
+    Pages of an earlier result are removed.
 
     noise.json is written last: where it stands, everything that it names stands too.
     """
@@ -220,8 +224,9 @@ def write_noise(
                 for name, values in maps:
                     with members.open(f"{name}.npy", "w", force_zip64=True) as member:
                         write_array(member, values, allow_pickle=False)
-        for name, page in pages.items():
-            write_whole(out / name, page)
+        for earlier in (path for name in NOISE_PAGES for path in out.glob(name)):
+            remove(earlier)
+        write_whole(out / NOISE_PAGE, page)
         record = msgspec.structs.replace(record, maps_sha256=sha256(out / NOISE_MAPS))
         write_record(out / NOISE_FILE, record)
     return record

@@ -1,18 +1,16 @@
-"""The report by EMVA 1288 of a simulated sensor whose numbers are known."""
+"""The page noise.html, and its report by EMVA 1288, of a simulated sensor whose numbers are known."""
 
 import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import numpy as np
 import pytest
 
 from faintfield.calib.estimate import Estimate
 from faintfield.pipelines.commands.calibration import noise
-from faintfield.pipelines.formats.results.noise import EmvaRecord, NoiseRecord
-from faintfield.pipelines.pages.emva_page import EMVA_PAGE
+from faintfield.pipelines.formats.results.noise import NOISE_PAGE, EmvaRecord, NoiseRecord
 from tests.calib.noise.darkroom import specimen
 from tests.pipelines.noise_sets import measure_sensor, take_set, write_frames
 
@@ -29,8 +27,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, NoiseRecor
         (np.minimum(pixels, TOP_DN).astype(np.uint16), keys) for pixels, keys in take_set(chip, rng, photons=light)
     ]
     write_frames(folder, frames, saturation_dn=float(TOP_DN))
-    with mock.patch("faintfield.pipelines.workflows.noise.draw_page", return_value=b"page"):
-        return folder, noise(folder)
+    return folder, noise(folder)
 
 
 def emva_of(record: NoiseRecord) -> EmvaRecord:
@@ -62,34 +59,35 @@ def test_figures_of_merit_are_true(measured: tuple[Path, NoiseRecord]) -> None:
 
 
 def test_page_shows_quantities_and_loads_nothing(measured: tuple[Path, NoiseRecord]) -> None:
-    page, record = (measured[0] / EMVA_PAGE).read_text(), measured[1]
-    assert page.count("<svg") == 9
+    page, record = (measured[0] / NOISE_PAGE).read_text(), measured[1]
+    assert page.count("<svg") == len(re.findall(r'role="img" aria-label="[^"]{20}', page)) == 15
     assert not re.search(r"""(src|href)=["'](?!#|data:)|url\((?!#)|@import""", page.replace('xlink:href="#', 'x="'))
+    assert len(page.encode()) < 2_000_000
     assert "differ by 0 K" in page
+    assert page.count(record.provenance.inputs["noise.toml"] if record.provenance else "none") == 1
     # Units of other reports: the inverse gain, and noise that the rounding is part of
-    for symbol, unit, value in (
-        ("1/K", "e⁻/DN", 1 / (record.gain_dn_per_e.value or 0)),
-        (r"σ<sub>y.dark</sub>\(0\)", "DN", np.hypot(record.read_noise_dn.value or 0, np.sqrt(1 / 12))),
+    for words, unit, value in (
+        ("inverse of the gain", "e⁻/DN", 1 / (record.gain_dn_per_e.value or 0)),
+        ("read noise, with rounding", "DN", np.hypot(record.read_noise_dn.value or 0, np.sqrt(1 / 12))),
     ):
-        row = re.search(rf'symbol">{symbol}</th>.*?number">([\d.]+)</td>.*?unit">(.*?)</td>', page, re.DOTALL)
+        row = re.search(rf'row">{words} .*?</th><td class="unit">(.*?)</td>\s*<td class="number">([\d.]+)</td>', page)
         assert row is not None
-        assert float(row[1]) == pytest.approx(value, rel=2e-3)
-        assert row[2] == unit
+        assert row[1] == unit
+        assert float(row[2]) == pytest.approx(value, rel=2e-3)
 
 
 def test_without_flats_missing_numbers_have_reasons(tmp_path: Path) -> None:
     chip, rng = specimen(5, dark_current_e_per_s=5.0)
-    with mock.patch("faintfield.pipelines.workflows.noise.draw_page", return_value=b"page"):
-        record = noise(write_frames(tmp_path, take_set(chip, rng, frames=6)))
+    record = noise(write_frames(tmp_path, take_set(chip, rng, frames=6)))
     emva = emva_of(record)
     assert emva.dark_noise_exposure_s == 0
     for name in ("responsivity_dn_per_photon", "threshold_photons", "snr_max", "dynamic_range", "prnu_total"):
         measured: Any = getattr(emva, name)
         assert measured.value is None
         assert "flat" in measured.why, name
-    page = (tmp_path / EMVA_PAGE).read_text()
-    assert page.count("Not shown: there are no flats") == 5
-    assert page.count("<svg") == 4
+    page = (tmp_path / NOISE_PAGE).read_text()
+    assert page.count(": there are no flats<") == 4
+    assert page.count("<svg") == 7
     assert "as for" in page
 
 
