@@ -82,7 +82,7 @@ const viewer = (() => {
     one.key = key;
     return one.canvas;
   }
-  const sure = (one, doubt, at) => doubt.levels[at] !== UNKNOWN && number(doubt, doubt.levels[at]) >= one.sure_above - doubt.step / 2;
+  const sure = (one, doubt, at) => doubt.levels[at] !== UNKNOWN && number(doubt, doubt.levels[at]) >= one.sure_above;
   const name = one => one.title + ", " + one.words;
   /** Numbers of the sample at a place, in words with their units; null outside the picture. */
   function valueAt(one, u, v) {
