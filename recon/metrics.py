@@ -55,7 +55,7 @@ def noise_variance_e2(
     read_noise_e: float,
     background_photons_per_s: float = 0.0,
 ) -> float:
-    """Return eq. (6), `η (Φ_o + Φ_b) t + D t + σ²`, the variance of a pixel in e⁻²."""
+    """Return eq. (6), `η (Φ_o + Φ_b) t + D t + σ²`, the variance of a pixel in (e⁻)²."""
     light_e = quantum_efficiency * (photons_per_s + background_photons_per_s) * exposure_s
     return light_e + dark_current_e_per_s * exposure_s + read_noise_e**2
 

@@ -20,7 +20,7 @@ _STEPS, _DEVIATIONS = 2000, 10
 
 
 def pixel_information(mean_e: float, read_noise_e: float) -> float:
-    """Return the Fisher information in 1/e⁻² of a pixel `Poisson(λ) + N(0, σ²)` about its mean λ.
+    """Return the Fisher information in 1/(e⁻)² of a pixel `Poisson(λ) + N(0, σ²)` about its mean λ.
 
     It lies between 1/λ, without read noise, and 1/(λ + σ²). From 3 e⁻ of read noise on, and above 100 e⁻ of light, it
     is what the likelihood `auto` makes of a pixel, 1/(λ + σ²): 5 % less at most.
@@ -32,7 +32,7 @@ def pixel_information(mean_e: float, read_noise_e: float) -> float:
 def information_of_views(
     light_e: float, dark_e: float, read_noise_e: float, response: NDArray[np.floating]
 ) -> NDArray[np.float64]:
-    """Return the information in 1/e⁻² of one pixel of each view about a sample, (view,).
+    """Return the information in 1/(e⁻)² of one pixel of each view about a sample, (view,).
 
     Parameters
     ----------
@@ -68,8 +68,8 @@ def sample_sigma_e(information: float, views: int) -> float:
     Parameters
     ----------
     information, views : float, int
-        In 1/e⁻², summed over the views that see the sample, times the part of the pixels that have its colour; and the
-        number of these views, the reference view among them.
+        In 1/(e⁻)², summed over the views that see the sample, times the part of the pixels that have its colour; and
+        the number of these views, the reference view among them.
     """
     return math.sqrt(interpolation(views) / information)
 

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 _FIGURES: tuple[tuple[str, str, str, float], ...] = (
     ("pitch_x_mm", "pitch along rows", "mm", 1.0),
     ("pitch_y_mm", "pitch along columns", "mm", 1.0),
-    ("scale_x", "scale along rows, real over told", "", 1.0),
-    ("scale_y", "scale along columns, real over told", "", 1.0),
+    ("scale_x", "scale along rows, measured over asked", "", 1.0),
+    ("scale_y", "scale along columns, measured over asked", "", 1.0),
     ("squareness_rad", "squareness: angle between the axes less 90°", "mrad", 1e3),
     ("backlash_x_mm", "backlash along rows", "µm", 1e3),
     ("backlash_y_mm", "backlash along columns", "µm", 1e3),

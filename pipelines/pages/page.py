@@ -29,6 +29,11 @@ _SYMBOL = re.compile(
 # The font of a drawing's text, and a picture within it.
 _FONT = re.compile(r"font-family: [^;\"]+; ")
 _EMBEDDED = re.compile(r"data:image/png;base64,([A-Za-z0-9+/=\s]+)")
+# Exponents.
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+# SNR beyond which the noise of a dark frame does not matter: it is less than a thirtieth of the light.
+MAX_SNR = 1000
 
 # Quality above 100, which OpenCV takes for WebP without losses.
 LOSSLESS = 101
@@ -45,8 +50,16 @@ class Row(NamedTuple):
     symbol: str = ""
 
 
+class Fact(NamedTuple):
+    """A number with its name and meaning."""
+
+    name: str
+    value: str
+    means: str
+
+
 def template(name: str) -> Template:
-    """Return a page's template; its filter `figure` writes a number to three digits."""
+    """Return a page's template; its filter `figure` writes a number to three digits, `snr_text` an SNR."""
     return _environment().get_template(name)
 
 
@@ -59,7 +72,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["figure"] = figure
+    environment.filters |= {"figure": figure, "snr_text": snr_text}
     return environment
 
 
@@ -86,7 +99,13 @@ def figure(value: float | None, digits: int = 3) -> str:
     if rounded == 0 or 1e-4 <= abs(rounded) < 1e6:
         decimals = digits - 1 - int(np.floor(np.log10(abs(rounded)))) if rounded else 0
         return fixed(rounded, decimals)
-    return f"{rounded:.{digits - 1}e}".replace("-", "−")
+    mantissa, _, power = f"{rounded:.{digits - 1}e}".partition("e")
+    return f"{mantissa} × 10{str(int(power)).translate(_RAISED)}".replace("-", "−")
+
+
+def snr_text(snr: float) -> str:
+    """Return an SNR, a ratio of powers; beyond `MAX_SNR` its digits depend on the last bits of the noise."""
+    return figure(snr) if snr <= MAX_SNR else f"above {MAX_SNR}"
 
 
 def fixed(value: float, decimals: int) -> str:

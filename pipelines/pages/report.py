@@ -16,6 +16,7 @@ from faintfield.pipelines.formats.results.records import (
     RECONSTRUCTION_FILE,
     REPORT_FILE,
     BestFocusRecord,
+    Poses,
     ReconstructionRecord,
 )
 from faintfield.pipelines.formats.results.stacks import at_depths
@@ -29,20 +30,20 @@ from faintfield.pipelines.pages.calibration_pages import (
     geometry_section,
     noise_section,
 )
-from faintfield.pipelines.pages.page import figure, format_depths, template
+from faintfield.pipelines.pages.page import MAX_SNR, Fact, figure, format_depths, snr_text, template
 from faintfield.pipelines.pages.report_pictures import plane_sections
 from faintfield.pipelines.pages.report_planes import error_sections, method_title, read_planes
 from faintfield.pipelines.pages.report_sets import SetSection, set_sections
 from faintfield.pipelines.pages.report_surface import depth_sections, surface_sections
 from faintfield.pipelines.pages.viewer_data import viewer_of
 
-
-class Fact(NamedTuple):
-    """A number with its name and meaning."""
-
-    name: str
-    value: str
-    means: str
+# Origins of poses in words.
+_POSES: dict[Poses, str] = {
+    "stated": "by the set; not measured",
+    "measured": f"their uncertainty is in {GEOMETRY_FILE} of the session, which is not here",
+    "nominal": "where the stage was sent; not measured",
+    "true": "known to the simulation",
+}
 
 
 class Origin(NamedTuple):
@@ -75,9 +76,13 @@ def write_report(directory: Path, *, noise: Path | None = None, geometry: Path |
     planes = read_planes(directory, results)
     shown, errors = plane_sections(planes, results.values()), error_sections(directory, planes)
     the_set = sets[0] if sets else None
+    lead: ReconstructionRecord | SurfaceFileRecord = results[shown.best.path.parent] if shown.best else records[0]
+    of_surfaces = surface_sections(directory, surfaces)
     facts = _light(the_set) if the_set else []
-    facts.append(_poses(of_geometry, errors.geometry_off, units))
-    facts += _noise(of_noise, the_set)
+    if not planes:
+        facts = [*of_surfaces[0].facts, *([] if facts else [_no_snr(the_set)]), *facts]
+    facts.append(_poses(lead, of_geometry, errors.geometry_off))
+    facts += _noise(lead, of_noise, the_set)
     led_by = [plane for plane in planes if shown.best and plane.column == shown.best.column]
     if best := errors.of(led_by):
         values = ", ".join(figure(row.mse_texture) for row in best)
@@ -89,9 +94,9 @@ def write_report(directory: Path, *, noise: Path | None = None, geometry: Path |
         facts=facts,
         sets=sets,
         **vars(shown),
-        viewer=viewer_of(planes, shown, the_set),
+        viewer=viewer_of(planes, shown, the_set, surfaces),
         depth_maps=depth_sections(directory, results),
-        surfaces=surface_sections(directory, surfaces),
+        surfaces=of_surfaces,
         noise=of_noise,
         geometry=of_geometry,
         **vars(errors),
@@ -171,7 +176,9 @@ def _light(the_set: SetSection) -> list[Fact]:
     light = the_set.overview.brightness
     if light.snr is None or the_set.noise_free:
         return []
-    facts = [Fact("SNR of a view", figure(light.snr), f"eq. (4): {light.region} against {light.noise_from}")]
+    means = f"eq. (4): {light.region} against {light.noise_from}"
+    means += "; the noise of darkness hardly counts" if light.snr > MAX_SNR else ""
+    facts = [Fact("SNR of a view", snr_text(light.snr), means)]
     units = units_of(the_set.overview)
     if units.light != "electrons":
         value = f"{figure(light.mean_signal_e)} {units.light_per_pixel}"
@@ -187,10 +194,22 @@ def _light(the_set: SetSection) -> list[Fact]:
     return facts
 
 
-def _poses(geometry: GeometrySection | None, against_truth: GeometryErrors | None, units: StatedUnits) -> Fact:
-    if geometry is None:
-        scale = "" if units.depth == "mm" else "; their scale is not known"
-        return Fact("Poses", "as stated", f"by the set; not measured{scale}")
+def _no_snr(the_set: SetSection | None) -> Fact:
+    if the_set is None:
+        return Fact("SNR of a view", "–", "not recorded by the version that made this surface; reconstruct again")
+    return Fact("SNR of a view", "–", "the views are stated to have no noise")
+
+
+def _poses(
+    lead: ReconstructionRecord | SurfaceFileRecord,
+    geometry: GeometrySection | None,
+    against_truth: GeometryErrors | None,
+) -> Fact:
+    """Return the poses that a result was made with, as its record says, with their σ if geometry.json is at hand."""
+    poses = lead.options.poses
+    if poses != "measured" or geometry is None or not geometry.used:
+        scale = "" if units_of(lead).depth == "mm" else "; their scale is not known"
+        return Fact("Poses", "as stated" if poses == "stated" else poses, _POSES[poses] + scale)
     record = geometry.record
     sigma_mm = [node.sigma_mm for node in record.nodes if node.node != record.reference_node]
     known = f"± {_length(float(np.sqrt(np.mean(np.square(sigma_mm))))) if sigma_mm else '–'}"
@@ -199,21 +218,25 @@ def _poses(geometry: GeometrySection | None, against_truth: GeometryErrors | Non
         means += f"; they lie {_length(off)} rms off a regular grid"
     if against_truth:
         means += f". Against the truth: {_length(against_truth.centre_rms_mm)} rms"
-    return Fact("Poses, measured" if geometry.used else "Poses, not used here", known, means)
+    return Fact("Poses, measured", known, means)
 
 
-def _noise(noise: NoiseSection | None, the_set: SetSection | None) -> list[Fact]:
-    if noise is None:
-        if the_set is None or the_set.noise_free:
-            return []
-        units = units_of(the_set.overview)
-        says = "as the set states it" if units.light == "electrons" else "estimated, not measured"
-        return [Fact("Read noise", f"{figure(the_set.overview.read_noise_e)} {units.light_symbol}", says)]
-    read, dark = noise.record.read_noise_e, noise.record.dark_current_e_per_s
-    means = [f"± {figure(read.se, 2)}"] if read.se else []
-    means += [] if dark.value is None else [f"dark current {figure(dark.value)} e⁻/s"]
-    name = "Read noise, measured" if noise.used else "Read noise, not used here"
-    return [Fact(name, f"{figure(read.value)} e⁻", "; ".join(means))]
+def _noise(
+    lead: ReconstructionRecord | SurfaceFileRecord, noise: NoiseSection | None, the_set: SetSection | None
+) -> list[Fact]:
+    """Return the read noise that a result was made with, as its record says, from noise.json if that is at hand."""
+    if noise is not None and noise.used:
+        read, dark = noise.record.read_noise_e, noise.record.dark_current_e_per_s
+        means = [f"± {figure(read.se, 2)}"] if read.se else []
+        means += [] if dark.value is None else [f"dark current {figure(dark.value)} e⁻/s"]
+        return [Fact("Read noise, measured", f"{figure(read.value)} e⁻", "; ".join(means))]
+    if the_set is None or the_set.noise_free:
+        return []
+    units = units_of(the_set.overview)
+    says = "as the set states it" if units.light == "electrons" else "estimated, not measured"
+    if any(Path(name).name == NOISE_FILE for name in lead.inputs):
+        says = f"measured; its uncertainty is in {NOISE_FILE} of the set, which is not here"
+    return [Fact("Read noise", f"{figure(the_set.overview.read_noise_e)} {units.light_symbol}", says)]
 
 
 def _length(length_mm: float) -> str:

@@ -209,9 +209,9 @@ def _focus_curve(focus: FocusCurve, units: StatedUnits) -> str:
         text = f"{depth:.0f} mm" if units.depth == "mm" else units.numbers_text([depth]).replace("-", "−")
         peak = (depth, max(focus.detail_e2))
         axes.annotate(text, peak, (4, -2), textcoords="offset points", color="#d95f02", va="top")
-    squared = {"electrons": "e⁻²", "dn": "DN²", "relative": "white²"}[units.light]
+    squared = {"electrons": "(e⁻)²", "dn": "DN²", "relative": "white²"}[units.light]
     axes.set_xlabel(f"{units.quantity} ({units.length or 'relative'})")
-    axes.set_ylabel(f"detail both halves\nof the views agree on ({squared})")
+    axes.set_ylabel(f"detail both halves\nof the views agree on, {squared}")
     axes.ticklabel_format(axis="y", scilimits=(-3, 3))
     ink(axes)
     return svg(figure)

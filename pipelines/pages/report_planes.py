@@ -76,7 +76,7 @@ class Plane:
     def sidecar_pixels(self, key: Literal["sigma_file", "proposal_file", "moved_file"]) -> NDArray[Any] | None:
         """Return the pixels of a file beside the plane that its record names, None if it names none."""
         name = getattr(self.records[0], key)
-        return read_frame(_existing(self.path.with_name(Path(name).name))).pixels_dn if name else None
+        return read_frame(existing(self.path.with_name(Path(name).name))).pixels_dn if name else None
 
 
 def method_title(records: Sequence[PlaneRecord]) -> str:
@@ -103,7 +103,7 @@ def read_planes(directory: Path, results: dict[Path, ReconstructionRecord]) -> l
             # The folders of a method and of a session's reconstructions tell nothing more
             parts = [part for part in where.parts if part not in (method, RECONSTRUCTIONS)]
             column = f"{parts[-1]}/{method}" if parts else method
-            path, depth = _existing(folder / Path(name).name), records[0].depth_mm
+            path, depth = existing(folder / Path(name).name), records[0].depth_mm
             planes.append(Plane(column, method, result.options.poses, depth, path, records, units_of(result)))
     poses, methods = _POSES_IN_ORDER.index, list(METHOD_NAMES).index
     return sorted(
@@ -111,9 +111,10 @@ def read_planes(directory: Path, results: dict[Path, ReconstructionRecord]) -> l
     )
 
 
-def _existing(path: Path) -> Path:
+def existing(path: Path) -> Path:
+    """Return the path of a file that a record names (MissingFile)."""
     if not path.is_file():
-        raise MissingFile(f"{path}: is recorded in reconstruction.json but missing; reconstruct again")
+        raise MissingFile(f"{path}: is recorded but missing; reconstruct again")
     return path
 
 

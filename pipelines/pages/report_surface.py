@@ -9,8 +9,8 @@ from msgspec import UNSET, UnsetType
 from faintfield.pipelines.formats.reading import read_content
 from faintfield.pipelines.formats.results.records import DepthMapRecord, ReconstructionRecord, preview_name
 from faintfield.pipelines.formats.results.surface import HeldOutRecord, SurfaceFileRecord, SurfaceRecord
-from faintfield.pipelines.formats.units import MAX_PREVIEW_BYTES, StatedUnits, units_of
-from faintfield.pipelines.pages.page import LOSSLESS, data_uri, figure, smaller_uri
+from faintfield.pipelines.formats.units import MAX_PREVIEW_BYTES
+from faintfield.pipelines.pages.page import LOSSLESS, Fact, data_uri, figure, smaller_uri
 
 # Kinds of films that browsers play.
 _FILMS = (".webp", ".png")
@@ -68,10 +68,13 @@ def depth_sections(directory: Path, results: dict[Path, ReconstructionRecord]) -
 class SurfaceSection(NamedTuple):
     """Part of the page about one surface; a row of its table is name, value and meaning of a number.
 
-    Predictions, and the verdict that follows from them, are of views that were left out; empty if none were.
+    Facts are the numbers that matter most; the warning is of a surface that does not explain its views. Predictions,
+    and the verdict that follows from them, are of views that were left out; empty if none were.
     """
 
     title: str
+    facts: list[Fact]
+    warning: str | None
     made: SurfaceFileRecord
     picture: str | None
     figures: list[Figure]
@@ -89,26 +92,41 @@ def _section(title: str, folder: Path, made: SurfaceFileRecord) -> SurfaceSectio
     surface = made.surface
     predictions = _predictions(surface.held_out) if surface.held_out else []
     verdict = _verdict(surface.held_out, predictions) if surface.held_out else ""
+    if surface.warning is not None:
+        verdict = "The surface does not explain them."
     picture = _embedded(folder / preview_name(surface.picture))
-    figures = _figures(folder, surface, units_of(made))
-    return SurfaceSection(title, made, picture, figures, _rows(surface), predictions, verdict)
+    figures = _figures(folder, surface)
+    rows, facts = _rows(surface), _facts(surface)
+    return SurfaceSection(title, facts, surface.warning, made, picture, figures, rows, predictions, verdict)
 
 
-def _figures(folder: Path, surface: SurfaceRecord, units: StatedUnits) -> list[Figure]:
+def _facts(surface: SurfaceRecord) -> list[Fact]:
+    """Return the share of sure depths, and how well the surface explains its views."""
+    probability = f"with a probability of at least {100 * surface.sure_above:.0f} %"
+    means = f"of the picture: the {_quantity(surface)} is right within {_tolerance(surface)} {probability}"
+    sure = Fact(f"Sure {_quantity(surface)}s".replace("ys", "ies"), f"{100 * surface.sure_share:.0f} %", means)
+    name = "Deviance; 1 is perfect"
+    if surface.held_out is None:
+        return [sure, Fact(name, "–", "not known: with so few views none is left out to compare with")]
+    deviance = surface.held_out.surface
+    times = "no more than" if deviance <= 1 else f"{figure(deviance**0.5, 2)} times"
+    return [
+        sure,
+        Fact(name, figure(deviance), f"views that were left out differ from its prediction by {times} their noise"),
+    ]
+
+
+def _figures(folder: Path, surface: SurfaceRecord) -> list[Figure]:
     quantity, unit = _quantity(surface), surface.unit
     film = _embedded_film(folder / surface.film) if surface.film and Path(surface.film).suffix in _FILMS else None
     circling = "From viewpoints between the nodes; the middle depth stands still, what is nearer moves most"
     measured = "in the unit of the poses, whose length is not known" if unit == "relative" else f"in {unit}"
     right = f"Probability that the {quantity} is right within {_tolerance(surface)}"
-    light = "1 = white" if units.light == "relative" else units.light_symbol
-    noise = "Standard deviation of the light of each sample by noise, if its depth is right"
-    known = f"Where each sample is, {measured}; hatched where that is not sure"
+    known = f"Where each sample is, {measured}; hatched where that is not sure, grey where it is not known"
     entries: list[tuple[str | UnsetType, str, str]] = [
-        (surface.picture, "Sharp everywhere.", "One picture from all views, as the reference camera would see it"),
+        (surface.picture, "Picture.", "One from all views, as the reference camera would see it"),
         (surface.depth, f"{quantity.capitalize()}, {unit}.", known),
         (surface.depth_confidence, "How sure.", right),
-        (surface.depth_sigma, f"σ of the {quantity}, {unit}.", "Standard deviation, if the right surface was found"),
-        (surface.picture_sigma, f"σ of the picture, {light}.", noise),
         (surface.visibility, "Seen by.", "Number of views in which nothing hides the sample"),
         (surface.picture_proposal, "Proposal.", "What the prior proposed"),
         (surface.picture_moved, "Moved, σ.", "Picture less proposal, in standard deviations of the noise"),
@@ -138,14 +156,11 @@ def _rows(surface: SurfaceRecord) -> list[tuple[str, str, str]]:
     first, last = (figure(value) for value in surface.searched)
     how = "found in the views" if surface.range_found else "as asked for"
     compared = f"{how}; {surface.depths} depths compared in bins of {surface.bins_px} × {surface.bins_px} pixels"
-    probability = f"with a probability of at least {100 * surface.sure_above:.0f} %"
-    sure = f"the {quantity} is right within {_tolerance(surface)} {probability}"
     median = f"{figure(surface.median)}{unit}" if surface.median is not None else "–"
     return [
         (f"{quantity.capitalize()} searched", f"{first} to {last}{unit}", compared),
         (f"Median {quantity}", median, f"of all samples whose {quantity} is known"),
         ("Known", f"{100 * surface.known_share:.0f} %", f"of the picture has a {quantity}"),
-        ("Sure", f"{100 * surface.sure_share:.0f} %", f"of the picture: {sure}"),
     ]
 
 

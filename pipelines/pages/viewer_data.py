@@ -1,6 +1,9 @@
 """Data of a report's viewer: numbers packed in lossless pictures that the page's script decodes, and scales."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal, NamedTuple, NotRequired, TypedDict
 
 import cv2
@@ -8,13 +11,16 @@ import numpy as np
 from msgspec import UNSET
 from numpy.typing import NDArray
 
-from faintfield.pipelines.formats.image_files import encoded
+from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.image_files import encoded, white_level
 from faintfield.pipelines.formats.results.records import JOINT_METHODS
-from faintfield.pipelines.formats.units import StatedUnits
+from faintfield.pipelines.formats.results.surface import SurfaceFileRecord, SurfaceRecord
+from faintfield.pipelines.formats.units import StatedUnits, units_of
 from faintfield.pipelines.pages.page import smaller_uri
 from faintfield.pipelines.pages.report_pictures import PlaneSections
-from faintfield.pipelines.pages.report_planes import Plane, best_column, column_titles
+from faintfield.pipelines.pages.report_planes import Plane, best_column, column_titles, existing
 from faintfield.pipelines.pages.report_sets import SetSection
+from faintfield.pipelines.reconstruction.depth.depth_map import robust_limits
 
 # A plane of more samples is binned: a phone draws this many in a frame.
 _MAX_SAMPLES = 1_500_000
@@ -35,10 +41,14 @@ _TOP_GREY = 255
 # Median absolute difference of two samples of normal noise, in its standard deviations.
 _MEDIAN_DIFFERENCE = 0.6745 * np.sqrt(2)
 
-type Kind = Literal["light", "sigma", "view", "bright"]
+# Steps of a surface's depths and probabilities over nearly all of their range, and of standard deviations: depths are
+# known to a percent at best.
+_MAP_STEPS, _SIGMA_STEPS = 512, 128
 
-# Black, white and name of the pictures of each kind when the page opens.
-type Scales = dict[Kind, dict[str, float | str]]
+type Kind = Literal["light", "sigma", "view", "bright", "depth", "depth_sigma", "confidence"]
+
+# Black, white and name of the pictures of each kind when the page opens; maps in `colours` instead of grey.
+type Scales = dict[Kind, dict[str, float | str | bool]]
 
 
 class Fineness(NamedTuple):
@@ -63,7 +73,9 @@ class ViewerPicture(TypedDict):
     """One picture of the viewer; JSON for the page's script.
 
     A number is `low + step * level`. `src` is a lossless picture with the high bytes of all levels above their low
-    bytes, or else `element` is the id of an 8-bit picture on the page. Lengths are those of the numbers after binning.
+    bytes, or else `element` is the id of an 8-bit picture on the page, whose numbers are integers if `whole`. Lengths
+    are those of the numbers after binning. `sigma` is the index of the picture of their standard deviations, and
+    `confidence` that of the probabilities that they are right, which are sure from `sure_above` on.
     """
 
     kind: Kind
@@ -78,23 +90,42 @@ class ViewerPicture(TypedDict):
     origin: NotRequired[tuple[float, float]]
     src: NotRequired[str]
     element: NotRequired[str]
+    whole: NotRequired[bool]
+    sigma: NotRequired[int]
+    confidence: NotRequired[int]
+    sure_above: NotRequired[float]
 
 
-def viewer_of(planes: list[Plane], shown: PlaneSections, the_set: SetSection | None) -> dict[str, Any] | None:
-    """Return the data of the viewer as JSON for the page's script, None without planes.
+def viewer_of(
+    planes: list[Plane],
+    shown: PlaneSections,
+    the_set: SetSection | None,
+    surfaces: Mapping[Path, SurfaceFileRecord] = MappingProxyType({}),
+) -> dict[str, Any] | None:
+    """Return the data of the viewer as JSON for the page's script, None without planes and surfaces.
 
     The grey scales are those of the pictures `shown`. The views are those of `the_set`, if there is one.
     """
-    if not planes:
+    if not planes and not surfaces:
         return None
-    units = planes[0].units
+    units = planes[0].units if planes else units_of(next(iter(surfaces.values())))
     places = {plane.place: plane.label for plane in sorted(planes, key=lambda plane: plane.place)}
-    scales: Scales = {"light": {"black": 0.0, "white": shown.white, "name": "planes"}}
-    views = _views(the_set, scales) if the_set else []
-    numbers = _plane_pictures(planes, list(places), units)
+    scales: Scales = {}
+    if planes:
+        scales["light"] = {"black": 0.0, "white": shown.white, "name": "planes"}
     if shown.sigmas:
         scales["sigma"] = {"black": 0.0, "white": shown.sigmas.white, "name": "standard deviations"}
-    pictures = [*views, *numbers]
+    pictures = _views(the_set, scales) if the_set else []
+    sources = _plane_sources(planes, list(places))
+    maps: list[_Source] = []
+    for folder, made in surfaces.items():
+        title = "Surface" if len(surfaces) == 1 else f"Surface {folder.name}"
+        picture, *others = _surface_sources(folder, made.surface, title, units_of(made), scales)
+        sources, maps = [*sources, picture], maps + others
+    fineness, coarser = _choose_fineness(sources)
+    numbers = [_picture(source, fineness, coarser) for source in sources]
+    pictures += numbers + [_map_picture(source, coarser) for source in maps]
+    _refer(pictures)
     return {
         "pictures": pictures,
         "scales": scales,
@@ -102,8 +133,28 @@ def viewer_of(planes: list[Plane], shown: PlaneSections, the_set: SetSection | N
         "quantity": units.quantity,
         "length": units.length or "(unit of the poses)",
         "binned": any(picture["bins"] > 1 for picture in numbers),
-        "first": _first(planes, shown, list(places), pictures),
+        "first": _first(planes, shown, list(places), pictures) if planes else _first_of_surface(pictures),
     }
+
+
+def _refer(pictures: list[ViewerPicture]) -> None:
+    """Name beside each picture those of its standard deviations and of its probabilities."""
+    indices = {(picture["kind"], picture["title"], picture["place"]): at for at, picture in enumerate(pictures)}
+    for picture in pictures:
+        title, place = picture["title"], picture["place"]
+        kind: Kind = "sigma" if picture["kind"] == "light" else "depth_sigma"
+        sigma = indices.get((kind, title if place is None else f"σ of {title}", place))
+        if picture["kind"] in ("light", "depth") and sigma is not None:
+            picture["sigma"] = sigma
+        confidence = indices.get(("confidence", title, place))
+        if picture["kind"] == "depth" and confidence is not None:
+            picture["confidence"] = confidence
+
+
+def _first_of_surface(pictures: list[ViewerPicture]) -> tuple[int, int]:
+    """Return the pictures that the viewer opens with: a view as recorded, else the depth; and the surface's picture."""
+    kinds = [picture["kind"] for picture in pictures]
+    return kinds.index("view" if "view" in kinds else "depth"), kinds.index("light")
 
 
 def _first(
@@ -140,6 +191,7 @@ def _views(the_set: SetSection, scales: Scales) -> list[ViewerPicture]:
         scales["view"] = {"black": black, "white": white, "name": "view as recorded"}
         step = (white - black) / _TOP_GREY
         views.append(_view("view", "One view", "as recorded", "DN", black, step))
+        views[-1]["whole"] = the_set.overview.whole_dn is True
     if the_set.pictures["bright"]:
         scales["bright"] = {"black": 0.0, "white": float(_TOP_GREY), "name": "bright view"}
         title, unit = "The same view in plenty of light", f"of {_TOP_GREY} grey levels"
@@ -155,33 +207,98 @@ def _view(kind: Kind, title: str, words: str, unit: str, low: float, step: float
 
 
 class _Source(NamedTuple):
-    """A picture whose numbers are read when they are needed, and what is said of it."""
+    """A picture whose numbers are read when they are needed, and what is said of it.
 
-    plane: Plane
+    `pitch` and `origin` are those of its samples in the unit of length; a surface has none.
+    """
+
+    read: Callable[[], NDArray[np.floating]]
     kind: Kind
     title: str
-    place: int
+    words: str
+    place: int | None
+    unit: str
+    pitch: float | None = None
+    origin: tuple[float, float] = (0.0, 0.0)
+    sure_above: float | None = None
 
-    def read(self, coarser: int) -> tuple[NDArray[np.floating], int]:
+    def binned(self, coarser: int) -> tuple[NDArray[np.floating], int]:
         """Return the numbers (row, column[, colour]) in bins, and the width of these; `coarser` is added to it."""
-        numbers = self.plane.sidecar_pixels("sigma_file") if self.kind == "sigma" else self.plane.pixels()
-        assert numbers is not None
+        numbers = self.read()
         bins = 1
         while (numbers.shape[0] // bins) * (numbers.shape[1] // bins) > _MAX_SAMPLES:
             bins += 1
         return _binned(numbers, bins + coarser), bins + coarser
 
 
-def _plane_pictures(planes: list[Plane], places: list[tuple[float, str]], units: StatedUnits) -> list[ViewerPicture]:
-    """Return the planes and their standard deviations, as fine as their budget allows; one at a time is in memory."""
+def _plane_sources(planes: list[Plane], places: list[tuple[float, str]]) -> list[_Source]:
+    """Return the planes and their standard deviations."""
     sources, titles = [], column_titles(planes)
     for plane in planes:
-        title, place = titles[plane.column], places.index(plane.place)
-        sources.append(_Source(plane, "light", title, place))
-        if plane.records[0].sigma_file:
-            sources.append(_Source(plane, "sigma", f"σ of {title}", place))
-    fineness, coarser = _choose_fineness(sources)
-    return [_picture(source, fineness, coarser, units) for source in sources]
+        title, place, record = titles[plane.column], places.index(plane.place), plane.records[0]
+        at = (plane.label, place, plane.units.light_per_pixel, record.pitch_mm, record.origin_mm)
+        sources.append(_Source(plane.pixels, "light", title, *at))
+        if record.sigma_file:
+            sources.append(_Source(partial(_sigma_of, plane), "sigma", f"σ of {title}", *at))
+    return sources
+
+
+def _sigma_of(plane: Plane) -> NDArray[np.floating]:
+    sigma = plane.sidecar_pixels("sigma_file")
+    assert sigma is not None
+    return sigma
+
+
+def _surface_sources(
+    folder: Path, surface: SurfaceRecord, title: str, units: StatedUnits, scales: Scales
+) -> list[_Source]:
+    """Return a surface's picture and its maps; scales that are missing are added."""
+    what, length = "disparity" if surface.unit == "px" else "depth", "" if surface.unit == "relative" else surface.unit
+    entries: tuple[tuple[Kind, str, str, str], ...] = (
+        ("light", surface.picture, "picture", units.light_per_pixel),
+        ("sigma", surface.picture_sigma, "σ of the picture", units.light_per_pixel),
+        ("depth", surface.depth, what, length),
+        ("depth_sigma", surface.depth_sigma, f"σ of the {what}", length),
+        ("confidence", surface.depth_confidence, f"probability of the {what}", ""),
+    )
+
+    def read(name: str) -> NDArray[np.floating]:
+        return np.asarray(read_frame(existing(folder / name)).pixels_dn, np.float32)
+
+    def limits(kind: Kind, name: str) -> tuple[float, float]:
+        """Return black and white of a kind; colours of depths span the sure ones, as in the preview."""
+        if kind == "confidence":
+            return 0.0, 1.0
+        values = read(name)
+        if kind in ("light", "sigma"):
+            return 0.0, white_level(values) or 1.0
+        if kind == "depth":
+            sure = read(surface.depth_confidence) >= surface.sure_above
+            values = values[sure] if sure.any() else values
+        return robust_limits(values)
+
+    sources = []
+    for kind, name, words, unit in entries:
+        sure_above = surface.sure_above if kind == "depth" else None
+        sources.append(_Source(partial(read, name), kind, title, words, None, unit, sure_above=sure_above))
+        if kind not in scales:
+            black, white = limits(kind, name)
+            scales[kind] = {"black": black, "white": white, "name": words}
+            if kind not in ("light", "sigma"):
+                scales[kind]["colours"] = True
+    return sources
+
+
+def _map_picture(source: _Source, coarser: int) -> ViewerPicture:
+    numbers, bins = source.binned(coarser)
+    low, high = robust_limits(numbers)
+    finite = numbers[np.isfinite(numbers)]
+    steps = _SIGMA_STEPS if source.kind in ("sigma", "depth_sigma") else _MAP_STEPS
+    step = max((high - low) / steps, float(np.ptp(finite)) / _TOP_LEVEL if finite.size else 0.0)
+    picture = _packed_picture(source, numbers, step, bins)
+    if source.sure_above is not None:
+        picture["sure_above"] = source.sure_above
+    return picture
 
 
 def _choose_fineness(sources: Sequence[_Source]) -> tuple[Fineness, int]:
@@ -192,7 +309,7 @@ def _choose_fineness(sources: Sequence[_Source]) -> tuple[Fineness, int]:
     most = share * max(_MIN_BUDGET, _MOST_PER_PICTURE * len(sources))
     coarser = 0
     while True:
-        binned = [source.read(coarser)[0] for source in sample]
+        binned = [source.binned(coarser)[0] for source in sample]
         for fineness in _FINENESSES:
             limit = most if fineness is _FINENESSES[-1] else budget
             if sum(len(pack(numbers, fineness.step(numbers)).png) for numbers in binned) <= limit:
@@ -239,23 +356,26 @@ def _noise(plane: NDArray[np.floating]) -> float:
     return float(np.median(finite) / _MEDIAN_DIFFERENCE) if finite.size else 0.0
 
 
-def _picture(source: _Source, fineness: Fineness, coarser: int, units: StatedUnits) -> ViewerPicture:
-    numbers, bins = source.read(coarser)
-    packed = pack(numbers, fineness.step(numbers))
-    record = source.plane.records[0]
-    pitch = record.pitch_mm
-    # The first bin's centre lies half a bin less half a sample from that of the first sample
-    x, y = (start + pitch * (bins - 1) / 2 for start in record.origin_mm)
-    return {
-        "kind": source.kind,
-        "title": source.title,
-        "words": source.plane.label,
-        "place": source.place,
-        "unit": units.light_per_pixel,
-        "low": packed.low,
-        "step": packed.step,
-        "bins": bins,
-        "pitch": pitch * bins,
-        "origin": (x, y),
-        "src": smaller_uri(packed.png),
-    }
+def _picture(source: _Source, fineness: Fineness, coarser: int) -> ViewerPicture:
+    numbers, bins = source.binned(coarser)
+    return _packed_picture(source, numbers, fineness.step(numbers), bins)
+
+
+def _packed_picture(source: _Source, numbers: NDArray[np.floating], step: float, bins: int) -> ViewerPicture:
+    packed = pack(numbers, step)
+    picture = ViewerPicture(
+        kind=source.kind,
+        title=source.title,
+        words=source.words,
+        place=source.place,
+        unit=source.unit,
+        low=packed.low,
+        step=packed.step,
+        bins=bins,
+        src=smaller_uri(packed.png),
+    )
+    if source.pitch is not None:
+        # The first bin's centre lies half a bin less half a sample from that of the first sample
+        x, y = (start + source.pitch * (bins - 1) / 2 for start in source.origin)
+        picture |= {"pitch": source.pitch * bins, "origin": (x, y)}
+    return picture

@@ -227,7 +227,7 @@ def _region(path: Path, options: PlanOptions, width: int, height: int) -> tuple[
 
 
 def _variance_of_calibration(sensor: Sensor, light_e: float, exposure_s: float) -> float:
-    """Return the variance in e⁻² of a mean `(dn − offset)/gain − D t` by its calibration, with the frame's jitter."""
+    """Return the variance in (e⁻)² of a mean `(dn − offset)/gain − D t` by its calibration, with the frame's jitter."""
     record, gain = sensor.record, sensor.gain_dn_per_e.value
     if record is None or gain is None:
         return 0.0

@@ -180,6 +180,7 @@ def inspect_set(elemental_set: ElementalSet) -> tuple[Overview, dict[str, bytes]
         quantum_efficiency=noise.quantum_efficiency,
         dark_e=float(np.mean(elemental_set.background_e(noise))),
         grey_scale_dn=(black, white),
+        whole_dn=bool(np.issubdtype(reference.dtype, np.integer)),
         brightness=brightness_within(elemental_set, region, name),
     )
     record = in_units(elemental_set, record)

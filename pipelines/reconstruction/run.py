@@ -55,6 +55,7 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     depth_map: DepthMapRecord | None = None
     metrics: Metrics | None = None
     surface: SurfaceRecord | UnsetType = UNSET
+    surface_warning: str | UnsetType = UNSET
     units: StatedUnits | UnsetType = UNSET
 
 

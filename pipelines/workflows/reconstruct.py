@@ -5,6 +5,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import msgspec
+from msgspec import UNSET
 
 from faintfield.pipelines.arguments import SceneKind
 from faintfield.pipelines.console import inform, working
@@ -77,7 +78,16 @@ def surface_and_report(elemental_set: ElementalSet, out: Path, request: SurfaceR
         report = _write_report(page_in)
     sure = f"{record.known_share:.0%} of its depths known, {record.sure_share:.0%} sure"
     inform(f"a surface in {time.monotonic() - started:.1f} s, {sure}: {report}")
-    return Outcome(out=str(out), report=str(report), planes=[], surface=record, units=elemental_set.units)
+    if record.warning is not None:
+        inform(record.warning)
+    return Outcome(
+        out=str(out),
+        report=str(report),
+        planes=[],
+        surface=record,
+        surface_warning=record.warning or UNSET,
+        units=elemental_set.units,
+    )
 
 
 def _write_report(folder: Path) -> Path:

@@ -43,7 +43,7 @@ class Agreement(NamedTuple):
     """Agreement of the views on each sample of a plane (row, column), their number, and the light.
 
     `squares` is `Hᵀ[(g − b − H f)²/v]`, whose mean is s − 1 if the views differ by noise alone, like that of χ²;
-    `light` and `light_variance` are the mean of the views, f, and its variance, in e⁻ and e⁻².
+    `light` and `light_variance` are the mean of the views, f, and its variance, in e⁻ and (e⁻)².
     """
 
     squares: Image

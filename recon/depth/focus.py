@@ -34,7 +34,7 @@ _MIN_COVERAGE = 0.5
 
 
 class FocusMeasure(NamedTuple):
-    """The power of detail at one depth, and its standard deviation due to noise, both in e⁻²."""
+    """The power of detail at one depth, and its standard deviation due to noise, both in (e⁻)²."""
 
     detail_e2: float
     sigma_e2: float

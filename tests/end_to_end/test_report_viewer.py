@@ -11,9 +11,14 @@ import tifffile
 from numpy.typing import NDArray
 
 from faintfield.pipelines import pages
+from faintfield.pipelines.formats.image_files import grey_levels, write_png
 from faintfield.pipelines.pages.page import smaller_uri
+from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.pages.viewer_data import pack
 from tests.end_to_end.browser import Tab, decoded
+from tests.pipelines.by_hand import write_by_hand
+from tests.pipelines.forms import GOLDEN
+from tests.pipelines.surfaces import SHAPE, write_example
 
 FOLDERS = {"back-projection": "backprojection", "PMLEM (one-step-late, TV)": "pmlem-osl"}
 VIRTUAL_KEYS = {"ArrowRight": 39, "ArrowLeft": 37, "ArrowUp": 38, "ArrowDown": 40}
@@ -309,4 +314,33 @@ def test_colours_and_missing_samples_are_read(browser: Tab, tmp_path: Path) -> N
             assert reading.groups() == ("not known",) * 3
         else:
             np.testing.assert_allclose([float(word) for word in reading.groups()], numbers[row, column], atol=1.1e-3)
+    assert browser.complaints == []
+
+
+def test_readout_of_surface_has_uncertainty_and_integers(browser: Tab, tmp_path: Path) -> None:
+    shown = write_example(tmp_path)
+    overview = json.loads((GOLDEN / "overview_set.json").read_text()) | {"grey_scale_dn": [79.0, 122.0]}
+    write_by_hand(tmp_path / "overview.json", overview)
+    recorded = np.random.default_rng(1).integers(80, 122, SHAPE)
+    write_png(tmp_path / "reference_view.png", grey_levels(recorded.astype(float), 122.0, 79.0))
+    browser.open(write_report(tmp_path).as_uri())
+    browser.wait_until("document.querySelector('.v-stage').dataset.ready === 'all'")
+    browser.choose("v-B", "Surface, depth")
+    browser.evaluate("document.querySelector('.v-stage').scrollIntoView()")
+    browser.draw()
+    left, top, width, height = browser.box(".v-stage")
+    size = _state(browser, "size")
+    for row, column, confidence in ((40, 50, 0.99), (60, 100, 0.85)):
+        across, down = (column + 0.5) / SHAPE[1] - 0.5, (row + 0.5) / SHAPE[1] - _state(browser, "v")
+        _point(browser, left + width / 2 + size * across, top + height / 2 + size * down)
+        found = re.search(r"([\d.]+) ± ([\d.]+) mm .*?(not sure|sure): .* of ([\d.]+)\)", _reading(browser))
+        assert found is not None, _reading(browser)
+        depth, sigma = (tifffile.imread(tmp_path / name)[row, column] for name in (shown.depth, shown.depth_sigma))
+        assert float(found[1]) == pytest.approx(depth, abs=0.5)
+        assert float(found[2]) == pytest.approx(sigma, rel=0.05)
+        assert (found[3] == "sure") == (confidence > 0.9)
+        assert float(found[4]) == pytest.approx(confidence, abs=0.01)
+        assert f"{recorded[row, column]} DN\n" in _reading(browser, "A")
+    picture = _canvas(browser)
+    assert (picture.max(axis=2) - picture.min(axis=2)).max() > 100  # depths in colours
     assert browser.complaints == []

@@ -1,6 +1,6 @@
 """Maps of the pixels in the order in which they are measured: noise, offset and dark signal, response to light, gain.
 
-Offset and dark signal are posterior means. The mean of ten frames of a pixel is off by 1.1 e⁻ rms at 12 e⁻² of read
+Offset and dark signal are posterior means. The mean of ten frames of a pixel is off by 1.1 e⁻ rms at 12 (e⁻)² of read
 noise: as much as the signal to be reconstructed. So offset and dark signal of pixel i get the priors N(μ, s²) and
 N(d, q²), whose spreads the fit has measured; the means m_ij of the series measure `o_i + d_i t_j` with variance
 v_ij/n_j, v_ij the noise of the pixel itself. Since both are Gaussian, the posterior mean is linear in the means, with a

@@ -27,7 +27,10 @@ class Brightness(Struct, frozen=True):
 
 
 class Overview(Struct, frozen=True, kw_only=True):
-    """`overview.json`: a set at a glance, beside its pictures."""
+    """`overview.json`: a set at a glance, beside its pictures.
+
+    `grey_scale_dn` are black and white of these; the pixels of the reference view are integers if `whole_dn`.
+    """
 
     units: StatedUnits | UnsetType = UNSET
     set: str
@@ -42,6 +45,7 @@ class Overview(Struct, frozen=True, kw_only=True):
     quantum_efficiency: float | None = None
     dark_e: float | UnsetType = UNSET
     grey_scale_dn: tuple[float, float] | UnsetType = UNSET
+    whole_dn: bool | UnsetType = UNSET
     brightness: Brightness
 
 

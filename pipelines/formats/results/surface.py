@@ -31,6 +31,10 @@ from faintfield.pipelines.formats.results.records import (
 
 SURFACE_FILE = "surface.json"
 
+# Mean deviance beyond which a surface does not explain its views: simulated ones with right poses and depths stay
+# below 7 up to an SNR of 1000 (docs/surface.md).
+MAX_DEVIANCE = 10.0
+
 type Share = Annotated[float, Meta(ge=0, le=1)]
 
 
@@ -128,6 +132,26 @@ class SurfaceRecord(SurfaceFacts, frozen=True, kw_only=True):
     known_share: Share
     sure_share: Share
     median: float | None
+
+    @property
+    def warning(self) -> str | None:
+        """Words on a surface that does not explain its views; None if it does, or if no view was left out to tell."""
+        if self.held_out is None:
+            return None
+        deviance, neighbours = self.held_out.surface, self.held_out.neighbours
+        if deviance > MAX_DEVIANCE:
+            what = (
+                f"This surface does not explain its views: those that were left out differ from its prediction by "
+                f"{deviance**0.5:.2g} times their noise (mean deviance {deviance:.4g}, 1 is perfect)"
+            )
+        elif neighbours is not None and deviance > neighbours:
+            what = (
+                f"The views do not show the depths of this surface: those that were left out are predicted better by "
+                f"their neighbours, without any depth (mean deviance {deviance:.4g} against {neighbours:.4g})"
+            )
+        else:
+            return None
+        return f"{what}. Trust neither its picture nor its depths; check poses, range of depths and noise model"
 
     @property
     def maps(self) -> list[str]:

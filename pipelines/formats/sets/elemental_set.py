@@ -118,7 +118,7 @@ class ElementalSet:
         return noise.background_e(self.settings.exposure_s or 0.0)
 
     def read_variance_e2(self, noise: NoiseModel) -> Map:
-        """Return the variance in e⁻² that reading adds to a view, once per frame."""
+        """Return the variance in (e⁻)² that reading adds to a view, once per frame."""
         return self.frames_per_view * noise.read_variance_e2()
 
     @property

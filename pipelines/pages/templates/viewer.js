@@ -16,6 +16,15 @@ const viewer = (() => {
   /** A number with as many decimals as its step can tell. */
   const told = (value, step) => minus(value.toFixed(step > 0 ? between(0, Math.ceil(-Math.log10(step)), 6) : 3));
   const brief = value => Number(value.toPrecision(4));
+  /** Decimals that leave two digits of a number. */
+  const decimals = value => value > 0 ? between(0, 1 - Math.floor(Math.log10(value)), 6) : 3;
+  /** Viridis, from the lowest to the highest of 256 levels, as a canvas has its bytes. */
+  const VIRIDIS = [[68, 1, 84], [71, 44, 122], [59, 81, 139], [44, 113, 142], [33, 144, 141], [39, 173, 129], [92, 200, 99], [170, 220, 50], [253, 231, 37]];
+  const bytesOf = ([red, green, blue]) => (0xff000000 | blue << 16 | green << 8 | red) >>> 0;
+  const colourOf = level => {
+    const at = level / 255 * (VIRIDIS.length - 1), from = Math.min(Math.floor(at), VIRIDIS.length - 2);
+    return VIRIDIS[from].map((value, index) => Math.round(value + (at - from) * (VIRIDIS[from + 1][index] - value)));
+  };
 
   // ---- Numbers -------------------------------------------------------------------------------------------------
   /** Decode a picture: levels (row, column, colour) and how often each occurs. */
@@ -48,32 +57,57 @@ const viewer = (() => {
   }
   /** A picture as a canvas on its grey scale; painted anew only if that has changed. */
   function painted(one, { black, white } = scales[one.kind]) {
-    const key = black + " " + white;
+    const doubt = one.confidence === undefined ? null : pictures[one.confidence];
+    const key = black + " " + white + Boolean(doubt?.levels);
     if (one.key === key) return one.canvas;
     const grey = new Uint8Array(UNKNOWN + 1), reach = Math.max(white - black, 1e-12);
     for (let level = 0; level < UNKNOWN; level++) grey[level] = Math.round(255 * between(0, (number(one, level) - black) / reach, 1));
     one.canvas ??= make("canvas", { width: one.width, height: one.height });
     const context = one.canvas.getContext("2d"), image = context.createImageData(one.width, one.height);
-    const pixels = new Uint32Array(image.data.buffer), { levels, colours } = one;
-    if (colours === 1) for (let i = 0; i < pixels.length; i++) pixels[i] = levels[i] === UNKNOWN ? 0xff603030 : 0xff000000 | 0x10101 * grey[levels[i]];
+    const pixels = new Uint32Array(image.data.buffer), { levels, colours, width } = one;
+    const inks = Array.from({ length: 256 }, (_, level) => bytesOf(scales[one.kind].colours ? colourOf(level) : [level, level, level]));
+    if (colours === 1) for (let i = 0; i < pixels.length; i++) pixels[i] = levels[i] === UNKNOWN ? 0xff603030 : inks[grey[levels[i]]];
     else for (let i = 0; i < pixels.length; i++)
       pixels[i] = 0xff000000 | grey[levels[3 * i + 2]] << 16 | grey[levels[3 * i + 1]] << 8 | grey[levels[3 * i]];
+    if (doubt?.levels) {
+      // Where it is not sure, hatching shows through, as in the previews
+      const period = Math.max(6, Math.round(width / 53)), bytes = image.data;
+      for (let i = 0; i < pixels.length; i++) if (levels[i] === UNKNOWN || !sure(one, doubt, i)) {
+        const grey = (i % width + Math.floor(i / width)) % period < period / 6 ? 128 : 158, share = levels[i] === UNKNOWN ? 0 : 0.3;
+        for (let c = 0; c < 3; c++) bytes[4 * i + c] = share * bytes[4 * i + c] + (1 - share) * grey;
+        bytes[4 * i + 3] = 255;
+      }
+    }
     context.putImageData(image, 0, 0);
     one.key = key;
     return one.canvas;
   }
+  const sure = (one, doubt, at) => doubt.levels[at] !== UNKNOWN && number(doubt, doubt.levels[at]) >= one.sure_above;
   const name = one => one.title + ", " + one.words;
   /** Numbers of the sample at a place, in words with their units; null outside the picture. */
   function valueAt(one, u, v) {
     const [column, row] = [Math.floor(u * one.width), Math.floor(v * one.width)];
     if (!one.levels || column < 0 || row < 0 || column >= one.width || row >= one.height) return null;
     const at = (row * one.width + column) * one.colours;
-    const values = [...one.levels.subarray(at, at + one.colours)].map(level => level === UNKNOWN ? "not known" : told(number(one, level), one.step));
-    const off = one.step > 0 && !values.every(it => it === "not known") ? " (rounded by up to " + (one.step / 2).toPrecision(1) + ")" : "";
+    const levels = [...one.levels.subarray(at, at + one.colours)], known = levels.some(level => level !== UNKNOWN);
+    const sigma = one.sigma === undefined ? null : pictures[one.sigma], off = [];
+    const sigmas = known && sigma?.levels ? [...sigma.levels.subarray(at / one.colours * sigma.colours, (at / one.colours + 1) * sigma.colours)].map(level => level === UNKNOWN ? NaN : number(sigma, level)) : [];
+    const values = levels.map((level, index) => {
+      if (level === UNKNOWN) return "not known";
+      // Grey levels of a view stand for the integers that they were made of; beyond black and white nothing is known
+      if (one.whole) return (level === 0 ? "\u2264 " : level === 255 ? "\u2265 " : "") + minus(Math.round(number(one, level)));
+      const deviation = sigmas[index] ?? NaN;
+      return deviation > 0 ? minus(number(one, level).toFixed(decimals(deviation))) + " \u00b1 " + deviation.toFixed(decimals(deviation)) : told(number(one, level), one.step);
+    });
+    const rounded = one.whole && one.step <= 1 ? 0 : one.step / 2;
+    if (sigmas.some(deviation => deviation > 0)) off.push("\u00b1 is \u03c3");
+    if (known && rounded > 0 && !sigmas.some(deviation => rounded < 0.1 * deviation)) off.push("rounded by up to " + minus(Number(rounded.toPrecision(1))));
+    const doubt = one.confidence === undefined ? null : pictures[one.confidence];
+    if (known && doubt?.levels) off.push((sure(one, doubt, at) ? "sure" : "not sure") + ": right within 2 % with a probability of " + number(doubt, doubt.levels[at]).toFixed(2));
     const value = (one.colours === 3 ? "R " + values[0] + ", G " + values[1] + ", B " + values[2] : values[0]) + " " + one.unit;
     const [x, y] = one.pitch ? [one.origin[0] + column * one.pitch, one.origin[1] + row * one.pitch] : [];
-    const many = one.bins > 1 && one.pitch ? "mean of " + one.bins + " \u00d7 " + one.bins + " samples, first " : "";
-    return { value, off, x, y, at: many + "column " + column * one.bins + ", row " + row * one.bins,
+    const many = one.bins > 1 ? "mean of " + one.bins + " \u00d7 " + one.bins + " samples, first " : "";
+    return { value, off: off.length ? " (" + off.join("; ") + ")" : "", x, y, at: many + "column " + column * one.bins + ", row " + row * one.bins,
       where: one.pitch ? "x " + told(x, one.pitch / 10) + ", y " + told(y, one.pitch / 10) + " " + data.length : "" };
   }
 
@@ -322,7 +356,7 @@ const viewer = (() => {
   function choice(side) {
     const groups = new Map();
     pictures.forEach((one, index) => {
-      const group = one.place === null ? "Views" : one.title;
+      const group = one.element ? "Views" : one.title;
       if (!groups.has(group)) groups.set(group, make("optgroup", { label: group }));
       groups.get(group).append(make("option", { value: index }, name(one)));
     });
@@ -355,7 +389,7 @@ const viewer = (() => {
     const ofKind = found => found.filter(one => one.kind === kind && one.levels);
     const shown = () => { const chosen = ofKind([A, B].map(picture)); return chosen.length ? chosen : ofKind(all()).slice(0, 2); };
     const plot = make("canvas", { role: "img", "aria-label": "Histogram of " + scale.name });
-    const range = end => make("input", { type: "range", step: "any", id: "v-" + end + "-" + kind, "aria-label": (end === "black" ? "Black" : "White") + " of the " + scale.name + ", " + unit, oninput: event => set(end, Number(event.target.value)) });
+    const range = end => make("input", { type: "range", step: "any", id: "v-" + end + "-" + kind, "aria-label": (end === "black" ? "Black" : "White") + " of the " + scale.name + (unit && ", " + unit), oninput: event => set(end, Number(event.target.value)) });
     const typed = end => make("input", { type: "number", step: "any", id: "v-" + end + "-number-" + kind, onchange: event => { if (event.target.value) set(end, Number(event.target.value)); } });
     const ends = { black: [range("black"), typed("black")], white: [range("white"), typed("white")] };
     let axis = [0, 1];
@@ -416,7 +450,7 @@ const viewer = (() => {
       draw();
     }, "Scale of the " + scale.name + " by what is shown: 0.2 % black, 0.2 % white");
     const back = button("As opened", () => { Object.assign(scale, opened[kind]); update(); draw(); });
-    const box = make("fieldset", {}, make("legend", {}, "Grey scale of the " + scale.name + ", " + unit + " (histogram: logarithm of counts)"),
+    const box = make("fieldset", {}, make("legend", {}, (scale.colours ? "Colour scale of the " : "Grey scale of the ") + scale.name + (unit && ", " + unit) + " (histogram: logarithm of counts)"),
       make("div", { className: "v-histogram" }, plot, ends.black[0], ends.white[0]),
       make("div", { className: "v-numbers" }, make("label", {}, "black ", ends.black[1]), make("label", {}, "white ", ends.white[1]), auto, back));
     return { kind, box, update, auto };

@@ -39,6 +39,7 @@ from faintfield.pipelines.reconstruction.depth.search import (
     naming_range,
 )
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, blind_views, plane_grid
+from faintfield.pipelines.reconstruction.overview import inspect_set, write_overview
 from faintfield.pipelines.reconstruction.planes.penalised import Objective, Solution, solve_then_sigma
 from faintfield.pipelines.reconstruction.planes.prior import with_prior
 from faintfield.pipelines.reconstruction.surface.files import SurfaceMaps, write_surface
@@ -57,7 +58,7 @@ _NUMBERS, _NUMBERS_PER_COLOUR, _POINT_BYTES, _FIXED_BYTES = 4, 2, 27, 30_000_000
 def reconstruct_surface(
     elemental_set: ElementalSet, out: Path, request: SurfaceRequest, pages: Sequence[Path] = ()
 ) -> SurfaceRecord:
-    """Reconstruct the surface of a set, and write it with its record; one that is up to date is kept.
+    """Reconstruct the surface of a set, and write it with its record and an overview of the set; keep one up to date.
 
     The caller has `out` to itself, see `formats.files.exclusive`. Earlier `pages` are removed before the files that
     they show are. Raises BadValue for too few or too small views, OutputExists if `out` holds a depth map, whose files
@@ -84,6 +85,7 @@ def reconstruct_surface(
     if range_mm is not None:
         check_overlap(elemental_set, range_mm)
     remove_leftovers(out)
+    overview, pictures = inspect_set(elemental_set)
     search = depths_of_set(elemental_set, range_mm, out)
     far, near = float(search.compared[0]), float(search.compared[-1])
     with naming_range(elemental_set, far, near):
@@ -110,6 +112,7 @@ def reconstruct_surface(
     for page in pages:
         remove(page)
     record = write_surface(out, maps, facts, origin)
+    write_overview(overview, pictures, out)
     write_depth_errors(elemental_set, out, record.depth, record.unit)
     return record
 

@@ -17,7 +17,7 @@ import tifffile
 
 from faintfield.pipelines.formats.image_files import grey_levels, white_level
 from faintfield.pipelines.pages import report_surface
-from faintfield.pipelines.pages.page import figure
+from faintfield.pipelines.pages.page import figure, snr_text
 from tests.pipelines.by_hand import write_by_hand
 from tests.pipelines.conftest import Command, assert_refused, run_undrawn
 from tests.pipelines.forms import read_record
@@ -257,11 +257,14 @@ def _words(html: str) -> str:
 def test_folder_with_surface_alone_has_report(surface: Path, done: Command) -> None:
     message = _words(_section(surface, done))
     assert "Depth searched 400 to 900 mm found in the views; 64 depths compared in bins of 2 × 2 pixels" in message
-    for words in ("Known 98 %", "Sure 12 %", "3 of the views", "surface 1.012", "planes 1.340", "predicts them best"):
+    for words in ("Known 98 %", "3 of the views", "surface 1.012", "planes 1.340", "predicts them best"):
         assert words in message
     page = (surface / "report.html").read_text()
     assert "<title>faintfield · &lt;toys &amp; more&gt;: a surface</title>" in page
     assert "What all views show, sharp everywhere." in page
+    first = _words(page.partition('<dl class="facts">')[2].partition("</dl>")[0])
+    assert re.match(r"Sure depths 12 % .* Deviance; 1 is perfect 1\.01 .* SNR of a view – not recorded", first)
+    assert 'class="banner"' not in page
     assert "The planes below" not in page
     assert "within 0.40 % of the optimum" in page  # in the provenance
     assert "poisson-gaussian" in page
@@ -271,7 +274,7 @@ def test_pictures_are_those_of_folder(surface: Path, done: Command) -> None:
     section = _section(surface, done)
     film, *shown = [base64.b64decode(found) for found in re.findall(r'<img src="data:[^,]*,([^"]*)"', section)]
     assert film == (surface / "parallax.webp").read_bytes()
-    names = ("depth_mm.png", "depth_confidence.png", "depth_sigma_mm.png", "picture_sigma.png", "visibility.png")
+    names = ("depth_mm.png", "depth_confidence.png", "visibility.png")
     for name, content in zip(names, shown, strict=True):
         assert _difference((surface / name).read_bytes(), content) < 8  # noise packs worst
     still = re.search(
@@ -289,6 +292,25 @@ def _difference(*contents: bytes) -> float:
     assert first is not None
     assert second is not None
     return float(np.mean(cv2.absdiff(first, second)))
+
+
+def test_viewer_shows_surface_with_its_uncertainty(surface: Path, done: Command) -> None:
+    done("report", surface)
+    data = (surface / "report.html").read_text().partition('id="viewer-data">')[2].partition("</script>")[0]
+    viewer = json.loads(data)
+    pictures = {picture["words"]: picture for picture in viewer["pictures"]}
+    depth, picture = pictures["depth"], pictures["picture"]
+    assert viewer["pictures"][viewer["first"][1]] == picture
+    assert viewer["pictures"][picture["sigma"]]["words"] == "σ of the picture"
+    assert viewer["pictures"][depth["sigma"]]["words"] == "σ of the depth"
+    assert viewer["pictures"][depth["confidence"]]["words"] == "probability of the depth"
+    assert (depth["unit"], depth["sure_above"]) == ("mm", 0.9)
+    assert viewer["scales"]["depth"] == {
+        "black": 449.775,
+        "white": 450.225,
+        "name": "depth",
+        "colours": True,
+    }  # the ball
 
 
 def test_disparities_are_no_lengths(tmp_path: Path, done: Command) -> None:
@@ -312,6 +334,36 @@ def test_what_is_not_there_is_not_shown(surface: Path, done: Command) -> None:
         assert absent not in section
 
 
+@pytest.mark.parametrize(
+    ("deviance", "neighbours", "says"),
+    [(2045.3, 3000.0, "differ from its prediction by 45 times their noise"), (0.9, 0.8, "better by their neighbours")],
+)
+def test_unexplained_surface_says_so_first(
+    deviance: float, neighbours: float, says: str, surface: Path, done: Command
+) -> None:
+    record = read_record(surface, "surface.json")
+    record["surface"]["held_out"] |= {"surface": deviance, "planes": 1.01 * deviance, "neighbours": neighbours}
+    write_by_hand(surface / "surface.json", record)
+    section = _section(surface, done)
+    page = (surface / "report.html").read_text()
+    banner, figures = page.index('<p class="banner">'), page.index('<dl class="facts">')
+    assert says in page[banner:figures]
+    assert "sharp everywhere" not in page
+    assert "explain what other cameras see" not in section
+
+
 def test_overlarge_picture_is_refused(surface: Path, faintfield: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(report_surface, "MAX_PREVIEW_BYTES", 1000)
     assert_refused(faintfield("report", surface), "MissingFile")
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(1.16e7, "1.16 × 10⁷"), (2.5e-5, "2.50 × 10⁻⁵"), (66310.4, "66300"), (-0.5, "−0.500"), (None, "–")],
+)
+def test_figures_have_digits_and_powers_of_print(value: float | None, text: str) -> None:
+    assert figure(value) == text
+
+
+def test_snr_beyond_noise_has_no_digits() -> None:
+    assert (snr_text(1.16e7), snr_text(0.16)) == ("above 1000", "0.160")

@@ -116,6 +116,29 @@ def test_calibrations_can_be_named(drawn: Path, session: Path, tmp_path: Path) -
     assert 'id="geometry"' not in text
 
 
+@pytest.mark.parametrize(
+    ("poses", "noise", "says"),
+    [
+        ("measured", "noise.json", ["measured", "measured; its uncertainty is in noise.json"]),
+        ("nominal", "noise.json", ["nominal", "where the stage was sent"]),
+        ("stated", "elemental.toml", ["as stated", "not measured", "as the set states it"]),
+    ],
+)
+def test_page_away_from_session_says_what_record_says(
+    poses: str, noise: str, says: list[str], drawn: Path, tmp_path: Path
+) -> None:
+    folder = Path(shutil.copytree(drawn, tmp_path / "elsewhere" / "a" / "b" / "c"))
+    record = json.loads((folder / "reconstruction.json").read_text())
+    record["options"]["poses"] = poses
+    record["inputs"][noise] = "0" * 64
+    write_by_hand(folder / "reconstruction.json", record)
+    facts = write_report(folder).read_text().partition('<dl class="facts">')[2].partition("</dl>")[0]
+    for words in says:
+        assert words in facts
+    assert ("as stated" in facts) == (poses == "stated")
+    assert ("as the set states it" in facts) == (noise != "noise.json")
+
+
 def test_damaged_calibration_is_named(session: Path, faintfield: Command) -> None:
     for name in ("noise", "geometry"):
         before = (session / f"{name}.json").read_bytes()
@@ -150,7 +173,7 @@ def test_photon_budget_is_that_of_papers_equations() -> None:
     # Eq. (7): 0.16 · 12 / 0.5 photons; at 0.1 s ten times as many per second; 49 views see 49 times as many
     assert (linear.photons, linear.flux) == pytest.approx((0.16 * 12 / 0.5, 38.4))
     assert linear.all_views == pytest.approx(3.84 * 49)
-    # (4) with a Poisson signal: μ² + μ = 0.16 · 12 e⁻², less the little that dark current does
+    # (4) with a Poisson signal: μ² + μ = 0.16 · 12 (e⁻)², less the little that dark current does
     mu_e = moments.electrons
     assert mu_e**2 + mu_e == pytest.approx(0.16 * 12, rel=0.03)
     assert counted.photons == pytest.approx(0.96 / 0.5)

@@ -2,6 +2,7 @@
 
 import base64
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -92,6 +93,17 @@ def test_small_plane_is_fine_and_large_one_binned(tmp_path: Path) -> None:
     shown = one["low"] + one["step"] * levels
     expected = plane[:1400, :1600].reshape(700, 2, 800, 2).mean(axis=(1, 3))
     np.testing.assert_allclose(shown, expected, atol=0.51 * one["step"] + 1e-3)
+
+
+def test_plane_is_read_with_its_standard_deviation(tmp_path: Path) -> None:
+    light = np.eye(6, 8, dtype=np.float32)
+    plane = _plane(tmp_path, "pmlem", 500.0, light)
+    write_plane(tmp_path / "sigma.tiff", 0.1 + light, Spacing(0.5))
+    record = msgspec.structs.replace(plane.records[0], sigma_file="sigma.tiff")
+    pictures = _pictures([_plane(tmp_path, "mlem", 500.0, light), replace(plane, records=[record])])
+    (known,) = [picture for picture in pictures if "sigma" in picture]
+    assert (known["kind"], known["title"]) == ("light", "PMLEM")
+    assert pictures[known["sigma"]]["title"] == "σ of PMLEM"
 
 
 def test_joint_planes_stand_beside_best_found_alone(tmp_path: Path) -> None:

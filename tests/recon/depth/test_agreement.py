@@ -90,7 +90,7 @@ def test_noise_alone_has_no_plane_of_focus() -> None:
 
 def test_less_light_takes_larger_bins() -> None:
     operator = views_displaced_by(0 * OFFSETS, SHAPE, margin=0)
-    # A pixel of λ electrons and 0.5 e⁻² of read noise has the power ratio λ²/(λ + 0.5); k² of it must reach 2
+    # A pixel of λ electrons and 0.5 (e⁻)² of read noise has the power ratio λ²/(λ + 0.5); k² of it must reach 2
     for light_e, bins in ((30.0, 2), (1.0, 2), (0.4, 4), (0.2, 8)):
         images = ElementalImages(
             np.random.default_rng(1).poisson(np.full((len(OFFSETS), *SHAPE), light_e)).astype(np.float32),

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,10 @@ from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.reconstruction.planes import prior as prior_module
 from faintfield.pipelines.reconstruction.surface import files as surface_files
 from faintfield.pipelines.reconstruction.surface import reconstruct as surface
+from faintfield.recon.surface.goodness import Prediction
 from tests.pipelines.conftest import SMALL, Command, Edit, assert_refused, run_undrawn
 from tests.pipelines.forms import GOLDEN, check_proposal, files_in, flip_last_bit, form_of_result, read_record
-from tests.pipelines.surfaces import FOUND_CONFIDENCE, FOUND_MM, Searches
+from tests.pipelines.surfaces import FOUND_CONFIDENCE, FOUND_MM, Searches, found_at_once
 
 RANGE = ("--depth-range-mm", "400:900")
 FAST = (*RANGE, "--penalty-weight", 0.5, "--passes", 2)
@@ -34,8 +36,11 @@ def test_second_call_keeps_files_and_prints_same_record(
     before = files_in(out, "report.html")
     (out / ".picture.tiff.0123abcd.unfinished").write_bytes(b"left by a command that was killed")
 
-    def refuse(file: object, path: Path, *_: object) -> None:
-        raise AssertionError(f"{path} is decoded")
+    decoded = vars(frames_module)["_decoded"]
+
+    def refuse(file: Any, path: Path, *rest: Any) -> Any:
+        assert path.parent == out, f"{path} is decoded"
+        return decoded(file, path, *rest)
 
     flat = read_frame(folder / "flat.tiff")
     monkeypatch.setattr(frames_module, "_decoded", refuse)
@@ -45,6 +50,22 @@ def test_second_call_keeps_files_and_prints_same_record(
     assert outcome["surface"] == read_record(out, "surface.json")["surface"]
     assert (outcome["planes"], outcome["report"]) == ([], str(out / "report.html"))
     assert files_in(out, "report.html") == before
+
+
+def test_unexplained_surface_is_told_of_at_the_end(
+    seen: Searches, scene: Path, monkeypatch: pytest.MonkeyPatch, done: Command
+) -> None:
+    prediction = Prediction(np.array([3]), 1000, surface=2045.0, planes=2050.0, standard_error=1.0, neighbours=3000.0)
+    monkeypatch.setattr(
+        "faintfield.pipelines.reconstruction.depth.search.estimate_surface",
+        lambda views, _: replace(found_at_once(views), prediction=prediction),
+    )
+    told = done("reconstruct", scene, "--surface", *FAST, "--out", scene / "out", "--json")
+    warning = json.loads(told.stdout)["surface_warning"]
+    assert warning.startswith("This surface does not explain its views")
+    assert told.stderr.splitlines()[-1].endswith(warning)
+    assert "SNR of a view" in (scene / "out" / "report.html").read_text()
+    assert read_record(scene / "out", "overview.json")["brightness"]["snr"] is not None
 
 
 def test_maps_follow_from_depth_and_confidence(seen: Searches, scene: Path, done: Command) -> None:
@@ -204,7 +225,7 @@ def test_each_colour_has_prior_of_its_own(
     seen: Searches, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, done: Command
 ) -> None:
     monkeypatch.setattr(prior_module, "patch_candidates", lambda evidence: {"pilot": evidence.pilot})
-    for path in scene.glob("view_*.tiff"):
+    for path in [*scene.glob("view_*.tiff"), scene / "noise_reference.tiff"]:
         grey = read_frame(path).pixels_dn
         write_frame(path, np.stack([grey, grey // 2 + 50, grey], axis=-1))
     done("reconstruct", scene, "--surface", *FAST, "--prior", "patches", "--proposal", "--out", tmp_path)
