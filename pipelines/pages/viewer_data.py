@@ -63,7 +63,8 @@ class ViewerPicture(TypedDict):
     """One picture of the viewer; JSON for the page's script.
 
     A number is `low + step * level`. `src` is a lossless picture with the high bytes of all levels above their low
-    bytes, or else `element` is the id of an 8-bit picture on the page. Lengths are those of the numbers after binning.
+    bytes, or else `element` is the id of an 8-bit picture on the page, `toned` if that has the tone curve of sRGB.
+    Lengths are those of the numbers after binning.
     """
 
     kind: Kind
@@ -78,6 +79,7 @@ class ViewerPicture(TypedDict):
     origin: NotRequired[tuple[float, float]]
     src: NotRequired[str]
     element: NotRequired[str]
+    toned: NotRequired[bool]
 
 
 def viewer_of(planes: list[Plane], shown: PlaneSections, the_set: SetSection | None) -> dict[str, Any] | None:
@@ -100,6 +102,7 @@ def viewer_of(planes: list[Plane], shown: PlaneSections, the_set: SetSection | N
         "scales": scales,
         "places": list(places.values()),
         "quantity": units.quantity,
+        "toned": units.tone_curve,
         "length": units.length or "(unit of the poses)",
         "binned": any(picture["bins"] > 1 for picture in numbers),
         "first": _first(planes, shown, list(places), pictures),
@@ -139,7 +142,8 @@ def _views(the_set: SetSection, scales: Scales) -> list[ViewerPicture]:
         black, white = the_set.overview.grey_scale_dn
         scales["view"] = {"black": black, "white": white, "name": "view as recorded"}
         step = (white - black) / _TOP_GREY
-        views.append(_view("view", "One view", "as recorded", "DN", black, step))
+        view = _view("view", "One view", "as recorded", "DN", black, step)
+        views.append(view | {"toned": True} if the_set.overview.tone else view)
     if the_set.pictures["bright"]:
         scales["bright"] = {"black": 0.0, "white": float(_TOP_GREY), "name": "bright view"}
         title, unit = "The same view in plenty of light", f"of {_TOP_GREY} grey levels"

@@ -39,7 +39,10 @@ const viewer = (() => {
     }
     return Object.assign(one, { width, height, colours, levels, counts, src: null });
   }
-  const number = (one, level) => one.low + one.step * level;
+  /** The tone curve of sRGB, and light by it, both 0 to 1. */
+  const encoded = light => light <= 0.0031308 ? 12.92 * light : 1.055 * light ** (1 / 2.4) - 0.055;
+  const decoded = value => value <= 0.04045 ? value / 12.92 : ((value + 0.055) / 1.055) ** 2.4;
+  const number = (one, level) => one.low + one.step * (one.toned ? 255 * decoded(level / 255) : level);
   /** The level below which a share of the known samples lies. */
   function quantile(one, share) {
     let rest = share * one.counts.subarray(0, UNKNOWN).reduce((sum, count) => sum + count, 0);
@@ -51,13 +54,15 @@ const viewer = (() => {
     const key = black + " " + white;
     if (one.key === key) return one.canvas;
     const grey = new Uint8Array(UNKNOWN + 1), reach = Math.max(white - black, 1e-12);
-    for (let level = 0; level < UNKNOWN; level++) grey[level] = Math.round(255 * between(0, (number(one, level) - black) / reach, 1));
+    const toned = data.toned && one.kind !== "sigma" ? encoded : share => share;
+    for (let level = 0; level < UNKNOWN; level++) grey[level] = Math.round(255 * toned(between(0, (number(one, level) - black) / reach, 1)));
     one.canvas ??= make("canvas", { width: one.width, height: one.height });
     const context = one.canvas.getContext("2d"), image = context.createImageData(one.width, one.height);
     const pixels = new Uint32Array(image.data.buffer), { levels, colours } = one;
-    if (colours === 1) for (let i = 0; i < pixels.length; i++) pixels[i] = levels[i] === UNKNOWN ? 0xff603030 : 0xff000000 | 0x10101 * grey[levels[i]];
+    const hatch = i => (i % one.width + Math.floor(i / one.width)) % 8 < 2 ? 0xff787878 : 0xffebebeb;
+    if (colours === 1) for (let i = 0; i < pixels.length; i++) pixels[i] = levels[i] === UNKNOWN ? hatch(i) : 0xff000000 | 0x10101 * grey[levels[i]];
     else for (let i = 0; i < pixels.length; i++)
-      pixels[i] = 0xff000000 | grey[levels[3 * i + 2]] << 16 | grey[levels[3 * i + 1]] << 8 | grey[levels[3 * i]];
+      pixels[i] = [0, 1, 2].some(c => levels[3 * i + c] === UNKNOWN) ? hatch(i) : 0xff000000 | grey[levels[3 * i + 2]] << 16 | grey[levels[3 * i + 1]] << 8 | grey[levels[3 * i]];
     context.putImageData(image, 0, 0);
     one.key = key;
     return one.canvas;
