@@ -1,4 +1,4 @@
-"""Consequences of saturated pixels, which do not count: samples that nothing tells, and the bias of the others.
+"""Consequences of saturated pixels, which do not count: samples of unknown light, and the bias of the others.
 
 Of the pixels that see a sample, noise decides which ones stay below saturation: those that count are the darker ones.
 If a share q of normal values is cut off at the top, the mean of the rest is too low by `σ φ(z)/(1 − q)`, where z is the
@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from faintfield.recon.likelihood.images import Image
 
-# Least part of a pixel that must count, or a sample is unknown.
-_LEAST_PIXEL = 0.5
+# Least share of a sample's pixels that must count: if most are saturated, so is the median of the light.
+_LEAST_COUNTED = 0.5
 
 _NORMAL = NormalDist()
 
@@ -23,8 +23,11 @@ _BIAS = np.array([0.0, *(_NORMAL.pdf(_NORMAL.inv_cdf(1 - share)) / (1 - share) f
 
 
 def unknown_samples(counted: Image, whole: Image) -> NDArray[np.bool_]:
-    """Return the samples that no pixel tells, but saturated ones see, by the sensitivity without and with these."""
-    return np.asarray(counted < _LEAST_PIXEL * np.minimum(whole, 1))
+    """Return the samples most of whose pixels are saturated, by the sensitivity without and with these.
+
+    The pixels that count would show less light than saturation, and the truth is more.
+    """
+    return np.asarray(counted < _LEAST_COUNTED * whole)
 
 
 def bias_of_selection(counted: Image, whole: Image) -> Image:

@@ -135,8 +135,8 @@ class PlaneRecord(Struct, frozen=True, kw_only=True):
     """One colour of one plane, in reconstruction.json and in the plane's own record.
 
     A plane given by a pose has a `name` and `rt_ref_plane`, whose lengths are those of the poses of the set.
-    `saturated_share` is that of the pixels of all views, and `unknown_share` that of the samples, NaN, which only such
-    pixels see; unset without any.
+    `saturated_share` is that of the pixels of all views, and `unknown_share` that of the samples, NaN, most of whose
+    pixels are; unset without any.
     """
 
     name: str | UnsetType = UNSET

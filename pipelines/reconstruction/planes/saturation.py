@@ -1,4 +1,4 @@
-"""Samples of a plane or surface that only saturated pixels see, and the uncertainty of those that some see."""
+"""Samples of a plane or surface that mostly saturated pixels see, and the uncertainty of the others."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ class PixelSelection:
 
     @property
     def unknown(self) -> NDArray[np.bool_]:
-        """Samples that saturated pixels see, and no others."""
+        """Samples whose pixels are mostly saturated."""
         return unknown_samples(self.counted, self.whole)
 
     def applied(self, arrays: Mapping[str, Image], known_e2: float) -> dict[str, Image]:
@@ -66,7 +66,7 @@ def saturation_text(records: Sequence[PlaneRecord | SurfaceChannel]) -> str | No
     if not saturated:
         return None
     unknown = max(record.unknown_share or 0.0 for record in records)
-    samples = f"; up to {unknown:.2%} of the samples, seen by no others, are NaN, and hatched in the pictures"
+    samples = f"; up to {unknown:.2%} of the samples are brighter than that: NaN, hatched in the pictures"
     return (
         f"{saturated:.2%} of the pixels are saturated and do not count{samples if unknown else ''}; use a shorter "
         "exposure, or several"
