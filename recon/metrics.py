@@ -74,9 +74,13 @@ def photons_from_moments(snr: float, *, quantum_efficiency: float, read_noise_e:
 
 
 def mean_square_error(plane: Image, truth: Image, region: NDArray[np.bool_] | None = None) -> float:
-    """Return the mean square difference of two planes over a region, both divided by the truth's maximum there."""
+    """Return the mean square difference of two planes over a region, both divided by the truth's maximum there.
+
+    Samples of the plane that are NaN, as they are not known, do not count.
+    """
     where = np.ones(truth.shape, bool) if region is None else region
     peak = float(np.max(truth[where]))
+    where = where & ~(np.isnan(plane) if plane.ndim == where.ndim else np.isnan(plane).any(axis=2))
     return float(np.mean(np.square((plane[where] - truth[where]) / peak, dtype=np.float64)))
 
 

@@ -17,6 +17,9 @@ type Picture = NDArray[np.uint8]
 # Of a lossy film, 0 to 100: above it, size grows faster than anyone can see.
 _FILM_QUALITY = 80
 
+# Hatching of samples that are not known: its period along a row, and its two levels.
+_HATCH_PERIOD_PX, _HATCH_DARK, _HATCH_BRIGHT = 8, 120, 235
+
 
 def write_frame(path: Path, pixels: NDArray[Any]) -> None:
     """Write a frame (row, column[, colour]) as TIFF of its own data type, uncompressed: decision 029."""
@@ -84,9 +87,37 @@ def encoded_film(frames: Sequence[Picture], frame_ms: int) -> bytes | None:
 
 def grey_levels(plane: NDArray[np.floating], white: float, black: float = 0.0) -> Picture:
     """Return a plane as 8-bit levels on a linear scale from black to white."""
+    return np.asarray(np.rint(255 * _relative(plane, white, black)), np.uint8)
+
+
+def _relative(plane: NDArray[np.floating], white: float, black: float) -> NDArray[np.float32]:
+    """Return a plane relative to the scale from black to white, 0 to 1; NaN is black."""
     # Clipped first: files may hold infinite values
     inside = np.clip(np.nan_to_num(np.asarray(plane, np.float32), nan=black), black, max(white, black))
-    return np.asarray(np.rint((inside - black) * (255.0 / max(white - black, 1e-30))), np.uint8)
+    return (inside - np.float32(black)) * np.float32(1 / max(white - black, 1e-30))
+
+
+def light_picture(
+    light: NDArray[np.floating], white: float, black: float = 0.0, *, tone_curve: bool = False
+) -> Picture:
+    """Return light (row, column[, colour]) as 8-bit levels from black to white; samples that are NaN are hatched.
+
+    With the tone curve of sRGB levels are what a screen expects, and what photographs have; without it they are
+    proportional to light.
+    """
+    share = _relative(light, white, black)
+    levels = np.asarray(np.rint(255 * (srgb_encoded(share) if tone_curve else share)), np.uint8)
+    unknown = np.isnan(light) if light.ndim == 2 else np.isnan(light).any(axis=2)
+    if unknown.any():
+        rows, columns = np.nonzero(unknown)
+        stripes = np.where((rows + columns) % _HATCH_PERIOD_PX < 2, _HATCH_DARK, _HATCH_BRIGHT).astype(np.uint8)
+        levels[rows, columns] = stripes if light.ndim == 2 else stripes[:, np.newaxis]
+    return levels
+
+
+def srgb_encoded(share: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return the values (0 to 1) of light relative to white by the tone curve of IEC 61966-2-1."""
+    return np.asarray(np.where(share <= 0.0031308, 12.92 * share, 1.055 * np.maximum(share, 0.0) ** (1 / 2.4) - 0.055))
 
 
 def mask_picture(mask: NDArray[np.bool_]) -> Picture:

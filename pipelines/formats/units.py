@@ -132,6 +132,11 @@ class StatedUnits(Units, frozen=True, forbid_unknown_fields=False, omit_defaults
         return "of the views’ white" if self.light == "relative" else f"{self.light_symbol} per pixel"
 
     @property
+    def tone_curve(self) -> bool:
+        """True if the files had the tone curve of sRGB; pictures are then shown with it."""
+        return self.light == "relative"
+
+    @property
     def quantities(self) -> str:
         """Several of what tells planes apart."""
         return "disparities" if self.depth == "disparity_px" else "depths"

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.pipelines.formats.image_files import encoded, grey_levels, shrunk, white_level
+from faintfield.pipelines.formats.image_files import encoded, grey_levels, light_picture, shrunk, white_level
 from faintfield.pipelines.formats.results.records import JOINT_METHODS, Certificate, FocusCurve, ReconstructionRecord
 from faintfield.pipelines.formats.units import StatedUnits
 from faintfield.pipelines.pages.page import INK, blank_drawing, data_uri, format_depths, ink, svg
@@ -111,7 +111,7 @@ def plane_sections(planes: list[Plane], results: Iterable[ReconstructionRecord])
         slider=[_slides(titles[column], in_order[column]) for column in columns] if several else None,
         slider_column=columns.index(best),
         slider_depth=slider_depth,
-        slider_picture=_picture(first_slide.pixels(), white, _SLIDER_WIDTH_PX, ".jpg") if several else None,
+        slider_picture=_plane_picture(first_slide, white, _SLIDER_WIDTH_PX, ".jpg") if several else None,
         sigmas=_sigmas(shown, titles),
         proposals=_proposals(shown, titles, white),
         depths=len(places),
@@ -158,7 +158,7 @@ def _side_by_side(planes: list[Plane], columns: list[str], white: float) -> list
     rows = []
     for place in sorted({plane.place for plane in planes}):
         row = (by_place.get((place, column)) for column in columns)
-        cells = [None if plane is None else _picture(plane.pixels(), white, width_px, ".png") for plane in row]
+        cells = [None if plane is None else _plane_picture(plane, white, width_px, ".png") for plane in row]
         rows.append((place_name(planes[0].units, *place), cells))
     return rows
 
@@ -172,7 +172,9 @@ def _sigmas(planes: list[Plane], titles: dict[str, str]) -> Sigmas | None:
     if not maps:
         return None
     white = max(white_level(sigma) for _, sigma in maps)
-    pictures = [(name, float(np.median(sigma)), _picture(sigma, white, _GRID_WIDTH_PX, ".png")) for name, sigma in maps]
+    pictures = [
+        (name, float(np.nanmedian(sigma)), _picture(sigma, white, _GRID_WIDTH_PX, ".png")) for name, sigma in maps
+    ]
     return Sigmas(white, pictures)
 
 
@@ -183,7 +185,7 @@ def _proposals(planes: list[Plane], titles: dict[str, str], white: float) -> lis
         proposal, moved = plane.sidecar_pixels("proposal_file"), plane.sidecar_pixels("moved_file")
         if proposal is not None and moved is not None:
             levels = shrunk(grey_levels(moved, _MOST_MOVED, -_MOST_MOVED), _GRID_WIDTH_PX)
-            picture = _picture(proposal, white, _GRID_WIDTH_PX, ".png")
+            picture = _picture(proposal, white, _GRID_WIDTH_PX, ".png", tone_curve=plane.units.tone_curve)
             title = f"{titles[plane.column]}, {plane.label}"
             proposals.append(Proposed(title, picture, data_uri(encoded(levels, ".png"), ".png")))
     return proposals
@@ -197,8 +199,13 @@ def _first_depth(depths: list[float], focus: FocusCurve | None) -> int:
     return int(np.argmin(np.abs(np.array(depths) - best)))
 
 
-def _picture(pixels: NDArray[Any], white: float, width_px: int, suffix: str) -> str:
-    return data_uri(encoded(shrunk(grey_levels(pixels, white), width_px), suffix), suffix)
+def _plane_picture(plane: Plane, white: float, width_px: int, suffix: str) -> str:
+    return _picture(plane.pixels(), white, width_px, suffix, tone_curve=plane.units.tone_curve)
+
+
+def _picture(pixels: NDArray[Any], white: float, width_px: int, suffix: str, *, tone_curve: bool = False) -> str:
+    levels = light_picture(pixels, white, tone_curve=tone_curve)
+    return data_uri(encoded(shrunk(levels, width_px), suffix), suffix)
 
 
 def _focus_curve(focus: FocusCurve, units: StatedUnits) -> str:

@@ -73,9 +73,10 @@ class ViewerPicture(TypedDict):
     """One picture of the viewer; JSON for the page's script.
 
     A number is `low + step * level`. `src` is a lossless picture with the high bytes of all levels above their low
-    bytes, or else `element` is the id of an 8-bit picture on the page, whose numbers are integers if `whole`. Lengths
-    are those of the numbers after binning. `sigma` is the index of the picture of their standard deviations, and
-    `confidence` that of the probabilities that they are right, which are sure from `sure_above` on.
+    bytes, or else `element` is the id of an 8-bit picture on the page: `toned` if it has the tone curve of sRGB, and
+    of integers if `whole`. Lengths are those of the numbers after binning. `sigma` is the index of the picture of their
+    standard deviations, and `confidence` that of the probabilities that they are right, which are sure from
+    `sure_above` on.
     """
 
     kind: Kind
@@ -94,6 +95,7 @@ class ViewerPicture(TypedDict):
     sigma: NotRequired[int]
     confidence: NotRequired[int]
     sure_above: NotRequired[float]
+    toned: NotRequired[bool]
 
 
 def viewer_of(
@@ -131,6 +133,7 @@ def viewer_of(
         "scales": scales,
         "places": list(places.values()),
         "quantity": units.quantity,
+        "toned": units.tone_curve,
         "length": units.length or "(unit of the poses)",
         "binned": any(picture["bins"] > 1 for picture in numbers),
         "first": _first(planes, shown, list(places), pictures) if planes else _first_of_surface(pictures),
@@ -192,6 +195,7 @@ def _views(the_set: SetSection, scales: Scales) -> list[ViewerPicture]:
         step = (white - black) / _TOP_GREY
         views.append(_view("view", "One view", "as recorded", "DN", black, step))
         views[-1]["whole"] = the_set.overview.whole_dn is True
+        views[-1]["toned"] = the_set.overview.tone == "srgb"
     if the_set.pictures["bright"]:
         scales["bright"] = {"black": 0.0, "white": float(_TOP_GREY), "name": "bright view"}
         title, unit = "The same view in plenty of light", f"of {_TOP_GREY} grey levels"

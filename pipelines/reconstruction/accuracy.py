@@ -76,7 +76,7 @@ def _plane_errors(
     at_depth = true_plane(truth, depth)
     assert at_depth is not None
     texture, region = texture_and_region(folder, at_depth)
-    if not plane.shape == texture.shape == bright.shape:
+    if not plane.shape == texture.shape == bright.shape or not np.isfinite(plane[region]).any():
         return None
     error = mean_square_error(plane, bright, region)
     return PlaneErrors(

@@ -138,10 +138,16 @@ class OperatorFactory:
         shared = self._shared if views is None else self._of_views(len(views), valid)
         return PlaneOperator(self._homographies(place, views), self._maps, grid, **shared)
 
-    def of_surface(self, inverse_depth: NDArray[np.floating], grid: PlaneGrid) -> SurfaceOperator:
-        """Return H of the surface with these 1/depths in 1/mm, on the samples of a grid at unit depth."""
+    def of_surface(
+        self, inverse_depth: NDArray[np.floating], grid: PlaneGrid, *, masked: bool = True
+    ) -> SurfaceOperator:
+        """Return H of the surface with these 1/depths in 1/mm, on the samples of a grid at unit depth.
+
+        Unless it is `masked`, saturated pixels count, too.
+        """
+        shared = self._shared if masked else self._of_views(len(self._poses), None)
         matrices = np.repeat(ray_from_surface(self._poses, self._principal_shift), self._phases, axis=0)
-        return SurfaceOperator(matrices, self._maps, grid, inverse_depth, **self._shared)
+        return SurfaceOperator(matrices, self._maps, grid, inverse_depth, **shared)
 
     def of_scene(self, grids: Mapping[Place, PlaneGrid], opacities: Sequence[Image] | None = None) -> SceneOperator:
         """Return H of all planes together, in the order of `grids`.

@@ -7,13 +7,14 @@ from typing import Any
 import cv2
 import msgspec
 import numpy as np
+from msgspec import UNSET
 from numpy.typing import NDArray
 from skimage.filters import threshold_li
 
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import write_record, write_whole
 from faintfield.pipelines.formats.frames import read_frame
-from faintfield.pipelines.formats.image_files import Picture, contact_sheet, encoded, grey_levels, white_level
+from faintfield.pipelines.formats.image_files import Picture, contact_sheet, encoded, light_picture, white_level
 from faintfield.pipelines.formats.results.figures import OVERVIEW_FILE, Brightness, Overview
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, in_units
 from faintfield.pipelines.reconstruction.channels import checked_frame, lattice_noise, view_electrons
@@ -152,17 +153,20 @@ def inspect_set(elemental_set: ElementalSet) -> tuple[Overview, dict[str, bytes]
     columns = grid[1] if grid else int(np.ceil(np.sqrt(len(elemental_set.settings.view))))
     small_px = max(_SHEET_WIDTH_PX // columns, 24)
 
+    def shown(pixels_dn: NDArray[Any]) -> Picture:
+        return light_picture(pixels_dn, white, black, tone_curve=elemental_set.units.tone_curve)
+
     def shrunk_view(path: Path) -> Picture:
-        return grey_levels(_every_nth(checked_frame(elemental_set, path, layout).pixels_dn, small_px), white, black)
+        return shown(_every_nth(checked_frame(elemental_set, path, layout).pixels_dn, small_px))
 
     small = map_in_threads(shrunk_view, elemental_set.image_paths)
     pictures = {
         INTEGRAL_IMAGE: contact_sheet(small, columns),
-        REFERENCE_VIEW: grey_levels(reference, white, black),
+        REFERENCE_VIEW: shown(reference),
     }
     if elemental_set.noise_reference:
         no_light = read_frame(elemental_set.noise_reference[0], size_px).pixels_dn
-        pictures[NOISE_REFERENCE_VIEW] = grey_levels(no_light, white, black)
+        pictures[NOISE_REFERENCE_VIEW] = shown(no_light)
     region, name = object_region(elemental_set)
     pictures |= _bright_views(elemental_set, region)
     noise, exposure_s = elemental_set.noise, elemental_set.settings.exposure_s
@@ -181,6 +185,7 @@ def inspect_set(elemental_set: ElementalSet) -> tuple[Overview, dict[str, bytes]
         dark_e=float(np.mean(elemental_set.background_e(noise))),
         grey_scale_dn=(black, white),
         whole_dn=bool(np.issubdtype(reference.dtype, np.integer)),
+        tone="srgb" if elemental_set.units.tone_curve else UNSET,
         brightness=brightness_within(elemental_set, region, name),
     )
     record = in_units(elemental_set, record)
@@ -204,7 +209,7 @@ def _bright_views(elemental_set: ElementalSet, region: Region | None) -> dict[st
     light_e = bright_electrons(elemental_set)
     if light_e is None:
         return {}
-    picture = grey_levels(light_e, white_level(light_e))
+    picture = light_picture(light_e, white_level(light_e))
     views = {BRIGHT_VIEW: picture}
     if region is not None:
         outlined = np.ascontiguousarray(np.dstack([picture] * 3))

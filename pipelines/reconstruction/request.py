@@ -27,6 +27,7 @@ from faintfield.pipelines.reconstruction.depth.autofocus import (
     searched_range_mm,
     sweep_of_range,
 )
+from faintfield.pipelines.reconstruction.depth.shared_range import check_range_shared, check_shared
 from faintfield.pipelines.reconstruction.operators import check_in_front
 from faintfield.pipelines.reconstruction.options import PLACES, Options, sweep_values
 
@@ -217,8 +218,9 @@ def resolve(
     """Return the request for a set: disparities become depths, and `auto` the depths that are found.
 
     `out` is for a temporary file while depths are searched. Nothing is searched if the record of an `earlier` result is
-    given: depths are then those that it has by the same search, or none. Raises WrongUsage, BadValue or NothingInFocus
-    if the depths do not suit the options, a disparity has no depth, or the search finds none.
+    given: depths are then those that it has by the same search, or none. Raises WrongUsage, BadValue,
+    GeometryMismatch or NothingInFocus if the depths do not suit the options, a disparity has no depth, no two views see
+    a plane, or the search finds none.
     """
     _refuse_mm(selection, elemental_set)
     own_px = elemental_set.units.depth == "disparity_px"
@@ -230,10 +232,13 @@ def resolve(
     depths, found, swept_mm = [*in_mm, *disparities], None, list[float]()
     if selection.auto:
         near_mm, far_mm = (min(depths), max(depths)) if depths else searched_range_mm(elemental_set)
+        check_range_shared(elemental_set, (near_mm, far_mm))
         found = earlier.best_focus if earlier else best_focus(elemental_set, out, (near_mm, far_mm))
         if found and found.searched_mm[0] != (near_mm, far_mm):  # that of an earlier result was another search
             found = None
         depths, disparities = found.depth_mm if found else [], {}
+    elif earlier is None:
+        check_shared(elemental_set, depths, in_mm=not disparities)
     if selection.auto_sweep:
         if earlier is None:
             swept_mm = sweep_of_range(elemental_set, found_range_mm(elemental_set, out))

@@ -37,6 +37,7 @@ from faintfield.pipelines.reconstruction.depth.depth_map import kept_depth_map, 
 from faintfield.pipelines.reconstruction.depth.search import check_overlap, check_views, depths_of_set
 from faintfield.pipelines.reconstruction.operators import default_pitch_px, plane_grid
 from faintfield.pipelines.reconstruction.overview import inspect_set, write_overview
+from faintfield.pipelines.reconstruction.planes.saturation import saturation_text
 from faintfield.pipelines.reconstruction.planes.sweep import PlaneTask, Runner, Sweep, run_serially
 from faintfield.pipelines.reconstruction.request import Request, folder_of_method
 
@@ -199,6 +200,8 @@ def _warn(elemental_set: ElementalSet, records: list[PlaneRecord]) -> None:
         inform(
             f"the prior is left out of {len(without)} of {len(records)} planes, total variation's stay: {without[0]}"
         )
+    if text := saturation_text(records):
+        inform(text)
     black = [record for record in records if record.mean_e <= _BLACK_E * light_per_e(elemental_set)]
     if black:
         first = elemental_set.units.depths_text([black[0].depth_mm])

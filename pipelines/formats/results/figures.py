@@ -1,5 +1,7 @@
 """Records of figures: a set at a glance (`overview.json`), and the errors of planes (`metrics.json`)."""
 
+from typing import Literal
+
 from msgspec import UNSET, Struct, UnsetType
 
 from faintfield.pipelines.formats.results.records import Method, Poses
@@ -27,7 +29,7 @@ class Brightness(Struct, frozen=True):
 
 
 class Overview(Struct, frozen=True, kw_only=True):
-    """`overview.json`: a set at a glance, beside its pictures.
+    """`overview.json`: a set at a glance, beside its pictures, which are linear in light unless they have a `tone`.
 
     `grey_scale_dn` are black and white of these; the pixels of the reference view are integers if `whole_dn`.
     """
@@ -46,6 +48,7 @@ class Overview(Struct, frozen=True, kw_only=True):
     dark_e: float | UnsetType = UNSET
     grey_scale_dn: tuple[float, float] | UnsetType = UNSET
     whole_dn: bool | UnsetType = UNSET
+    tone: Literal["srgb"] | UnsetType = UNSET
     brightness: Brightness
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.files import problem_of_file, remove, sha256, write_record, writing
-from faintfield.pipelines.formats.image_files import Spacing, grey_levels, white_level, write_plane, write_png
+from faintfield.pipelines.formats.image_files import Spacing, light_picture, white_level, write_plane, write_png
 from faintfield.pipelines.formats.plane_poses import Place, TiltedPlane
 from faintfield.pipelines.formats.provenance import Provenance, digest_holds, first_difference
 from faintfield.pipelines.formats.reading import JSON_FAILURES, read_content, read_json
@@ -124,7 +124,8 @@ class PlaneFiles:
         spacing = Spacing(entries[0].record.pitch_mm, in_mm=units_of(entries[0]).depth == "mm")
         write_plane(self.path, plane, spacing)
         preview = self.path.with_suffix(".png")
-        write_png(preview, grey_levels(plane, white_level(plane)))
+        tone_curve = units_of(entries[0]).tone_curve
+        write_png(preview, light_picture(plane, white_level(plane), tone_curve=tone_curve))
         sidecars = self._write_sidecars(parts, spacing)
         written = [self.path, preview, *sidecars.values()]
         names = {f"{name}_file": path.name for name, path in sidecars.items()}

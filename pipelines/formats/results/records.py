@@ -135,6 +135,8 @@ class PlaneRecord(Struct, frozen=True, kw_only=True):
     """One colour of one plane, in reconstruction.json and in the plane's own record.
 
     A plane given by a pose has a `name` and `rt_ref_plane`, whose lengths are those of the poses of the set.
+    `saturated_share` is that of the pixels of all views, and `unknown_share` that of the samples, NaN, most of whose
+    pixels are; unset without any.
     """
 
     name: str | UnsetType = UNSET
@@ -153,6 +155,8 @@ class PlaneRecord(Struct, frozen=True, kw_only=True):
     objective: float | None = None
     certificate: Certificate | None
     mean_e: float = math.nan
+    saturated_share: float | UnsetType = UNSET
+    unknown_share: float | UnsetType = UNSET
     passes_before: float | UnsetType = UNSET
     penalty_weight_curve: list[WeightScore] | UnsetType | None = UNSET
     penalty: PenaltyRecord | UnsetType = UNSET

@@ -75,7 +75,7 @@ class HeldOutRecord(Struct, frozen=True, kw_only=True):
 
 
 class SurfaceChannel(Struct, frozen=True, kw_only=True):
-    """Solution of one colour of the picture."""
+    """Solution of one colour of the picture; shares of saturated pixels and unknown samples as in `PlaneRecord`."""
 
     channel: str
     penalty_weight: float | None
@@ -85,6 +85,8 @@ class SurfaceChannel(Struct, frozen=True, kw_only=True):
     passes: int
     likelihood: str
     mean_e: float
+    saturated_share: float | UnsetType = UNSET
+    unknown_share: float | UnsetType = UNSET
     prior: PriorRecord | UnsetType = UNSET
 
 

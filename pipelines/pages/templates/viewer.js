@@ -48,7 +48,10 @@ const viewer = (() => {
     }
     return Object.assign(one, { width, height, colours, levels, counts, src: null });
   }
-  const number = (one, level) => one.low + one.step * level;
+  /** The tone curve of sRGB, and light by it, both 0 to 1. */
+  const encoded = light => light <= 0.0031308 ? 12.92 * light : 1.055 * light ** (1 / 2.4) - 0.055;
+  const decoded = value => value <= 0.04045 ? value / 12.92 : ((value + 0.055) / 1.055) ** 2.4;
+  const number = (one, level) => one.low + one.step * (one.toned ? 255 * decoded(level / 255) : level);
   /** The level below which a share of the known samples lies. */
   function quantile(one, share) {
     let rest = share * one.counts.subarray(0, UNKNOWN).reduce((sum, count) => sum + count, 0);
@@ -61,22 +64,22 @@ const viewer = (() => {
     const key = black + " " + white + Boolean(doubt?.levels);
     if (one.key === key) return one.canvas;
     const grey = new Uint8Array(UNKNOWN + 1), reach = Math.max(white - black, 1e-12);
-    for (let level = 0; level < UNKNOWN; level++) grey[level] = Math.round(255 * between(0, (number(one, level) - black) / reach, 1));
+    const toned = data.toned && one.kind !== "sigma" && !scales[one.kind].colours ? encoded : share => share;
+    for (let level = 0; level < UNKNOWN; level++) grey[level] = Math.round(255 * toned(between(0, (number(one, level) - black) / reach, 1)));
     one.canvas ??= make("canvas", { width: one.width, height: one.height });
     const context = one.canvas.getContext("2d"), image = context.createImageData(one.width, one.height);
-    const pixels = new Uint32Array(image.data.buffer), { levels, colours, width } = one;
+    const pixels = new Uint32Array(image.data.buffer), bytes = image.data, { levels, colours, width } = one;
     const inks = Array.from({ length: 256 }, (_, level) => bytesOf(scales[one.kind].colours ? colourOf(level) : [level, level, level]));
-    if (colours === 1) for (let i = 0; i < pixels.length; i++) pixels[i] = levels[i] === UNKNOWN ? 0xff603030 : inks[grey[levels[i]]];
-    else for (let i = 0; i < pixels.length; i++)
-      pixels[i] = 0xff000000 | grey[levels[3 * i + 2]] << 16 | grey[levels[3 * i + 1]] << 8 | grey[levels[3 * i]];
-    if (doubt?.levels) {
-      // Where it is not sure, hatching shows through, as in the previews
-      const period = Math.max(6, Math.round(width / 53)), bytes = image.data;
-      for (let i = 0; i < pixels.length; i++) if (levels[i] === UNKNOWN || !sure(one, doubt, i)) {
-        const grey = (i % width + Math.floor(i / width)) % period < period / 6 ? 128 : 158, share = levels[i] === UNKNOWN ? 0 : 0.3;
-        for (let c = 0; c < 3; c++) bytes[4 * i + c] = share * bytes[4 * i + c] + (1 - share) * grey;
-        bytes[4 * i + 3] = 255;
-      }
+    // Hatching as in the previews: where nothing is known, and through what is not sure
+    const period = Math.max(6, Math.round(width / 53));
+    const hatch = i => (i % width + Math.floor(i / width)) % period < period / 6 ? 128 : 158;
+    const unknown = i => { for (let c = 0; c < colours; c++) if (levels[i * colours + c] === UNKNOWN) return true; return false; };
+    for (let i = 0; i < pixels.length; i++) {
+      const known = !unknown(i);
+      if (!known) pixels[i] = bytesOf([hatch(i), hatch(i), hatch(i)]);
+      else if (colours === 1) pixels[i] = inks[grey[levels[i]]];
+      else pixels[i] = 0xff000000 | grey[levels[3 * i + 2]] << 16 | grey[levels[3 * i + 1]] << 8 | grey[levels[3 * i]];
+      if (known && doubt?.levels && !sure(one, doubt, i)) for (let c = 0; c < 3; c++) bytes[4 * i + c] = 0.3 * bytes[4 * i + c] + 0.7 * hatch(i);
     }
     context.putImageData(image, 0, 0);
     one.key = key;

@@ -6,12 +6,11 @@ import numpy as np
 from msgspec import UNSET
 from numpy.typing import NDArray
 
-from faintfield.calib.homography import image_lattice
 from faintfield.pipelines.console import inform, working
 from faintfield.pipelines.formats.results.records import BestFocusRecord
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, rounded_depth
 from faintfield.pipelines.reconstruction.depth.comparison import BinnedViews, binned_views, check_places
-from faintfield.pipelines.reconstruction.operators import seen_from
+from faintfield.pipelines.reconstruction.depth.shared_range import overlap
 from faintfield.recon.depth.agreement import Agreement, DepthEstimate, Significance, depth_map
 from faintfield.recon.depth.focus import MIN_SAMPLES, SURE, likeliest_depth_mm, places_of_focus
 from faintfield.recon.errors import NothingInFocus
@@ -194,15 +193,6 @@ def _range_of_disparities(elemental_set: ElementalSet, least_px: float, largest_
             "infinity by the poses; correct one of them"
         )
     return 1 / near, 1 / max(far, near / _INFINITY)
-
-
-def overlap(elemental_set: ElementalSet, depth_mm: float) -> float:
-    """Return the share of the reference view's part of a plane that the views see, too, on average."""
-    size_px = elemental_set.settings.camera.size_px
-    views = range(len(elemental_set.settings.view))
-    seen = seen_from(elemental_set, depth_mm, image_lattice(size_px), views)
-    inside = np.all((seen > -0.5) & (seen < np.array(size_px) - 0.5), axis=2)
-    return float(inside.mean())
 
 
 def _refined(

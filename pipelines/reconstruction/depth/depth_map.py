@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.formats.files import remove, sha256, write_record, write_whole
 from faintfield.pipelines.formats.frames import read_frame
-from faintfield.pipelines.formats.image_files import ONE_PIXEL, encoded, grey_levels, white_level, write_plane
+from faintfield.pipelines.formats.image_files import ONE_PIXEL, encoded, light_picture, white_level, write_plane
 from faintfield.pipelines.formats.results.plane_files import Origin, read_current
 from faintfield.pipelines.formats.results.records import DEPTH_MAP_FILE, DepthMapFileRecord, DepthMapRecord, Method
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, unit_of_maps
@@ -66,7 +66,7 @@ def write_depth_map(
     for method, folder in {method: path.parent for (method, _), path in planes.items()}.items():
         remove(folder / DEPTH_MAP_FILE)
         sharp = _all_in_focus([planes[method, depth] for depth in depths], index)
-        preview = encoded(grey_levels(sharp, white_level(sharp)), ".png")
+        preview = encoded(light_picture(sharp, white_level(sharp), tone_curve=elemental_set.units.tone_curve), ".png")
         hashes: dict[str, str] = {}
         for name, (values, picture) in (pictures | {record.all_in_focus: (sharp, preview)}).items():
             path = folder / name
@@ -129,7 +129,8 @@ def _all_in_focus(paths: Sequence[Path], index: NDArray[np.floating]) -> NDArray
         elif plane.shape != sharp.shape:
             plane = cv2.resize(plane, (columns, rows), interpolation=cv2.INTER_LINEAR)
         share = np.maximum(1 - np.abs(at - number), 0)
-        part = plane * (share if plane.ndim == 2 else share[:, :, np.newaxis])
+        share = share if plane.ndim == 2 else share[:, :, np.newaxis]
+        part = np.where(share > 0, plane * share, 0)  # unknown samples of other planes do not matter
         sharp = part if sharp is None else sharp + part
     assert sharp is not None
     return sharp

@@ -19,8 +19,9 @@ from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.frames import Lattice
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.channels import lattice_noise, view_electrons
-from faintfield.pipelines.reconstruction.depth.autofocus import overlap, searched_range_mm, views_of_search
+from faintfield.pipelines.reconstruction.depth.autofocus import searched_range_mm, views_of_search
 from faintfield.pipelines.reconstruction.depth.comparison import BETWEEN_PIXELS, between_pixels, check_places
+from faintfield.pipelines.reconstruction.depth.shared_range import overlap, remedy
 from faintfield.pipelines.reconstruction.operators import plane_grid, principal_shift, response_of
 from faintfield.recon.errors import GeometryMismatch, NothingInFocus
 from faintfield.recon.operator.grid import PlaneGrid
@@ -176,7 +177,7 @@ def check_overlap(elemental_set: ElementalSet, range_mm: tuple[float, float]) ->
         between = elemental_set.depths_text(near_mm, far_mm, join=" and ")
         raise GeometryMismatch(
             f"between {between} the other views see {shared:.0%} of what the reference view sees, "
-            f"on average, and {_MIN_OVERLAP:.0%} are needed; correct the range, or the poses and their signs"
+            f"on average, and {_MIN_OVERLAP:.0%} are needed; {remedy(elemental_set, range_mm)}"
         )
 
 

@@ -28,6 +28,7 @@ from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, in_uni
 from faintfield.pipelines.reconstruction.channels import load_channel
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, blind_views
 from faintfield.pipelines.reconstruction.planes.penalised import Pilot, Solution
+from faintfield.pipelines.reconstruction.planes.saturation import PixelSelection
 from faintfield.pipelines.reconstruction.planes.solve import solve, solve_together
 from faintfield.recon.depth.focus import FocusMeasure, focus_measure, sharp_depths_mm
 from faintfield.recon.errors import GeometryMismatch
@@ -65,6 +66,7 @@ class Channel:
     def __init__(self, elemental_set: ElementalSet, layout: ChannelLayout, images: ElementalImages) -> None:
         self._set, self._layout, self._images = elemental_set, layout, images
         self._factory = OperatorFactory(elemental_set, layout, images)
+        self._selected: dict[Place, PixelSelection] = {}
 
     def total_variation(self, task: PlaneTask) -> dict[Place, Solution]:
         """Return the planes from which the priors of a task begin."""
@@ -80,6 +82,9 @@ class Channel:
         focus: dict[Place, FocusPoint | None] = dict.fromkeys(task.grids)
         for place, grid in task.grids.items():
             operator = self._operator(place, grid)
+            if self._images.valid is not None:
+                whole = self._factory.at(place, grid, range(len(self._set.settings.view)))
+                self._selected[place] = PixelSelection.of(operator, whole, self._images)
             if message := blind_views(self._set, operator, "the plane"):
                 messages.append(f"{self._describe(place)}: {message}")
             if task.with_focus:
@@ -105,6 +110,10 @@ class Channel:
 
     def _save(self, task: PlaneTask, files: PlaneFiles, solution: Solution, focus: FocusPoint | None) -> None:
         place, grid = files.place, task.grids[files.place]
+        arrays = {"plane": solution.plane, **solution.sidecars}
+        selected = self._selected.get(place)
+        if selected is not None:
+            arrays = selected.applied(arrays, float(np.mean(self._images.known_variance_e2())))
         tilted = place if isinstance(place, TiltedPlane) else None
         px_per_sample = grid.pitch_mm * self._set.settings.camera.fx_px / depth_of(place)  # on the axis
         cosine = abs(float(tilted.normal[2])) if tilted else 1.0
@@ -119,10 +128,11 @@ class Channel:
             pitch_mm=grid.pitch_mm,
             origin_mm=grid.origin_mm,
             **structs.asdict(solution.record),
-            mean_e=float(np.mean(solution.plane, dtype=np.float64)),
-            flux_e=float(solution.plane.sum(dtype=np.float64)) * (px_per_sample**2 * cosine),
+            mean_e=float(np.nanmean(arrays["plane"], dtype=np.float64)),
+            flux_e=float(np.nansum(arrays["plane"], dtype=np.float64)) * (px_per_sample**2 * cosine),
+            saturated_share=selected.saturated_share if selected else UNSET,
+            unknown_share=selected.unknown_share if selected else UNSET,
         )
-        arrays = {"plane": solution.plane, **solution.sidecars}
         light = light_per_e(self._set)
         if light != 1:
             arrays |= {name: light * arrays[name] for name in ("plane", "sigma", "proposal") if name in arrays}

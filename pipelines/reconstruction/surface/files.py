@@ -17,7 +17,7 @@ from faintfield.pipelines.formats.image_files import (
     Picture,
     encoded,
     encoded_film,
-    grey_levels,
+    light_picture,
     white_level,
     write_plane,
 )
@@ -88,7 +88,7 @@ def write_surface(
     depths = [name for of_unit in _DEPTH_FILES.values() for name in of_unit]  # an earlier surface may have another unit
     for name in (POINTS, FILM, *depths, *_PROPOSED, *map(preview_name, (*depths, *_PROPOSED))):
         remove(folder / name)
-    levels = grey_levels(maps.picture, white_level(maps.picture))
+    levels = light_picture(maps.picture, white_level(maps.picture), tone_curve=units_of(origin).tone_curve)
     points = None if facts.unit == "px" else POINTS
     if points is not None:
         (left, top), pitch, (rows, columns) = maps.grid.origin_mm, maps.grid.pitch_mm, maps.grid.shape
@@ -134,7 +134,11 @@ def _named_maps(
     sigma, proposal, moved = maps.picture_sigma, maps.picture_proposal, maps.picture_moved
     yield record.picture_sigma, sigma, _colour_map(sigma, f"σ of the light ({_LIGHT[units.light]})")
     if proposal is not None and moved is not None:
-        yield _PROPOSED[0], proposal, encoded(grey_levels(proposal, white_level(maps.picture)), ".png")
+        yield (
+            _PROPOSED[0],
+            proposal,
+            encoded(light_picture(proposal, white_level(maps.picture), tone_curve=units.tone_curve), ".png"),
+        )
         yield _PROPOSED[1], moved, _colour_map(moved, "picture less proposal (σ)")
     confidence = maps.depth_confidence
     sure = confidence >= record.sure_above

@@ -4,9 +4,10 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
+from msgspec import UNSET
 from numpy.typing import NDArray
 from scipy.special import erfinv
 
@@ -42,6 +43,7 @@ from faintfield.pipelines.reconstruction.operators import OperatorFactory, blind
 from faintfield.pipelines.reconstruction.overview import inspect_set, write_overview
 from faintfield.pipelines.reconstruction.planes.penalised import Objective, Solution, solve_then_sigma
 from faintfield.pipelines.reconstruction.planes.prior import with_prior
+from faintfield.pipelines.reconstruction.planes.saturation import PixelSelection, saturation_text
 from faintfield.pipelines.reconstruction.surface.files import SurfaceMaps, write_surface
 from faintfield.pipelines.reconstruction.surface.parallax import aperture_of
 from faintfield.pipelines.reconstruction.surface.request import SurfaceRequest
@@ -53,6 +55,13 @@ from faintfield.recon.surface.confidence import RIGHT_WITHIN, SURE, UNKNOWN_BELO
 # Bytes of a sample in the files: TIFFs of one number and of one per colour, a point, and the picture on the page; and
 # bytes of previews, film and page, which do not grow with the picture.
 _NUMBERS, _NUMBERS_PER_COLOUR, _POINT_BYTES, _FIXED_BYTES = 4, 2, 27, 30_000_000
+
+
+class _Light(NamedTuple):
+    """One colour of the picture, and which of its pixels count if some are saturated."""
+
+    solution: Solution
+    selected: PixelSelection | None
 
 
 def reconstruct_surface(
@@ -108,7 +117,9 @@ def reconstruct_surface(
         channels=[in_units(elemental_set, _channel(name, light)) for name, light in lights.items()],
         wall_time_s=time.monotonic() - started,
     )
-    maps = _maps(elemental_set, search, list(lights.values()), unit)
+    maps = _maps(elemental_set, search, [light.solution for light in lights.values()], unit)
+    if text := saturation_text(facts.channels):
+        inform(text)
     for page in pages:
         remove(page)
     record = write_surface(out, maps, facts, origin)
@@ -130,7 +141,7 @@ def _light(
     search: DepthSearch,
     options: SolverOptions,
     out: Path,
-) -> Solution:
+) -> _Light:
     """Return one colour of the picture on a surface of known depth, with `sigma` and `visibility` beside it.
 
     `sigma` is that of total variation's picture; it is computed when the images are gone.
@@ -147,8 +158,17 @@ def _light(
     else:
         (solution,) = with_prior(objective, [solution])
     visibility = _visibility(operator, layout)
+    selected = None
+    if images.valid is not None:
+        whole = factory.of_surface(search.estimate.inverse_depth, search.grid, masked=False)
+        selected = PixelSelection.of(operator, whole, images)
+        del whole
+    known_e2 = float(np.mean(images.known_variance_e2()))
     del images, factory, operator, objective
-    return replace(solution, sidecars=solution.sidecars | {"sigma": sigma(), "visibility": visibility})
+    arrays = {"plane": solution.plane, **solution.sidecars, "sigma": sigma(), "visibility": visibility}
+    if selected is not None:
+        arrays = selected.applied(arrays, known_e2)
+    return _Light(replace(solution, plane=arrays.pop("plane"), sidecars=arrays), selected)
 
 
 def _visibility(operator: SurfaceOperator, layout: ChannelLayout) -> NDArray[np.floating]:
@@ -162,8 +182,8 @@ def _visibility(operator: SurfaceOperator, layout: ChannelLayout) -> NDArray[np.
     return operator.adjoint_of_map(inverse) * operator.dtype.type(samples_per_px)
 
 
-def _channel(name: str, light: Solution) -> SurfaceChannel:
-    record = light.record
+def _channel(name: str, light: _Light) -> SurfaceChannel:
+    record, selected = light.solution.record, light.selected
     return SurfaceChannel(
         channel=name,
         penalty_weight=record.penalty_weight,
@@ -172,7 +192,9 @@ def _channel(name: str, light: Solution) -> SurfaceChannel:
         certificate=record.certificate,
         passes=record.passes,
         likelihood=record.likelihood or "",
-        mean_e=float(np.mean(light.plane, dtype=np.float64)),
+        mean_e=float(np.nanmean(light.solution.plane, dtype=np.float64)),
+        saturated_share=selected.saturated_share if selected else UNSET,
+        unknown_share=selected.unknown_share if selected else UNSET,
         prior=record.prior,
     )
 
