@@ -64,7 +64,7 @@ const viewer = (() => {
     const key = black + " " + white + Boolean(doubt?.levels);
     if (one.key === key) return one.canvas;
     const grey = new Uint8Array(UNKNOWN + 1), reach = Math.max(white - black, 1e-12);
-    const toned = data.toned && one.kind !== "sigma" && !scales[one.kind].colours ? encoded : share => share;
+    const toned = data.toned && ["light", "view", "bright"].includes(one.kind) ? encoded : share => share;
     for (let level = 0; level < UNKNOWN; level++) grey[level] = Math.round(255 * toned(between(0, (number(one, level) - black) / reach, 1)));
     one.canvas ??= make("canvas", { width: one.width, height: one.height });
     const context = one.canvas.getContext("2d"), image = context.createImageData(one.width, one.height);
@@ -102,7 +102,8 @@ const viewer = (() => {
       const deviation = sigmas[index] ?? NaN;
       return deviation > 0 ? minus(number(one, level).toFixed(decimals(deviation))) + " \u00b1 " + deviation.toFixed(decimals(deviation)) : told(number(one, level), one.step);
     });
-    const rounded = one.whole && one.step <= 1 ? 0 : one.step / 2;
+    const halves = levels.filter(level => level !== UNKNOWN).map(level => (number(one, level + 1) - number(one, level - 1)) / 4);
+    const rounded = one.whole && one.step <= 1 && !one.toned ? 0 : Math.max(0, ...halves);
     if (sigmas.some(deviation => deviation > 0)) off.push("\u00b1 is \u03c3");
     if (known && rounded > 0 && !sigmas.some(deviation => rounded < 0.1 * deviation)) off.push("rounded by up to " + minus(Number(rounded.toPrecision(1))));
     const doubt = one.confidence === undefined ? null : pictures[one.confidence];
