@@ -109,8 +109,8 @@ def _key_line(answers: Iterable[str], gap: str) -> str:
 
 def _describe_status(status: Status) -> str:
     node = "" if status.node is None else f" node {status.node[0]},{status.node[1]}"
-    line = f"{status.done} of {status.total} frames, {format_duration(status.to_go_s)} to go;{node}: {status.doing}"
-    return visible(line)
+    to_go = f", {format_duration(status.to_go_s)} to go" if status.done < status.total else ""
+    return visible(f"{status.done} of {status.total} frames{to_go};{node}: {status.doing}")
 
 
 def _describe_frame(shown: ShownFrame) -> str:

@@ -21,7 +21,7 @@ _SHOWN = (
     ("read_noise_e", "sigma_d, read noise", "e⁻"),
     ("dark_current_e_per_s", "mu_I, dark current", "e⁻/s"),
     ("dsnu_e", "DSNU (pixel)", "e⁻"),
-    ("prnu", "PRNU (pixel)", ""),
+    ("prnu", "PRNU", ""),
     ("quantum_efficiency", "eta, quantum efficiency", "e⁻/photon"),
 )
 
