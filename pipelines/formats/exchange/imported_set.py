@@ -27,7 +27,7 @@ from faintfield.pipelines.formats.exchange.imported_light import (
     without_curve,
 )
 from faintfield.pipelines.formats.exchange.options import GridOptions, ImportOptions
-from faintfield.pipelines.formats.files import check_free, sha256, write_json, writing_folder
+from faintfield.pipelines.formats.files import check_free, require_room, sha256, write_json, writing_folder
 from faintfield.pipelines.formats.frames import RAW_SUFFIXES, Frame, exif_exposure_s, picture_kind, read_frame
 from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.formats.provenance import Provenance, provenance
@@ -219,6 +219,8 @@ def write_imported_set(
         )
     tone = tone_of(path, first, options)
     inputs = [*models, *(sources or [image.path for image in images])]
+    bytes_of_copies = len(images) * first.pixels_dn.size * np.dtype(np.uint16).itemsize
+    require_room(out, bytes_of_copies, written_bytes=bytes_of_copies)
     with writing_folder(out, replace_if=FILE_NAME, overwrite=options.overwrite, reads=inputs) as folder:
         views = [
             _view(_copy(image.path, folder, first, tone), image, images[reference])
