@@ -101,6 +101,7 @@ def import_posed(
     for image, original in zip(images, posed, strict=True):
         _check_image(image, original)
     index = _reference(images, options.reference)
+    require_room_for_copies(out, read_picture(images[0].path), len(images))
     write_imported_set(
         out,
         options,
@@ -178,6 +179,12 @@ def check_set_free(out: Path, options: ImportOptions | GridOptions, *sources: Pa
     check_free(out, replace_if=FILE_NAME, overwrite=options.overwrite, reads=sources)
 
 
+def require_room_for_copies(out: Path, first: Frame, count: int) -> None:
+    """Refuse an import whose pictures, all as large as the first one, do not fit on the disk; see `require_room`."""
+    size_bytes = count * first.pixels_dn.size * np.dtype(np.uint16).itemsize
+    require_room(out, size_bytes, written_bytes=size_bytes)
+
+
 def write_imported_set(
     out: Path,
     options: ImportOptions | GridOptions,
@@ -219,8 +226,6 @@ def write_imported_set(
         )
     tone = tone_of(path, first, options)
     inputs = [*models, *(sources or [image.path for image in images])]
-    bytes_of_copies = len(images) * first.pixels_dn.size * np.dtype(np.uint16).itemsize
-    require_room(out, bytes_of_copies, written_bytes=bytes_of_copies)
     with writing_folder(out, replace_if=FILE_NAME, overwrite=options.overwrite, reads=inputs) as folder:
         views = [
             _view(_copy(image.path, folder, first, tone), image, images[reference])
