@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from cyclopts import Parameter
+from cyclopts import Group, Parameter
 
 from faintfield.recon.names import LikelihoodName, PenaltyName
 
@@ -31,6 +31,14 @@ type NotNegative = Annotated[float, _within(0)]
 type NotNegativeOrAuto = Annotated[float | Literal["auto"], _within(0)]
 type Fraction = Annotated[float, _within(1e-9, 1)]
 type SizePx = Annotated[tuple[int, int], _within(2)]
+
+# Groups of options in help, the first first.
+IN_INPUT = Parameter(group=Group("Input", sort_key=1))
+IN_DEPTHS = Parameter(group=Group("Depths of planes", sort_key=2))
+IN_SURFACE = Parameter(group=Group("Surface", sort_key=3))
+IN_PICTURE = Parameter(group=Group("Method, and what is expected of a picture", sort_key=4))
+IN_OUTPUT = Parameter(group=Group("Output", sort_key=5))
+IN_MACHINE = Parameter(group=Group("Machine", sort_key=6))
 
 type Method = Literal["pmlem", "backprojection", "mlem", "pmlem-osl", "joint", "occlusion"]
 type PriorName = Literal["tv", "patches", "learned", "auto"]
@@ -95,13 +103,13 @@ class SolverOptions:
         Largest number of passes over the data.
     """
 
-    penalty_weight: NotNegativeOrAuto = "auto"
-    penalty: PenaltyName = "tv"
-    likelihood: LikelihoodName | Literal["auto"] = "auto"
-    uncertainty: bool = False
-    prior: PriorName | None = None
-    proposal: bool = False
-    passes: Count | None = None
+    penalty_weight: Annotated[NotNegativeOrAuto, IN_PICTURE] = "auto"
+    penalty: Annotated[PenaltyName, IN_PICTURE] = "tv"
+    likelihood: Annotated[LikelihoodName | Literal["auto"], IN_PICTURE] = "auto"
+    uncertainty: Annotated[bool, IN_OUTPUT] = False
+    prior: Annotated[PriorName | None, IN_PICTURE] = None
+    proposal: Annotated[bool, IN_OUTPUT] = False
+    passes: Annotated[Count | None, IN_PICTURE] = None
 
     @property
     def has_prior(self) -> bool:

@@ -5,7 +5,17 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from faintfield.pipelines.arguments import Count, FigureNumber, LensName, Positive, SceneKind, Seed, SizePx
+from faintfield.pipelines.arguments import (
+    IN_INPUT,
+    IN_OUTPUT,
+    Count,
+    FigureNumber,
+    LensName,
+    Positive,
+    SceneKind,
+    Seed,
+    SizePx,
+)
 from faintfield.pipelines.console import inform, working
 from faintfield.pipelines.reconstruction.options import DEFAULTS, Options
 
@@ -20,12 +30,12 @@ type Figures = FiguresMade
 
 
 def run(
-    session: Path,
+    session: Annotated[Path, IN_INPUT],
     /,
     *,
     options: Options = DEFAULTS,
-    lens: LensName = "opencv5",
-    limit_px: Positive = 0.5,
+    lens: Annotated[LensName, IN_INPUT] = "opencv5",
+    limit_px: Annotated[Positive, IN_INPUT] = 0.5,
 ) -> Run:
     """Do everything after the capture: noise, geometry, reconstruction, report; skip what is up to date.
 
@@ -50,13 +60,13 @@ def run(
 
 
 def reconstruct(
-    set_path: Annotated[Path, Parameter(name="SESSION|SET")],
+    set_path: Annotated[Path, Parameter(name="SESSION|SET"), IN_INPUT],
     /,
     *,
-    out: Path | None = None,
+    out: Annotated[Path | None, IN_OUTPUT] = None,
     options: Options = DEFAULTS,
-    geometry: Path | None = None,
-    scene: SceneKind = "dark_scene",
+    geometry: Annotated[Path | None, IN_INPUT] = None,
+    scene: Annotated[SceneKind, IN_INPUT] = "dark_scene",
 ) -> Reconstruction:
     """Reconstruct planes of the scene at chosen depths, or one picture that is sharp everywhere, with its depth.
 

@@ -14,6 +14,7 @@ from typing import Any, BinaryIO
 
 import msgspec
 
+from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue, CannotWrite, DiskFull, MissingFile, OutputBusy, OutputExists
 from faintfield.pipelines.formats.provenance import with_digest
 from faintfield.pipelines.formats.reading import MAX_TEXT_BYTES, is_folder, naming_unreadable
@@ -30,6 +31,9 @@ _NO_LOCKS = {errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS, errno.EBADF, errno.EINVA
 UNFINISHED = ".unfinished"
 
 CACHE_FILE = ".hashes.json"
+
+# Bytes of results that a user wants to know of beforehand.
+_MUCH_BYTES = 200_000_000
 
 # Folders of results lie at most this far below the folder that is shown.
 _MAX_LEVELS_BELOW = 3
@@ -223,13 +227,18 @@ def remove_leftovers(folder: Path) -> None:
             path.unlink(missing_ok=True)
 
 
-def require_room(path: Path, needed_bytes: int) -> None:
-    """Refuse to begin work whose results would not fit on the disk of `path` (DiskFull)."""
+def require_room(path: Path, needed_bytes: int, *, written_bytes: int = 0) -> None:
+    """Refuse to begin work whose results would not fit on the disk of `path` (DiskFull).
+
+    If much of it will be written to stay, `written_bytes`, say how much.
+    """
     free = _free_bytes(path)
     if free < needed_bytes:
         raise DiskFull(
             f"{path}: {needed_bytes / 1e6:.1f} MB are needed, {free / 1e6:.1f} MB are free; make room or use another"
         )
+    if written_bytes >= _MUCH_BYTES:
+        inform(f"{path}: about {written_bytes / 1e9:.1f} GB will be written")
 
 
 def sha256(path: Path) -> str:

@@ -8,7 +8,17 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from faintfield.pipelines.arguments import Count, Method, Positive, SolverOptions
+from faintfield.pipelines.arguments import (
+    IN_DEPTHS,
+    IN_MACHINE,
+    IN_OUTPUT,
+    IN_PICTURE,
+    IN_SURFACE,
+    Count,
+    Method,
+    Positive,
+    SolverOptions,
+)
 from faintfield.pipelines.errors import WrongUsage
 
 # Options that say where planes are, and all that a surface does not know.
@@ -74,24 +84,24 @@ class Options:
         extra faintfield[cluster].
     """
 
-    depth: Annotated[list[float | Literal["auto"]] | None, Parameter(allow_leading_hyphen=True)] = None
-    sweep: Annotated[str | None, Parameter(allow_leading_hyphen=True)] = None
-    depth_mm: list[float | Literal["auto"]] | None = None
-    sweep_mm: str | None = None
-    disparity_px: list[float] | None = None
-    sweep_px: Annotated[str | None, Parameter(allow_leading_hyphen=True)] = None
-    plane_pose: list[Path] | None = None
-    depth_map: bool = False
-    surface: bool = False
-    depth_range_mm: str | None = None
-    disparity_range_px: Annotated[str | None, Parameter(allow_leading_hyphen=True)] = None
-    method: list[Method] | None = None
-    joint: bool = False
-    occlusion: bool = False
+    depth: Annotated[list[float | Literal["auto"]] | None, Parameter(allow_leading_hyphen=True), IN_DEPTHS] = None
+    sweep: Annotated[str | None, Parameter(allow_leading_hyphen=True), IN_DEPTHS] = None
+    depth_mm: Annotated[list[float | Literal["auto"]] | None, IN_DEPTHS] = None
+    sweep_mm: Annotated[str | None, IN_DEPTHS] = None
+    disparity_px: Annotated[list[float] | None, IN_DEPTHS] = None
+    sweep_px: Annotated[str | None, Parameter(allow_leading_hyphen=True), IN_DEPTHS] = None
+    plane_pose: Annotated[list[Path] | None, IN_DEPTHS] = None
+    depth_map: Annotated[bool, IN_DEPTHS] = False
+    surface: Annotated[bool, IN_SURFACE] = False
+    depth_range_mm: Annotated[str | None, IN_SURFACE] = None
+    disparity_range_px: Annotated[str | None, Parameter(allow_leading_hyphen=True), IN_SURFACE] = None
+    method: Annotated[list[Method] | None, IN_PICTURE] = None
+    joint: Annotated[bool, IN_PICTURE] = False
+    occlusion: Annotated[bool, IN_PICTURE] = False
     solver: SolverOptions = field(default_factory=SolverOptions)
-    pitch_mm: Positive | None = None
-    workers: Count | None = None
-    scheduler: str | None = None
+    pitch_mm: Annotated[Positive | None, IN_OUTPUT] = None
+    workers: Annotated[Count | None, IN_MACHINE] = None
+    scheduler: Annotated[str | None, IN_MACHINE] = None
 
     def given(self, names: Sequence[str]) -> list[str]:
         """Return those of some options that are given, as a user writes them."""

@@ -72,6 +72,10 @@ def reconstruct_set(elemental_set: ElementalSet, out: Path, request: Request, ru
     folders = {name: folder_of_method(out, name, request.methods) for name in request.methods}
     _check(elemental_set, folders.values(), request)
     sweep = _sweep(elemental_set, folders, request)
+    sweep.keep_finished()
+    needed_bytes = sweep.needed_bytes()
+    # Decoded frames take the rest
+    require_room(out, int(needed_bytes / (1 - SHARE_OF_DISK)), written_bytes=needed_bytes)
     overview, pictures = inspect_set(elemental_set)  # what is wrong with a set is to be found before planes are made
     read_truth(elemental_set.folder)
     depth_map = kept_depth_map(folders, sweep.origins) if request.with_depth_map else None
@@ -140,7 +144,6 @@ def _range_mm(request: Request) -> tuple[float, float]:
 
 def _make_planes(sweep: Sweep, folders: dict[Method, Path], out: Path, runner: Runner) -> None:
     """Write the planes that are missing, having removed the records that vouch for earlier ones."""
-    require_room(out, int(sweep.needed_bytes() / (1 - SHARE_OF_DISK)))  # decoded frames take the rest
     for folder in {out, *folders.values()}:
         remove_leftovers(folder)
     for folder in folders.values():

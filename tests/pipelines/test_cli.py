@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shlex
 import tomllib
 from pathlib import Path
@@ -132,3 +133,10 @@ def test_completion_knows_commands_and_options(tmp_path: Path, capsys: pytest.Ca
     written = script.read_text()
     assert all(word in written for word in ("reconstruct", "--depth-mm", "colmap", "goto"))
     assert str(script) in (tmp_path / ".bashrc").read_text()
+
+
+@pytest.mark.parametrize("command", ["reconstruct", "run"])
+def test_help_groups_options_by_purpose(command: str, done: Command) -> None:
+    panels = re.findall(r"^╭─ (.*?) ─+╮$", done(command, "--help").stdout, re.MULTILINE)
+    depths, picture = "Depths of planes", "Method, and what is expected of a picture"
+    assert panels == ["Input", depths, "Surface", picture, "Output", "Machine", "Every command"]

@@ -27,7 +27,7 @@ from faintfield.pipelines.formats.exchange.imported_light import (
     without_curve,
 )
 from faintfield.pipelines.formats.exchange.options import GridOptions, ImportOptions
-from faintfield.pipelines.formats.files import check_free, sha256, write_json, writing_folder
+from faintfield.pipelines.formats.files import check_free, require_room, sha256, write_json, writing_folder
 from faintfield.pipelines.formats.frames import RAW_SUFFIXES, Frame, exif_exposure_s, picture_kind, read_frame
 from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.formats.provenance import Provenance, provenance
@@ -101,6 +101,7 @@ def import_posed(
     for image, original in zip(images, posed, strict=True):
         _check_image(image, original)
     index = _reference(images, options.reference)
+    require_room_for_copies(out, read_picture(images[0].path), len(images))
     write_imported_set(
         out,
         options,
@@ -176,6 +177,12 @@ def _nodes(images: Sequence[PosedImage]) -> Sequence[tuple[int, int] | None]:
 def check_set_free(out: Path, options: ImportOptions | GridOptions, *sources: Path) -> None:
     """Refuse a folder that an imported set cannot be written to, before anything is read; see `check_free`."""
     check_free(out, replace_if=FILE_NAME, overwrite=options.overwrite, reads=sources)
+
+
+def require_room_for_copies(out: Path, first: Frame, count: int) -> None:
+    """Refuse an import whose pictures, all as large as the first one, do not fit on the disk; see `require_room`."""
+    size_bytes = count * first.pixels_dn.size * np.dtype(np.uint16).itemsize
+    require_room(out, size_bytes, written_bytes=size_bytes)
 
 
 def write_imported_set(

@@ -24,7 +24,12 @@ from faintfield.pipelines.errors import BadValue, WrongBitDepth
 from faintfield.pipelines.formats.exchange.arranged_grid import arrange_grid
 from faintfield.pipelines.formats.exchange.hci import described_grid, write_true_depth
 from faintfield.pipelines.formats.exchange.image_grid import ImageGrid, find_grid
-from faintfield.pipelines.formats.exchange.imported_set import check_set_free, read_picture, write_imported_set
+from faintfield.pipelines.formats.exchange.imported_set import (
+    check_set_free,
+    read_picture,
+    require_room_for_copies,
+    write_imported_set,
+)
 from faintfield.pipelines.formats.exchange.options import GridOptions
 from faintfield.pipelines.formats.files import require_room
 from faintfield.pipelines.formats.frames import IMAGE_SUFFIXES, RAW_SUFFIXES, pages_in, picture_kind, read_frame
@@ -71,6 +76,7 @@ def import_pictures(src: Path, out: Path, options: GridOptions) -> ImportedGrid:
         for remark in views.remarks:
             inform(remark)
         first = read_picture(next(iter(views.paths.values())))
+        require_room_for_copies(out, first, len(views.paths))
         height, width = first.pixels_dn.shape[:2]
         white = float(first.saturation_dn or np.iinfo(first.pixels_dn.dtype).max)
         grid, arrangement = arrange_grid(

@@ -205,20 +205,29 @@ class Sweep:
     finished: dict[tuple[Method, Place], PlaneFileRecord] = field(default_factory=dict)
 
     def needed_bytes(self) -> int:
-        """Return about how much disk the results take: planes, previews, and the report that shows them again."""
-        samples = sum(grid.shape[0] * grid.shape[1] for grid in self.plan.grids.values()) * len(self.plan.layouts)
-        beside = self.plan.solver.uncertainty + 2 * self.plan.solver.proposal
-        files = len(self.origins) * (1 + beside) + ("occlusion" in self.origins)
-        return samples * files * (np.dtype(np.float32).itemsize + 3)
+        """Return about how much is to be written: missing planes, and the stack, previews and report of all."""
+        plan, float_bytes, shown_bytes = self.plan, np.dtype(np.float32).itemsize, 3
+        total = 0
+        for files in plan.files:
+            rows, columns = plan.grids[files.place].shape
+            arrays = 1 + plan.solver.uncertainty + 2 * plan.solver.proposal + (files.method == "occlusion")
+            is_missing = (files.method, files.place) not in self.finished
+            per_sample = arrays * (is_missing * float_bytes + shown_bytes) + plan.with_focus * float_bytes
+            total += rows * columns * len(plan.layouts) * per_sample
+        return total
 
-    def run(self, runner: Runner, out: Path) -> None:
-        """Run the missing tasks, and write each plane at once (FileFailed: a colour cannot be read back)."""
+    def keep_finished(self) -> None:
+        """Find the planes that are there, made from the same inputs."""
         planned = self.plan.files
         for files in planned:
             if record := files.finished():
                 self.finished[files.method, files.place] = record
         if self.finished:
             inform(f"{len(self.finished)} of {len(planned)} planes are there, made from the same inputs; they are kept")
+
+    def run(self, runner: Runner, out: Path) -> None:
+        """Run the missing tasks, and write each plane at once (FileFailed: a colour cannot be read back)."""
+        planned = self.plan.files
         tasks = self._tasks()
         self._write_complete(planned)
         with closing(runner(self.elemental_set, out, tasks)) as done:

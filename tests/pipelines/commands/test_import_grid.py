@@ -84,6 +84,15 @@ def test_missing_pictures_are_named_and_done_without(names: list[str], tmp_path:
     assert [int(read_frame(path).pixels_dn[0, 0]) for path in elemental_set.image_paths] == [0, 1, 2, 3, 5]
 
 
+def test_full_disk_is_found_before_pictures_are_compared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, faintfield: Command
+) -> None:
+    monkeypatch.setattr("faintfield.pipelines.formats.exchange.picture_grid.arrange_grid", pytest.fail)
+    monkeypatch.setattr("faintfield.pipelines.formats.files._free_bytes", lambda _: 6 * 96 - 1)
+    src = _pictures(tmp_path / "src", _grid_names(range(2), range(3)))
+    assert_refused(faintfield("import", "grid", src, tmp_path / "out"), "DiskFull", "MB are needed")
+
+
 def test_unlike_pictures_are_refused(tmp_path: Path, faintfield: Command) -> None:
     src = _pictures(tmp_path / "src", _grid_names([0], [0, 1]))
     for second, failure, words in (

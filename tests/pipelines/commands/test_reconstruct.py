@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -250,3 +251,15 @@ def test_folders_that_are_no_sets_are_named(words: str, tmp_path: Path, faintfie
     ):
         ended = faintfield(*words.format(folder, out=tmp_path / "out").split(), *options)
         assert_refused(ended, "MissingFile", message)
+
+
+def test_room_for_all_of_a_sweep_is_needed(
+    sweep: Path, simulated_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, faintfield: Command
+) -> None:
+    out = Path(shutil.copytree(sweep, tmp_path / "out"))
+    planes, stack = ([path.stat().st_size for path in sweep.glob(name)] for name in ("plane_*.tiff", "stack.tiff"))
+    words = ("reconstruct", simulated_scene, "--sweep-mm", "500:700:5", "--method", "backprojection", "--out")
+    # A quarter is for decoded frames
+    monkeypatch.setattr("faintfield.pipelines.formats.files._free_bytes", lambda _: 1.25 * sum(planes + stack))
+    assert_refused(faintfield(*words, tmp_path / "new"), "DiskFull", "MB are needed")
+    assert faintfield(*words, out).returncode == 0  # the planes are there

@@ -165,8 +165,11 @@ def test_unreadable_cache_of_hashes_is_ignored(content: bytes | None, tmp_path: 
     assert Hashes(tmp_path).of("file") == sha256(tmp_path / "file")
 
 
-def test_room_is_asked_for_before_work(tmp_path: Path) -> None:
-    require_room(tmp_path / "not" / "yet" / "there", 1)
+def test_room_is_asked_for_before_work(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    require_room(tmp_path / "not" / "yet" / "there", 1, written_bytes=1)
+    assert capfd.readouterr().err == ""
+    require_room(tmp_path, 1, written_bytes=1_400_000_000)
+    assert capfd.readouterr().err.endswith(": about 1.4 GB will be written\n")
     with pytest.raises(DiskFull, match=r"there: 1000000000000\.0 MB are needed, .* MB are free; make room"):
         require_room(tmp_path / "not" / "yet" / "there", 10**18)
 
