@@ -82,10 +82,16 @@ def test_bend_seen_by_noise_alone_leaves_the_gain_true() -> None:
         shape = flat.within_dn2.shape
         noise = (0.5 * (1 - 0.04 * x)) ** 2 * (charge_e + chip.sensor.read_noise_e**2) + 1 / 12
         kept = (shape[0] * shape[1] - sum(shape) + 1) / (shape[0] * shape[1])
-        exact = {"levels_dn": np.full(1000, chip.offset_dn.mean() + 0.5 * charge_e * (1 - 0.02 * x))}
-        exact |= {"within_dn2": np.full(shape, 999 * noise * kept, np.float32), "row_dn": np.zeros(shape[0])}
-        exact |= {"column_dn": np.zeros(shape[1]), "pattern_dn": np.zeros(shape, np.float32)}
-        flats.append(replace(flat, names=("frame",) * 1000, **exact))
+        exact = replace(
+            flat,
+            names=("frame",) * 1000,
+            levels_dn=np.full(1000, chip.offset_dn.mean() + 0.5 * charge_e * (1 - 0.02 * x)),
+            row_dn=np.zeros(shape[0]),
+            column_dn=np.zeros(shape[1]),
+            pattern_dn=np.zeros(shape, np.float32),
+            within_dn2=np.full(shape, 999 * noise * kept, np.float32),
+        )
+        flats.append(exact)
     fitted = fit_series(darks, flats, np.ones(shape, bool), 8000.0)
     assert fitted.moments.light.groups.size == 0
     error, se = np.exp(fitted.fit.values["log_gain"]) / 0.5 - 1, fitted.fit.standard_error("log_gain")

@@ -8,7 +8,7 @@ from faintfield.calib.noise import Estimate, Series, calibrate
 from faintfield.pipelines.calibration.noise_emva import measure_emva
 from tests.calib.noise.darkroom import dark_series, flat_series, specimen
 
-PRNU, SHAPE, SESSIONS = 0.005, (64, 64), 30
+PRNU, SHAPE, SESSIONS = 0.005, (64, 64), 20
 
 
 def session(seed: int) -> list[Series]:
@@ -29,12 +29,13 @@ def normalised(prnu: Estimate) -> float:
 
 
 def test_vignetting_hides_no_prnu_and_raises_no_alarm() -> None:
-    errors = []
+    errors, warnings = [], list[str]()
     for seed in range(SESSIONS):
         series = session(seed)
         result = calibrate(series)
-        assert result.warnings == (), seed
+        warnings += result.warnings
         report = measure_emva("", series, result, {}).estimates
         errors.append([normalised(result.estimates["prnu"]), normalised(report["prnu_pixel"])])
     assert np.all(np.abs(np.mean(errors, axis=0)) < 3 / np.sqrt(SESSIONS)), np.mean(errors, axis=0)
     assert np.all(np.std(errors, axis=0) < 1.4)
+    assert not warnings
