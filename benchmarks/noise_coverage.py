@@ -232,7 +232,7 @@ RESULTS = {
     "PRNU's pixel part's interval off": 0.05,
     "no gain": 1e-4,
     "a map of the gain": 2e-3,
-    "hot pixels": 2e-3,
+    "hot pixels": 1e-3,
     "noisy pixels": 1e-2,
     "dead pixels": 1e-6,
 }

@@ -235,8 +235,10 @@ def _shared_noise(fitted: SeriesFit) -> dict[str, Estimate]:
     noise, freedom = np.array(fitted.dark_noise_dn2), fitted.moments.darks.frames - 1
 
     def shared(variances: Sequence[float], along: int, across: int) -> Estimate:
-        excess = float(np.average(np.array(variances) - noise / along, weights=freedom))
-        se = float(np.average(variances, weights=freedom) * np.sqrt(2 / (freedom.sum() * across)))
+        # The level of a frame is subtracted from its lines, and takes one degree of freedom of them
+        variance = np.array(variances) * across / (across - 1)
+        excess = float(np.average(variance - noise / along, weights=freedom))
+        se = float(np.average(variance, weights=freedom) * np.sqrt(2 / (freedom.sum() * (across - 1))))
         return root(excess, se)
 
     # A jitter fitted as zero has no standard error: use the scatter of the levels that is expected without jitter.

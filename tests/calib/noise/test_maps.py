@@ -15,6 +15,7 @@ from faintfield.calib.noise.maps.photo_response import (
     Response,
     SignalNoise,
     _kept_share,
+    kept_freedom,
     measure_response,
     running_mean,
 )
@@ -280,6 +281,26 @@ def test_prnu_lost_in_the_running_mean_is_restored() -> None:
     z = np.array([(response.spread2 - 0.01**2) / response.spread2_se for response in responses])
     assert abs(z.mean()) < 3 / np.sqrt(z.size)
     assert 0.7 < z.std() < 1.3
+
+
+def test_sensor_without_prnu_is_shown_as_such() -> None:
+    """Its interval holds zero as often as it says, and no more than one in a thousand is hidden."""
+    found = [responding(np.ones((32, 40)), 900.0, seed).prnu_estimate() for seed in range(200)]
+    assert sum(prnu.value is None for prnu in found) <= 1
+    assert np.mean([(prnu.ci95 or (0.0, 0.0))[0] == 0 for prnu in found]) > 0.94
+
+
+def test_freedom_that_smoothing_keeps_is_that_of_a_matrix() -> None:
+    shape, usable = (17, 19), np.ones((17, 19), bool)
+    bases = [np.linalg.qr(np.vander(np.linspace(-1, 1, size), 5, increasing=True))[0] for size in shape]
+    surface = [np.outer(bases[0][:, i], bases[1][:, k]) for i in range(5) for k in range(5 - i)]
+    units = np.eye(usable.size).reshape(-1, *shape)
+    units = units - sum(np.multiply.outer(basis.ravel(), basis) for basis in surface)
+    rest = np.array([unit - running_mean(unit, usable, 15) for unit in units])
+    kept = kept_freedom(usable)
+    assert kept.total == pytest.approx(np.square(rest).sum(), rel=1e-9)
+    assert kept.rows == pytest.approx(np.square(rest.mean(2) * np.sqrt(19)).sum(), rel=0.1)
+    assert kept.columns == pytest.approx(np.square(rest.mean(1) * np.sqrt(17)).sum(), rel=0.1)
 
 
 def test_kept_share_is_that_of_a_matrix() -> None:

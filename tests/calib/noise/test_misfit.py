@@ -13,6 +13,7 @@ from faintfield.calib.noise.likelihood.gaussian_fit import NoiseFit
 from faintfield.calib.noise.likelihood.moments import gather_moments
 from faintfield.calib.noise.likelihood.response import Light
 from faintfield.calib.noise.scatter import trend, without_odd
+from faintfield.calib.noise.sensor_fit import fit_series
 from faintfield.calib.noise.temperature import Warmth, settle_temperature, with_doubling_error
 from tests.calib.noise.darkroom import Chip, dark_series, expose, flat_series, specimen, with_flats
 
@@ -70,6 +71,31 @@ def test_unknown_light_leaves_room_for_a_bend() -> None:
     of_chance = 3.92 * 0.5 * np.sqrt(2 / (3 * (1600 - 79)))
     assert width([*unknown[:4], unknown[12]]) > 1.15 * of_chance
     assert result.response is None
+
+
+def test_bend_seen_by_noise_alone_leaves_the_gain_true() -> None:
+    """The noise of the flats is the expected one, to the digit, of a signal K Q (1 − 2 % Q/Q_end)."""
+    chip, rng = specimen(7, **CHIP | {"read_noise_e": 3.0})
+    darks, flats = dark_series(chip, (0.1, 5.0, 10.0, 20.0), 8, rng), []
+    for level, x in enumerate(np.linspace(0.03, 0.95, 16)):
+        flat, charge_e = flat_series(chip, 1000.0, 2, rng, level=level, stated=False), 16_000 * x
+        shape = flat.within_dn2.shape
+        noise = (0.5 * (1 - 0.04 * x)) ** 2 * (charge_e + chip.sensor.read_noise_e**2) + 1 / 12
+        kept = (shape[0] * shape[1] - sum(shape) + 1) / (shape[0] * shape[1])
+        exact = replace(
+            flat,
+            names=("frame",) * 1000,
+            levels_dn=np.full(1000, chip.offset_dn.mean() + 0.5 * charge_e * (1 - 0.02 * x)),
+            row_dn=np.zeros(shape[0]),
+            column_dn=np.zeros(shape[1]),
+            pattern_dn=np.zeros(shape, np.float32),
+            within_dn2=np.full(shape, 999 * noise * kept, np.float32),
+        )
+        flats.append(exact)
+    fitted = fit_series(darks, flats, np.ones(shape, bool), 8000.0)
+    assert fitted.moments.light.groups.size == 0
+    error, se = np.exp(fitted.fit.values["log_gain"]) / 0.5 - 1, fitted.fit.standard_error("log_gain")
+    assert abs(error) < min(3e-4, 0.3 * se)
 
 
 def test_flickering_lamp_leaves_the_noise_alone() -> None:
