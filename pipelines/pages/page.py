@@ -26,12 +26,12 @@ _SYMBOL = re.compile(
     r"\b(?:(?P<base>[A-Zμση]+)_(?P<low>[A-Za-z]+(?:\.[a-z]+)*)(?P<square>²?)|(?P<whole>DSNU|PRNU)\.(?P<part>[a-z]+))"
 )
 
+# Quality above 100, which OpenCV takes for WebP without losses.
+LOSSLESS = 101
+
 # The font of a drawing's text, and a picture within it.
 _FONT = re.compile(r"font-family: [^;\"]+; ")
 _EMBEDDED = re.compile(r"data:image/png;base64,([A-Za-z0-9+/=\s]+)")
-
-# Quality above 100, which OpenCV takes for WebP without losses.
-LOSSLESS = 101
 
 
 class Row(NamedTuple):
