@@ -51,7 +51,7 @@ def map_drawings(calibration: NoiseCalibration, side_px: int) -> Iterator[Drawin
     maps, usable = calibration.maps, ~calibration.maps.unusable
     relative, vignetting, pattern = maps.relative_response, maps.vignetting, None
     if relative is not None and vignetting is not None:
-        pattern = map_of(lambda rows: relative[rows] / vignetting[rows], relative.shape)
+        pattern = map_of(lambda rows: relative[rows] / np.maximum(vignetting[rows], 1e-3), relative.shape)
     current, current_variance = maps.dark_current_e_per_s, maps.dark_current_variance_e2_per_s2
     no_current, no_flats = calibration.estimates["dark_current_e_per_s"].why, "there are no flats"
     no_read, no_gain = (maps.absent.get(name) for name in ("read_noise_e", "gain_dn_per_e"))
