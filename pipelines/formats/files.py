@@ -343,6 +343,12 @@ def files_in(folder: Path) -> list[Path]:
     return sorted(Path(entry) for entry in _list_folder(folder) if not _is_folder(entry))
 
 
+def files_named(folder: Path, patterns: Iterable[str]) -> list[Path]:
+    """Return the files in a folder by patterns of their names, in order; MissingFile if it cannot be listed."""
+    names = sorted(entry.name for entry in _list_folder(folder))
+    return [folder / name for pattern in patterns for name in names if fnmatchcase(name, pattern)]
+
+
 def _list_folder(folder: Path) -> list[os.DirEntry[str]]:
     with naming_unreadable(folder, "make it readable, or move it away"), os.scandir(folder) as entries:
         return list(entries)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.estimate import Estimate, StageFigure, StageReport
-from faintfield.pipelines.formats.files import folders_in, sha256
+from faintfield.pipelines.formats.files import files_named, folders_in, sha256
 from faintfield.pipelines.formats.provenance import Provenance
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_PAGE, GeometryRecord, LensRecord, read_geometry
 from faintfield.pipelines.formats.results.noise import NOISE_PAGES, NoiseRecord, read_noise
@@ -230,7 +230,7 @@ def noise_section(directory: Path, path: Path, inputs: Set[str]) -> NoiseSection
     record = read_noise(path)
     return Section(
         **_origin(directory, path, inputs),
-        pages=[_link(directory, page) for name in NOISE_PAGES for page in sorted(path.parent.glob(name))],
+        pages=[_link(directory, page) for page in files_named(path.parent, NOISE_PAGES)],
         made=record.provenance,
         record=record,
         rows=[

@@ -26,6 +26,9 @@ _SYMBOL = re.compile(
     r"\b(?:(?P<base>[A-Zμση]+)_(?P<low>[A-Za-z]+(?:\.[a-z]+)*)(?P<square>²?)|(?P<whole>DSNU|PRNU)\.(?P<part>[a-z]+))"
 )
 
+# Quality above 100, which OpenCV takes for WebP without losses.
+LOSSLESS = 101
+
 # The font of a drawing's text, and a picture within it.
 _FONT = re.compile(r"font-family: [^;\"]+; ")
 _EMBEDDED = re.compile(r"data:image/png;base64,([A-Za-z0-9+/=\s]+)")
@@ -34,9 +37,6 @@ _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 # SNR beyond which the noise of a dark frame does not matter: it is less than a thirtieth of the light.
 MAX_SNR = 1000
-
-# Quality above 100, which OpenCV takes for WebP without losses.
-LOSSLESS = 101
 
 
 class Row(NamedTuple):

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from faintfield.calib.noise import NoiseCalibration
-from faintfield.calib.noise.strips import Map, Mask, map_of, mean_over, release, thinned
+from faintfield.calib.noise.strips import Map, Mask, map_of, mean_over, release
 from faintfield.pipelines.pages.noise_plots import Drawing
 from faintfield.pipelines.pages.page import INK, blank_drawing, colour_bar, ink, svg
 
@@ -51,7 +51,7 @@ def map_drawings(calibration: NoiseCalibration, side_px: int) -> Iterator[Drawin
     maps, usable = calibration.maps, ~calibration.maps.unusable
     relative, vignetting, pattern = maps.relative_response, maps.vignetting, None
     if relative is not None and vignetting is not None:
-        pattern = map_of(lambda rows: relative[rows] / vignetting[rows], relative.shape)
+        pattern = map_of(lambda rows: relative[rows] / np.maximum(vignetting[rows], 1e-3), relative.shape)
     current, current_variance = maps.dark_current_e_per_s, maps.dark_current_variance_e2_per_s2
     no_current, no_flats = calibration.estimates["dark_current_e_per_s"].why, "there are no flats"
     no_read, no_gain = (maps.absent.get(name) for name in ("read_noise_e", "gain_dn_per_e"))
@@ -80,22 +80,25 @@ def colour_scale(low: float, high: float, error: float) -> tuple[float, float, i
 
 
 def _drawn(pixel_map: _PixelMap, usable: Mask, side_px: int) -> Drawing:
-    """Return a map; one step of its colours is no smaller than the error of a pixel."""
+    """Return a map; one step of its colours is no smaller than the error of what it shows."""
     title, unit, values, *_ = pixel_map
     if values is None or not usable.any():
         return Drawing(title, missing=pixel_map.why or "no pixel is usable")
-    shown = pixel_map.factor * (_shrunk(values, usable, side_px) - pixel_map.less)
+    step = _step(values.shape, side_px)
+    shown = pixel_map.factor * (_means(values, usable, step) - pixel_map.less)
     if not np.nanmin(shown) < np.nanmax(shown):
         return Drawing(title, missing="it is the same for all pixels")
-    error = pixel_map.error(usable)
-    low, high = pixel_map.factor * (np.quantile(thinned(values, usable), [0.005, 0.995]) - pixel_map.less)
+    # Pixels of a row or of a column may share their errors: a mean over a square counts as one over its side
+    error = pixel_map.error(usable) / float(np.sqrt(step))
+    low, high = np.nanquantile(shown, [0.005, 0.995])
     first, last, steps = colour_scale(low, high, error)
     figure, axes, look = _blank_map(values.shape)
     look |= {"cmap": colormaps["viridis"].resampled(steps), "vmin": first, "vmax": last}
     colour_bar(figure, axes.imshow(shown, **look), axes, unit)
-    caption = f"Standard error of a pixel: {error:.2g} {unit}; no step of the colours is finer." if error else ""
+    what = "a pixel" if step == 1 else f"a mean over {step} × {step} pixels, at most"
+    caption = f"Standard error of {what}: {error:.2g} {unit}; no step of the colours is finer." if error else ""
     if high - low < (last - first) / steps:
-        caption += " The frames resolve no difference between 99 % of the pixels."
+        caption += " The frames resolve no difference between 99 % of them."
     return Drawing(title, caption, svg(figure))
 
 
@@ -106,7 +109,8 @@ def _unusable_pixels(calibration: NoiseCalibration, side_px: int) -> Drawing:
         return Drawing(title, missing="no pixel is hot, noisy or dead")
     figure, axes, look = _blank_map(calibration.maps.unusable.shape)
     for (kind, mask), colour in zip(masks.items(), _KINDS.values(), strict=True):
-        dots = cv2.dilate(_shrunk(mask, np.ones_like(mask), side_px), np.ones((2, 2))) > 0
+        share = _means(mask, np.ones_like(mask), _step(mask.shape, side_px))
+        dots = cv2.dilate(share, np.ones((2, 2))) > 0
         axes.imshow(np.where(dots, 1.0, np.nan), cmap=ListedColormap([colour]), **look)
         axes.plot([], [], "s", color=colour, label=f"{mask.sum()} {kind}")
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, frameon=False, labelcolor=INK)
@@ -122,10 +126,13 @@ def _blank_map(shape: tuple[int, ...]) -> tuple[Figure, Axes, dict[str, Any]]:
     return figure, axes, {"extent": (-0.5, width - 0.5, height - 0.5, -0.5), "interpolation": "none"}
 
 
-def _shrunk(values: NDArray[Any], usable: Mask, side_px: int) -> NDArray[np.float64]:
-    """Return the means of usable pixels over squares (row, column), NaN where there are none."""
+def _step(shape: tuple[int, ...], side_px: int) -> int:
+    return -(-max(shape) // side_px)
+
+
+def _means(values: NDArray[Any], usable: Mask, step: int) -> NDArray[np.float64]:
+    """Return the means of usable pixels over squares of a side (row, column), NaN where there are none."""
     height, width = values.shape
-    step = -(-max(height, width) // side_px)
     columns, lines = np.arange(0, width, step), []
     for top in range(0, height, step):
         used = usable[top : top + step]

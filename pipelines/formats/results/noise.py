@@ -16,7 +16,15 @@ from faintfield.calib.estimate import Estimate, SeriesGoodness
 from faintfield.calib.noise_model import BentResponse, NoiseModel
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue
-from faintfield.pipelines.formats.files import exclusive, remove, sha256, write_record, write_whole, writing
+from faintfield.pipelines.formats.files import (
+    exclusive,
+    files_named,
+    remove,
+    sha256,
+    write_record,
+    write_whole,
+    writing,
+)
 from faintfield.pipelines.formats.frames import at_phase
 from faintfield.pipelines.formats.provenance import Provenance
 from faintfield.pipelines.formats.reading import is_file, read_arrays, read_json
@@ -224,7 +232,7 @@ def write_noise(out: Path, record: NoiseRecord, maps: Iterable[tuple[str, NDArra
                 for name, values in maps:
                     with members.open(f"{name}.npy", "w", force_zip64=True) as member:
                         write_array(member, values, allow_pickle=False)
-        for earlier in (path for name in NOISE_PAGES for path in out.glob(name)):
+        for earlier in files_named(out, NOISE_PAGES):
             remove(earlier)
         write_whole(out / NOISE_PAGE, page)
         record = msgspec.structs.replace(record, maps_sha256=sha256(out / NOISE_MAPS))
