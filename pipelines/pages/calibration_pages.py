@@ -174,9 +174,10 @@ def _sigma_map(nodes: Sequence[tuple[int, int]], sigmas: Sequence[float], label:
     image = axes.imshow(values, cmap="cividis", vmin=0, extent=extent)
     colour_bar(figure, image, axes, label)
     if values.size <= _MAX_WRITTEN:
+        decimals = int(np.clip(1 - np.floor(np.log10(max(*sigmas, 1e-6))), 0, 6))
         for (row, column), sigma in zip(nodes, sigmas, strict=True):
             colour = "black" if sigma > 0.6 * max(sigmas) else "white"
-            text = f"{sigma:.0f}" if max(sigmas) >= 10 else f"{sigma:.2g}"
+            text = f"{sigma:.{decimals}f}"
             axes.text(column, row, text, ha="center", va="center", fontsize=7, color=colour)
     axes.set(xlabel="column of the grid", ylabel="row of the grid")
     axes.locator_params(integer=True)

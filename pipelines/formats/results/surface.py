@@ -144,16 +144,18 @@ class SurfaceRecord(SurfaceFacts, frozen=True, kw_only=True):
         if deviance > MAX_DEVIANCE:
             what = (
                 f"This surface does not explain its views: those that were left out differ from its prediction by "
-                f"{deviance**0.5:.2g} times their noise (mean deviance {deviance:.4g}, 1 is perfect)"
+                f"{deviance**0.5:.2g} times their noise (mean deviance {deviance:.4g}, 1 is perfect). Trust neither "
+                "its picture nor its depths"
             )
         elif neighbours is not None and deviance > neighbours:
             what = (
                 f"The views do not show the depths of this surface: those that were left out are predicted better by "
-                f"their neighbours, without any depth (mean deviance {deviance:.4g} against {neighbours:.4g})"
+                f"their neighbours, without any depth (mean deviance {deviance:.4g} against {neighbours:.4g}). Do not "
+                "trust them"
             )
         else:
             return None
-        return f"{what}. Trust neither its picture nor its depths; check poses, range of depths and noise model"
+        return f"{what}; check poses, range of depths and noise model"
 
     @property
     def maps(self) -> list[str]:

@@ -18,6 +18,7 @@ from faintfield.pipelines.formats.files import remove, remove_leftovers, require
 from faintfield.pipelines.formats.frames import ChannelLayout
 from faintfield.pipelines.formats.large_arrays import memory_or_file
 from faintfield.pipelines.formats.provenance import provenance
+from faintfield.pipelines.formats.results.figures import OVERVIEW_FILE
 from faintfield.pipelines.formats.results.plane_files import read_current
 from faintfield.pipelines.formats.results.records import DEPTH_MAP_FILE
 from faintfield.pipelines.formats.results.surface import (
@@ -85,6 +86,8 @@ def reconstruct_surface(
     origin = provenance("reconstruct", options, elemental_set.input_hashes(), elemental_set.units)
     kept = read_current(out / SURFACE_FILE, SurfaceFileRecord, origin)
     if kept is not None:
+        if not (out / OVERVIEW_FILE).is_file():  # of a version that wrote none
+            write_overview(*inspect_set(elemental_set), out)
         return kept.surface
     layouts = elemental_set.layouts
     grid = plane_grid(elemental_set, 1.0)
