@@ -5,6 +5,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import msgspec
+from msgspec import UNSET
 
 from faintfield.pipelines.arguments import SceneKind
 from faintfield.pipelines.console import inform, working
@@ -14,6 +15,7 @@ from faintfield.pipelines.formats.results.records import REPORT_FILE
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, load_session, with_measured_geometry
 from faintfield.pipelines.reconstruction.channels import keeping_frames
+from faintfield.pipelines.reconstruction.depth.scene_structure import recommendation
 from faintfield.pipelines.reconstruction.options import OF_PLANES, Options
 from faintfield.pipelines.reconstruction.planes.sweep import Runner, run_serially
 from faintfield.pipelines.reconstruction.planes.workers import make_runner
@@ -57,6 +59,8 @@ def reconstruct_and_report(
         report = _write_report(out)
     planes = len({record.file for record in outcome.planes})
     inform(f"{planes} plane(s) in {time.monotonic() - started:.1f} s: {report}")
+    if outcome.recommendation:
+        inform(outcome.recommendation)
     return msgspec.structs.replace(outcome, report=str(report))
 
 
@@ -73,7 +77,13 @@ def surface_and_report(elemental_set: ElementalSet, out: Path, request: SurfaceR
         report = _write_report(page_in)
     sure = f"{record.known_share:.0%} of its depths known, {record.sure_share:.0%} sure"
     inform(f"a surface in {time.monotonic() - started:.1f} s, {sure}: {report}")
-    return Outcome(out=str(out), report=str(report), planes=[], surface=record, units=elemental_set.units)
+    advice = recommendation(record.share_of_sure)
+    if advice:
+        inform(advice)
+    return Outcome(
+        out=str(out), report=str(report), planes=[], surface=record, units=elemental_set.units,
+        recommendation=advice or UNSET,
+    )  # fmt: skip
 
 
 def _write_report(folder: Path) -> Path:
