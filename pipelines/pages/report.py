@@ -36,6 +36,7 @@ from faintfield.pipelines.pages.report_planes import error_sections, method_titl
 from faintfield.pipelines.pages.report_sets import SetSection, set_sections
 from faintfield.pipelines.pages.report_surface import depth_sections, surface_sections
 from faintfield.pipelines.pages.viewer_data import viewer_of
+from faintfield.pipelines.reconstruction.depth.scene_structure import recommendation
 
 # Origins of poses in words.
 _POSES: dict[Poses, str] = {
@@ -90,6 +91,7 @@ def write_report(directory: Path, *, noise: Path | None = None, geometry: Path |
         facts.append(Fact("Mean square error", values, f"against the object, 0…1, at {depths}"))
     page = template("report.html").render(
         title=_title(directory, results, surfaces),
+        recommendation=_recommendation(results, surfaces),
         units=units,
         facts=facts,
         sets=sets,
@@ -149,6 +151,13 @@ def _describe_search(search: BestFocusRecord, units: StatedUnits) -> str:
         f"{where}; {times}. The stated places are {figure(search.z_shuffled)} standard deviations of the shuffled "
         "better than their mean. This is about the set, not about each plane."
     )
+
+
+def _recommendation(results: dict[Path, ReconstructionRecord], surfaces: dict[Path, SurfaceFileRecord]) -> str | None:
+    """Return a sentence on the mode that suits the scene, by the first search for its depths that tells one."""
+    searches = [result.best_focus.share_of_sure for result in results.values() if result.best_focus]
+    of_surfaces = [record.surface.share_of_sure for record in surfaces.values()]
+    return next((advice for shares in [*searches, *of_surfaces] if (advice := recommendation(shares))), None)
 
 
 def _title(directory: Path, results: dict[Path, ReconstructionRecord], surfaces: dict[Path, SurfaceFileRecord]) -> str:

@@ -34,6 +34,7 @@ from faintfield.pipelines.formats.units import StatedUnits
 from faintfield.pipelines.reconstruction.accuracy import assess, write_depth_errors
 from faintfield.pipelines.reconstruction.channels import SHARE_OF_DISK
 from faintfield.pipelines.reconstruction.depth.depth_map import kept_depth_map, write_depth_map
+from faintfield.pipelines.reconstruction.depth.scene_structure import recommendation, shares_of_depths
 from faintfield.pipelines.reconstruction.depth.search import check_overlap, check_views, depths_of_set
 from faintfield.pipelines.reconstruction.operators import default_pitch_px, plane_grid
 from faintfield.pipelines.reconstruction.overview import inspect_set, write_overview
@@ -46,7 +47,10 @@ _BLACK_E = 1e-5
 
 
 class Outcome(msgspec.Struct, frozen=True, kw_only=True):
-    """Outcome of a reconstruction: the result of `faintfield reconstruct`, which adds the path of the report."""
+    """Outcome of a reconstruction: the result of `faintfield reconstruct`, which adds the path of the report.
+
+    `recommendation` is a sentence on the mode that suits the scene, if its depths were searched and tell one.
+    """
 
     out: str
     report: str | UnsetType = UNSET
@@ -58,6 +62,7 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     surface: SurfaceRecord | UnsetType = UNSET
     surface_warning: str | UnsetType = UNSET
     units: StatedUnits | UnsetType = UNSET
+    recommendation: str | UnsetType = UNSET
 
 
 def reconstruct_set(elemental_set: ElementalSet, out: Path, request: Request, runner: Runner = run_serially) -> Outcome:
@@ -109,9 +114,10 @@ def reconstruct_set(elemental_set: ElementalSet, out: Path, request: Request, ru
             write_stack(folder, result.planes, elemental_set.units)
         shutil.rmtree(folder / PARTS, ignore_errors=True)  # also those of another call that was interrupted
     _warn(elemental_set, records)
+    shares = shares_of_depths(search) if search else found.share_of_sure if found else None
     return Outcome(
         out=str(out), planes=records, focus=focus, best_focus=found, depth_map=depth_map, metrics=metrics,
-        units=elemental_set.units,
+        units=elemental_set.units, recommendation=recommendation(shares) or UNSET,
     )  # fmt: skip
 
 

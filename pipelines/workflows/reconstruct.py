@@ -15,6 +15,7 @@ from faintfield.pipelines.formats.results.records import REPORT_FILE
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, load_session, with_measured_geometry
 from faintfield.pipelines.reconstruction.channels import keeping_frames
+from faintfield.pipelines.reconstruction.depth.scene_structure import recommendation
 from faintfield.pipelines.reconstruction.options import OF_PLANES, Options
 from faintfield.pipelines.reconstruction.planes.sweep import Runner, run_serially
 from faintfield.pipelines.reconstruction.planes.workers import make_runner
@@ -62,6 +63,8 @@ def reconstruct_and_report(
         report = _write_report(out)
     planes = len({record.file for record in outcome.planes})
     inform(f"{planes} plane(s) in {time.monotonic() - started:.1f} s: {report}")
+    if outcome.recommendation:
+        inform(outcome.recommendation)
     return msgspec.structs.replace(outcome, report=str(report))
 
 
@@ -78,14 +81,16 @@ def surface_and_report(elemental_set: ElementalSet, out: Path, request: SurfaceR
         report = _write_report(page_in)
     sure = f"{record.known_share:.0%} of its depths known, {record.sure_share:.0%} sure"
     inform(f"a surface in {time.monotonic() - started:.1f} s, {sure}: {report}")
-    if record.warning is not None:
-        inform(record.warning)
+    advice = recommendation(record.share_of_sure) if record.warning is None else None
+    if last := record.warning or advice:
+        inform(last)
     return Outcome(
         out=str(out),
         report=str(report),
         planes=[],
         surface=record,
         surface_warning=record.warning or UNSET,
+        recommendation=advice or UNSET,
         units=elemental_set.units,
     )
 

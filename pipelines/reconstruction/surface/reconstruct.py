@@ -32,6 +32,7 @@ from faintfield.pipelines.formats.results.surface import (
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, in_units, light_per_e, unit_of_maps
 from faintfield.pipelines.reconstruction.accuracy import write_depth_errors
 from faintfield.pipelines.reconstruction.channels import SHARE_OF_DISK, load_channel
+from faintfield.pipelines.reconstruction.depth.scene_structure import shares_of_depths
 from faintfield.pipelines.reconstruction.depth.search import (
     DepthSearch,
     check_overlap,
@@ -105,6 +106,7 @@ def reconstruct_surface(
             layout.name: _light(elemental_set, layout, search, request.solver, out)
             for layout in progress(layouts, "picture")
         }
+    shares = shares_of_depths(search)
     held_out, prediction = None, search.estimate.prediction
     if prediction is not None and prediction.pixels:
         held_out = HeldOutRecord(**vars(prediction) | {"views": prediction.views.tolist()})
@@ -117,6 +119,7 @@ def reconstruct_surface(
         rounds=search.estimate.rounds,
         sure_above=SURE,
         held_out=held_out,
+        share_of_sure=UNSET if shares is None else shares,
         channels=[in_units(elemental_set, _channel(name, light)) for name, light in lights.items()],
         wall_time_s=time.monotonic() - started,
     )
