@@ -29,7 +29,7 @@ from faintfield.rig.simulation.objects import shaded_ball, star_chart, toy_truck
 from tests.pipelines.conftest import Command, run_undrawn
 
 FEW_SNRS = figure4.SNRS[::7]
-FAST_METHODS = [method for method in METHODS if method.name not in ("bm3d", "pmlem-patches", "pmlem-auto")]
+FAST_METHODS = [method for method in METHODS if method.name not in ("bm3d", "pmlem-patches")]
 OBJECTS = {"truck", "ball"}
 
 
