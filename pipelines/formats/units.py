@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 import msgspec
-from msgspec import UNSET, Meta
+from msgspec import UNSET, Meta, UnsetType
 
 # Limits beyond which values in a file are refused: far above what any rig has, far below what overflows.
 # Largest picture that is read, decoded (a plane in three colours of the largest detector, as float32), and on a page.
@@ -83,10 +83,14 @@ class Units(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
     light : {"electrons", "dn", "relative"}
         What light is stated in. "dn": values of the files, above the dark level, because the gain is not known or only
         estimated. "relative": linear in light up to an unknown factor, 1 is white; the files had a tone curve.
+    tone : {"srgb"}, optional
+        Tone curve of the photographs that the views were made from; pictures are shown with it. Relative light always
+        has that of sRGB.
     """
 
     depth: DepthUnit = "mm"
     light: LightUnit = "electrons"
+    tone: Literal["srgb"] | UnsetType = UNSET
 
 
 class StatedUnits(Units, frozen=True, forbid_unknown_fields=False, omit_defaults=False):
@@ -134,7 +138,7 @@ class StatedUnits(Units, frozen=True, forbid_unknown_fields=False, omit_defaults
     @property
     def tone_curve(self) -> bool:
         """True if the files had the tone curve of sRGB; pictures are then shown with it."""
-        return self.light == "relative"
+        return self.light == "relative" or self.tone == "srgb"
 
     @property
     def quantities(self) -> str:

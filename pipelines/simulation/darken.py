@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import msgspec
 import numpy as np
+from msgspec import UNSET
 from numpy.typing import NDArray
 
 from faintfield.pipelines.console import progress
@@ -16,6 +17,7 @@ from faintfield.pipelines.formats.image_files import ONE_PIXEL, mask_picture, wr
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.sets.elemental_file import FILE_NAME, write_set
 from faintfield.pipelines.formats.sets.elemental_set import NOISE_REFERENCE, ElementalSet, load_set
+from faintfield.pipelines.formats.units import Units
 from faintfield.pipelines.reconstruction.channels import checked_frame, lattice_noise
 from faintfield.pipelines.reconstruction.overview import OBJECT_REGION, brightness
 from faintfield.pipelines.simulation.options import DarkeningOptions
@@ -130,7 +132,7 @@ def _write_dark_views(
     settings = msgspec.structs.replace(
         bright.settings,
         exposure_s=options.exposure_s,
-        units=msgspec.structs.replace(bright.settings.units, light="electrons"),
+        units=Units(bright.units.depth, tone="srgb" if bright.units.tone_curve else UNSET),
         camera=camera,
         noise=stated_noise(sensor),
         view=views,

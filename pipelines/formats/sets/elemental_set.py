@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -90,7 +90,8 @@ class ElementalSet:
     def units(self) -> StatedUnits:
         """The units of all that is made from the set."""
         units = self.settings.units
-        return StatedUnits(units.depth, units.light, "unknown" if self.settings.exposure_s is None else "s")
+        exposure: Literal["s", "unknown"] = "unknown" if self.settings.exposure_s is None else "s"
+        return StatedUnits(units.depth, units.light, units.tone, exposure)
 
     @property
     def image_paths(self) -> list[Path]:

@@ -11,8 +11,10 @@ from faintfield.recon.depth.focus import MIN_SAMPLES, SURE, places_of_focus
 
 # Shares of the sure samples at the depths that stand out: at least the first in scenes of separate planes, at most the
 # second in a continuum. In between the evidence is not clear. Simulated planes have 0.91 to 0.99, pose errors included,
-# simulated surfaces and a photographed chessboard 0.38 to 0.58.
+# simulated surfaces and a photographed chessboard 0.38 to 0.58. In the dark few samples of a continuum are sure, and
+# may gather at some depths, so that more than a few depths tell nothing either.
 _OF_PLANES, _OF_CONTINUUM = 0.85, 0.7
+_FEW_DEPTHS = 4
 
 
 def recommendation(share_of_sure: Sequence[float] | UnsetType | None) -> str | None:
@@ -23,7 +25,7 @@ def recommendation(share_of_sure: Sequence[float] | UnsetType | None) -> str | N
     if share_of_sure is None or share_of_sure is UNSET:
         return None
     total, count = sum(share_of_sure), len(share_of_sure)
-    if total >= _OF_PLANES and count:
+    if total >= _OF_PLANES and 0 < count <= _FEW_DEPTHS:
         if count == 1:
             return f"{total:.0%} of the samples of sure depth lie at one depth: a single plane there fits this scene"
         return (

@@ -124,6 +124,17 @@ def test_colour_stays_colour(make_set: SetMaker, tmp_path: Path, done: Command) 
         assert deviation < 0.1 * expected
 
 
+@pytest.mark.parametrize(("light", "tone_curve"), [("relative", True), ("dn", False)])
+def test_tone_curve_of_photographs_is_kept(
+    light: str, tone_curve: bool, bright: Path, tmp_path: Path, done: Command
+) -> None:
+    settings = bright / "elemental.toml"
+    settings.write_text(settings.read_text() + f'\n[units]\nlight = "{light}"\n')
+    done("darken", bright, tmp_path / "dark")
+    units = load_set(tmp_path / "dark").units
+    assert (units.light, units.tone_curve) == ("electrons", tone_curve)
+
+
 def test_mosaic_and_dark_pixels_stay(make_set: SetMaker, tmp_path: Path, done: Command) -> None:
     """Pixels without light, of one colour or in one half, count as dark, also when they are below the offset of 100."""
     frame = np.rint(100 + 20_000 * _scene_light((150, 200), np.random.default_rng(1))).astype(np.uint16)

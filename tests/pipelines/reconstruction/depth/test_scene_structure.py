@@ -24,7 +24,7 @@ def test_recommended_mode_follows_distribution_of_depths(shares: list[float], wo
     assert words in advice
 
 
-@pytest.mark.parametrize("shares", [[0.4, 0.38], None])
+@pytest.mark.parametrize("shares", [[0.4, 0.38], [0.93 / 7] * 7, None])
 def test_nothing_is_recommended_without_clear_evidence(shares: list[float] | None) -> None:
     assert recommendation(shares) is None
 
