@@ -85,7 +85,8 @@ def draw_photographs(photographs: Path) -> None:
         near_px, far_px = np.quantile(disparity_px[sure], (0.01, 0.99))
         colours = 255 * colormaps["viridis"](np.clip((disparity_px - near_px) / (far_px - near_px), 0, 1))[..., :3]
         depth = np.where(sure[..., None], colours, 0.35 * colours + 26).astype(np.uint8)
-        pictures = [grey_levels(view, float(white), float(black)), np.asarray(picture, np.uint8), depth]
+        dark_view = grey_levels(view, float(white), float(black))
+        pictures = [dark_view, np.asarray(picture, np.uint8), depth]
         write_png(_PICTURES / "photographs.png", shrunk(contact_sheet(pictures, 3), _WIDTH_PX))
 
 
