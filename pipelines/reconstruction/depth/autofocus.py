@@ -1,5 +1,6 @@
 """`--depth-mm auto`: the depths of objects, found by comparing the views."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -65,8 +66,8 @@ def best_focus(elemental_set: ElementalSet, out: Path, range_mm: tuple[float, fl
     if not places:
         raise _nothing(elemental_set, ranges[0])
     searched_mm = _searched_depths(ranges[-1])
-    refined_mm = (_refined(planes, searched_mm, found, place) for place in places)
-    depths = sorted({rounded_depth(elemental_set, depth) for depth in refined_mm})
+    by_depth = _merged(planes, searched_mm, found, places)
+    depths = sorted({rounded_depth(elemental_set, depth) for depth in by_depth})
     between = elemental_set.depths_text(near_mm, far_mm, join=" and ")
     inform(f"planes of best focus between {between}: {elemental_set.depths_text(*depths)}")
     return BestFocusRecord(
@@ -74,7 +75,7 @@ def best_focus(elemental_set: ElementalSet, out: Path, range_mm: tuple[float, fl
         searched_mm=ranges,
         depths_per_search=_DEPTHS,
         bins_px=bins_px,
-        share_of_sure=[float(place.sum() / sure.sum()) for place in places],
+        share_of_sure=[float(place.sum() / sure.sum()) for place in by_depth.values()],
         p_value=significance.p_value if significance else UNSET,
         z_shuffled=significance.z if significance else UNSET,
         shuffles=significance.shuffles if significance else UNSET,
@@ -193,6 +194,21 @@ def _range_of_disparities(elemental_set: ElementalSet, least_px: float, largest_
             "infinity by the poses; correct one of them"
         )
     return 1 / near, 1 / max(far, near / _INFINITY)
+
+
+def _merged(
+    planes: list[Agreement], depths_mm: list[float], estimate: DepthEstimate, places: Sequence[NDArray[np.bool_]]
+) -> dict[float, NDArray[np.bool_]]:
+    """Return places by their refined depth in mm, in the order of depths; within a step of the search they are one."""
+    by_depth: dict[float, NDArray[np.bool_]] = {}
+    step = abs(1 / depths_mm[1] - 1 / depths_mm[0])
+    for place in places:
+        depth_mm = _refined(planes, depths_mm, estimate, place)
+        if near := [known for known in by_depth if abs(1 / known - 1 / depth_mm) <= step]:
+            place = place | by_depth.pop(near[-1])
+            depth_mm = _refined(planes, depths_mm, estimate, place)
+        by_depth[depth_mm] = place
+    return by_depth
 
 
 def _refined(
