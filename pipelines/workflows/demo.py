@@ -132,7 +132,7 @@ def demo_rig(size: DemoSize, snr: float, seed: int) -> RigSettings:
         StepSettings("dark_scene", _EXPOSURE_S),
         StepSettings("noise_reference", _EXPOSURE_S, at="centre"),
         StepSettings("dark", (0.1, 1.0, 10.0, 60.0), size.frames),
-        StepSettings("flat", (0.05, 0.1), size.frames, photons_per_s=flat_photons_per_s(camera)),
+        StepSettings("flat", (0.025, 0.05, 0.1), size.frames, photons_per_s=flat_photons_per_s(camera)),
     )
     return RigSettings(
         stage=StageSettings("simulated", port="simulated:grbl:pty"),
