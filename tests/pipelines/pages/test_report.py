@@ -188,6 +188,13 @@ psnr_db
 """.split()
 
 
+def test_page_states_tone_curve_of_views(planes: Path, done: Command) -> None:
+    write_by_hand(planes / "overview.json", read_record(planes, "overview.json") | {"tone": "srgb"})
+    done("report", planes)
+    words = _Page((planes / "report.html").read_text()).words
+    assert "Views and noise reference have one grey scale with the tone curve of sRGB" in words
+
+
 def test_results_with_fewest_keys_are_shown(planes: Path, done: Command) -> None:
     for path in [*planes.rglob("reconstruction.json"), planes / "overview.json", planes / "metrics.json"]:
         record = {key: value for key, value in json.loads(path.read_bytes()).items() if key in NEEDED}
