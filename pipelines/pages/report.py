@@ -154,9 +154,12 @@ def _describe_search(search: BestFocusRecord, units: StatedUnits) -> str:
 
 
 def _recommendation(results: dict[Path, ReconstructionRecord], surfaces: dict[Path, SurfaceFileRecord]) -> str | None:
-    """Return a sentence on the mode that suits the scene, by the first search for its depths that tells one."""
+    """Return a sentence on the mode that suits the scene, by the first search for its depths that tells one.
+
+    A surface that does not explain its views recommends nothing.
+    """
     searches = [result.best_focus.share_of_sure for result in results.values() if result.best_focus]
-    of_surfaces = [record.surface.share_of_sure for record in surfaces.values()]
+    of_surfaces = [record.surface.share_of_sure for record in surfaces.values() if record.surface.warning is None]
     return next((advice for shares in [*searches, *of_surfaces] if (advice := recommendation(shares))), None)
 
 

@@ -350,6 +350,7 @@ def test_unexplained_surface_says_so_first(
 ) -> None:
     record = read_record(surface, "surface.json")
     record["surface"]["held_out"] |= {"surface": deviance, "planes": 1.01 * deviance, "neighbours": neighbours}
+    record["surface"]["share_of_sure"] = [0.2, 0.2]
     write_by_hand(surface / "surface.json", record)
     section = _section(surface, done)
     page = (surface / "report.html").read_text()
@@ -357,6 +358,7 @@ def test_unexplained_surface_says_so_first(
     assert says in page[banner:figures]
     assert "sharp everywhere" not in page
     assert "explain what other cameras see" not in section
+    assert "fits it" not in page
 
 
 def test_overlarge_picture_is_refused(surface: Path, faintfield: Command, monkeypatch: pytest.MonkeyPatch) -> None:
