@@ -12,7 +12,8 @@ from faintfield.recon.depth.focus import MIN_SAMPLES, SURE, places_of_focus
 # Shares of the sure samples at the depths that stand out: at least the first in scenes of separate planes, at most the
 # second in a continuum. In between the evidence is not clear. Simulated planes have 0.91 to 0.99, pose errors included,
 # simulated surfaces and a photographed chessboard 0.38 to 0.58. In the dark few samples of a continuum are sure, and
-# may gather at some depths, so that more than a few depths tell nothing either.
+# may gather at some depths, so that more than a few depths tell nothing either. Nor does one: those of objects at other
+# depths may not be sure.
 _OF_PLANES, _OF_CONTINUUM = 0.85, 0.7
 _FEW_DEPTHS = 4
 
@@ -25,18 +26,16 @@ def recommendation(share_of_sure: Sequence[float] | UnsetType | None) -> str | N
     if share_of_sure is None or share_of_sure is UNSET:
         return None
     total, count = sum(share_of_sure), len(share_of_sure)
-    if total >= _OF_PLANES and 0 < count <= _FEW_DEPTHS:
-        if count == 1:
-            return f"{total:.0%} of the samples of sure depth lie at one depth: a single plane there fits this scene"
+    if total >= _OF_PLANES and 1 < count <= _FEW_DEPTHS:
         return (
             f"{total:.0%} of the samples of sure depth lie at {count} separate depths: planes there with --occlusion "
             "fit this scene"
         )
     if total <= _OF_CONTINUUM:
+        depths = "the depth that stands out" if count == 1 else f"the {count} depths that stand out"
         return (
             f"the depths of this scene are a continuum ({total:.0%} of the samples of sure depth lie at "
-            f"{f'the {count} depths that stand out' if count else 'depths that stand out'}): --surface fits it, and "
-            "planes are blurred"
+            f"{depths if count else 'depths that stand out'}): --surface fits it, and planes are blurred"
         )
     return None
 

@@ -12,9 +12,9 @@ from tests.pipelines.conftest import Command, run_undrawn
 @pytest.mark.parametrize(
     ("shares", "words"),
     [
-        ([0.95], "a single plane there fits"),
         ([0.5, 0.45], "2 separate depths: planes there with --occlusion fit"),
         ([0.1, 0.2, 0.1], "continuum (40% of the samples of sure depth lie at the 3 depths that stand out): --surface"),
+        ([0.6], "the depth that stands out): --surface fits it"),
         ([], "--surface fits it"),
     ],
 )
@@ -24,7 +24,7 @@ def test_recommended_mode_follows_distribution_of_depths(shares: list[float], wo
     assert words in advice
 
 
-@pytest.mark.parametrize("shares", [[0.4, 0.38], [0.93 / 7] * 7, None])
+@pytest.mark.parametrize("shares", [[0.4, 0.38], [1.0], [0.93 / 7] * 7, None])
 def test_nothing_is_recommended_without_clear_evidence(shares: list[float] | None) -> None:
     assert recommendation(shares) is None
 
