@@ -41,7 +41,7 @@ from faintfield.pipelines.reconstruction.depth.scene_structure import recommenda
 # Origins of poses in words.
 _POSES: dict[Poses, str] = {
     "stated": "by the set; not measured",
-    "measured": f"their uncertainty is in {GEOMETRY_FILE} of the session, which is not here",
+    "measured": f"their uncertainty is in the {GEOMETRY_FILE} that was used, which is not here",
     "nominal": "where the stage was sent; not measured",
     "true": "known to the simulation",
 }
@@ -247,7 +247,7 @@ def _noise(
     units = units_of(the_set.overview)
     says = "as the set states it" if units.light == "electrons" else "estimated, not measured"
     if any(Path(name).name == NOISE_FILE for name in lead.inputs):
-        says = f"measured; its uncertainty is in {NOISE_FILE} of the set, which is not here"
+        says = f"measured; its uncertainty is in the {NOISE_FILE} that was used, which is not here"
     return [Fact("Read noise", f"{figure(the_set.overview.read_noise_e)} {units.light_symbol}", says)]
 
 
