@@ -158,7 +158,9 @@ def _recommendation(results: dict[Path, ReconstructionRecord], surfaces: dict[Pa
 
     A surface that does not explain its views recommends nothing.
     """
-    searches = [result.best_focus.share_of_sure for result in results.values() if result.best_focus]
+    searches = [
+        found.share_of_sure for result in results.values() for found in (result.depth_map, result.best_focus) if found
+    ]
     of_surfaces = [record.surface.share_of_sure for record in surfaces.values() if record.surface.warning is None]
     return next((advice for shares in [*searches, *of_surfaces] if (advice := recommendation(shares))), None)
 
