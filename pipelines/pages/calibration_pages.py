@@ -22,6 +22,7 @@ from faintfield.pipelines.pages.page import (
     estimate_row,
     figure,
     fixed,
+    html_symbols,
     ink,
     svg,
     template,
@@ -235,7 +236,7 @@ def noise_section(directory: Path, path: Path, inputs: Set[str]) -> NoiseSection
         made=record.provenance,
         record=record,
         rows=[
-            estimate_row(measured, f"{words}, {symbol}", unit, factor)
+            estimate_row(measured, html_symbols(f"{words}, {symbol}"), unit, factor)
             for name, words, symbol, unit, factor in NOISE_QUANTITIES
             if isinstance(measured := getattr(record, name), Estimate)
         ],

@@ -188,5 +188,6 @@ def colour_bar(figure: Figure, image: ScalarMappable, axes: Axes, label: str) ->
     """Draw the scale of a picture's colours beside it."""
     bar = figure.colorbar(image, ax=axes, shrink=0.8)
     bar.set_label(label, color=INK)
+    bar.ax.ticklabel_format(useOffset=False)
     bar.ax.tick_params(colors=INK)
     bar.outline.set_edgecolor(INK)

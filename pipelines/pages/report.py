@@ -41,7 +41,7 @@ from faintfield.pipelines.reconstruction.depth.scene_structure import recommenda
 # Origins of poses in words.
 _POSES: dict[Poses, str] = {
     "stated": "by the set; not measured",
-    "measured": f"their uncertainty is in {GEOMETRY_FILE} of the session, which is not here",
+    "measured": f"their uncertainty is in the {GEOMETRY_FILE} that was used, which is not here",
     "nominal": "where the stage was sent; not measured",
     "true": "known to the simulation",
 }
@@ -154,9 +154,14 @@ def _describe_search(search: BestFocusRecord, units: StatedUnits) -> str:
 
 
 def _recommendation(results: dict[Path, ReconstructionRecord], surfaces: dict[Path, SurfaceFileRecord]) -> str | None:
-    """Return a sentence on the mode that suits the scene, by the first search for its depths that tells one."""
-    searches = [result.best_focus.share_of_sure for result in results.values() if result.best_focus]
-    of_surfaces = [record.surface.share_of_sure for record in surfaces.values()]
+    """Return a sentence on the mode that suits the scene, by the first search for its depths that tells one.
+
+    A surface that does not explain its views recommends nothing.
+    """
+    searches = [
+        found.share_of_sure for result in results.values() for found in (result.depth_map, result.best_focus) if found
+    ]
+    of_surfaces = [record.surface.share_of_sure for record in surfaces.values() if record.surface.warning is None]
     return next((advice for shares in [*searches, *of_surfaces] if (advice := recommendation(shares))), None)
 
 
@@ -244,7 +249,7 @@ def _noise(
     units = units_of(the_set.overview)
     says = "as the set states it" if units.light == "electrons" else "estimated, not measured"
     if any(Path(name).name == NOISE_FILE for name in lead.inputs):
-        says = f"measured; its uncertainty is in {NOISE_FILE} of the set, which is not here"
+        says = f"measured; its uncertainty is in the {NOISE_FILE} that was used, which is not here"
     return [Fact("Read noise", f"{figure(the_set.overview.read_noise_e)} {units.light_symbol}", says)]
 
 

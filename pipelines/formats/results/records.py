@@ -231,7 +231,10 @@ class BestFocusRecord(Struct, frozen=True):
 
 
 class DepthMapRecord(Struct, frozen=True):
-    """The maps of a sweep: their files, unit and how much of them is known."""
+    """The maps of a sweep: their files, unit and how much of them is known.
+
+    `share_of_sure` are the shares of the sure samples at the depths that stand out, as of `BestFocusRecord`.
+    """
 
     file: FileName
     confidence: FileName
@@ -241,6 +244,7 @@ class DepthMapRecord(Struct, frozen=True):
     sure_above: float
     sure_share: float
     median: float | None = None
+    share_of_sure: list[float] | UnsetType = UNSET
 
     @property
     def files(self) -> list[str]:

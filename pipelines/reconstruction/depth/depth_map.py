@@ -15,6 +15,7 @@ from faintfield.pipelines.formats.image_files import ONE_PIXEL, encoded, light_p
 from faintfield.pipelines.formats.results.plane_files import Origin, read_current
 from faintfield.pipelines.formats.results.records import DEPTH_MAP_FILE, DepthMapFileRecord, DepthMapRecord, Method
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, unit_of_maps
+from faintfield.pipelines.reconstruction.depth.scene_structure import shares_of_depths
 from faintfield.pipelines.reconstruction.depth.search import DepthSearch, in_unit
 from faintfield.recon.surface.confidence import SURE
 
@@ -104,6 +105,7 @@ def _maps(
         sure_above=SURE,
         sure_share=float(known.mean()),
         median=float(np.median(values[known])) if known.any() else None,
+        share_of_sure=shares_of_depths(search),
     )
     values = np.where(known, values, np.nan)
     label = "disparity (px)" if unit == "px" else f"depth ({unit})"

@@ -66,8 +66,13 @@ def saturation_text(records: Sequence[PlaneRecord | SurfaceChannel]) -> str | No
     if not saturated:
         return None
     unknown = max(record.unknown_share or 0.0 for record in records)
-    samples = f"; up to {unknown:.2%} of the samples are brighter than that: NaN, hatched in the pictures"
+    samples = f"; up to {_percent(unknown)} of the samples are seen mostly by such pixels: NaN, hatched in the pictures"
     return (
-        f"{saturated:.2%} of the pixels are saturated and do not count{samples if unknown else ''}; use a shorter "
-        "exposure, or several"
+        f"{_percent(saturated)} of the pixels are saturated and do not count{samples if unknown else ''}; "
+        "use a shorter exposure, or several"
     )
+
+
+def _percent(share: float) -> str:
+    """Return a share to two digits; that of one pixel is not zero."""
+    return f"{100 * share:.2g}%"

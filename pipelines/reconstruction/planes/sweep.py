@@ -66,7 +66,6 @@ class Channel:
     def __init__(self, elemental_set: ElementalSet, layout: ChannelLayout, images: ElementalImages) -> None:
         self._set, self._layout, self._images = elemental_set, layout, images
         self._factory = OperatorFactory(elemental_set, layout, images)
-        self._selected: dict[Place, PixelSelection] = {}
 
     def total_variation(self, task: PlaneTask) -> dict[Place, Solution]:
         """Return the planes from which the priors of a task begin."""
@@ -80,11 +79,12 @@ class Channel:
         """Reconstruct and save this colour of what a task asks for, and return messages for the user."""
         messages: list[str] = []
         focus: dict[Place, FocusPoint | None] = dict.fromkeys(task.grids)
+        selected: dict[Place, PixelSelection | None] = dict.fromkeys(task.grids)
         for place, grid in task.grids.items():
             operator = self._operator(place, grid)
             if self._images.valid is not None:
                 whole = self._factory.at(place, grid, range(len(self._set.settings.view)))
-                self._selected[place] = PixelSelection.of(operator, whole, self._images)
+                selected[place] = PixelSelection.of(operator, whole, self._images)
             if message := blind_views(self._set, operator, "the plane"):
                 messages.append(f"{self._describe(place)}: {message}")
             if task.with_focus:
@@ -93,13 +93,14 @@ class Channel:
                 if files.method not in JOINT_METHODS and files.place == place:
                     pilot = pilots[place] if pilots else None
                     solution = solve(operator, self._images, files.method, task.solver, pilot)
-                    self._save(task, files, solution, focus[place])
+                    self._save(task, files, solution, focus[place], selected[place])
         joint = [method for method in JOINT_METHODS if any(files.method == method for files in task.files)]
         if joint:
             solved = solve_together(self._factory, self._images, task.grids, joint, task.solver, pilots)
             for files in task.files:
                 if files.method in joint:
-                    self._save(task, files, solved[files.method][files.place], focus[files.place])
+                    place = files.place
+                    self._save(task, files, solved[files.method][place], focus[place], selected[place])
         return messages
 
     def _operator(self, place: Place, grid: PlaneGrid) -> PlaneOperator:
@@ -108,10 +109,16 @@ class Channel:
         except GeometryMismatch as failure:
             raise GeometryMismatch(f"plane at {self._describe(place)}: {failure}") from failure
 
-    def _save(self, task: PlaneTask, files: PlaneFiles, solution: Solution, focus: FocusPoint | None) -> None:
+    def _save(
+        self,
+        task: PlaneTask,
+        files: PlaneFiles,
+        solution: Solution,
+        focus: FocusPoint | None,
+        selected: PixelSelection | None,
+    ) -> None:
         place, grid = files.place, task.grids[files.place]
         arrays = {"plane": solution.plane, **solution.sidecars}
-        selected = self._selected.get(place)
         if selected is not None:
             arrays = selected.applied(arrays, float(np.mean(self._images.known_variance_e2())))
         tilted = place if isinstance(place, TiltedPlane) else None

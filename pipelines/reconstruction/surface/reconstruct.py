@@ -106,7 +106,6 @@ def reconstruct_surface(
             layout.name: _light(elemental_set, layout, search, request.solver, out)
             for layout in progress(layouts, "picture")
         }
-    shares = shares_of_depths(search)
     held_out, prediction = None, search.estimate.prediction
     if prediction is not None and prediction.pixels:
         held_out = HeldOutRecord(**vars(prediction) | {"views": prediction.views.tolist()})
@@ -119,7 +118,7 @@ def reconstruct_surface(
         rounds=search.estimate.rounds,
         sure_above=SURE,
         held_out=held_out,
-        share_of_sure=UNSET if shares is None else shares,
+        share_of_sure=shares_of_depths(search),
         channels=[in_units(elemental_set, _channel(name, light)) for name, light in lights.items()],
         wall_time_s=time.monotonic() - started,
     )

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from faintfield.pipelines.pages.page import blank_drawing, colour_bar
 from faintfield.pipelines.pages.pixel_maps import colour_scale
 
 
@@ -22,3 +23,12 @@ def test_pixels_that_hardly_differ_have_one_colour() -> None:
     values = 0.2 + 0.001 * np.random.default_rng(1).uniform(-0.3, 0.3, 1000)
     first, last, steps = colour_scale(float(values.min()), float(values.max()), 0.001)
     assert np.unique(np.floor((values - first) / (last - first) * steps)).size == 1
+
+
+def test_numbers_beside_colours_have_no_offset() -> None:
+    figure, axes = blank_drawing(4, 3)
+    colour_bar(figure, axes.imshow([[100.0, 100.001], [100.002, 100.003]]), axes, "DN")
+    figure.draw_without_rendering()
+    numbers = figure.axes[-1].yaxis
+    assert numbers.get_offset_text().get_text() == ""
+    assert "100.0010" in [label.get_text() for label in numbers.get_ticklabels()]

@@ -188,6 +188,13 @@ psnr_db
 """.split()
 
 
+def test_page_states_tone_curve_of_views(planes: Path, done: Command) -> None:
+    write_by_hand(planes / "overview.json", read_record(planes, "overview.json") | {"tone": "srgb"})
+    done("report", planes)
+    words = _Page((planes / "report.html").read_text()).words
+    assert "Views and noise reference have one grey scale with the tone curve of sRGB" in words
+
+
 def test_results_with_fewest_keys_are_shown(planes: Path, done: Command) -> None:
     for path in [*planes.rglob("reconstruction.json"), planes / "overview.json", planes / "metrics.json"]:
         record = {key: value for key, value in json.loads(path.read_bytes()).items() if key in NEEDED}
@@ -343,6 +350,7 @@ def test_unexplained_surface_says_so_first(
 ) -> None:
     record = read_record(surface, "surface.json")
     record["surface"]["held_out"] |= {"surface": deviance, "planes": 1.01 * deviance, "neighbours": neighbours}
+    record["surface"]["share_of_sure"] = [0.2, 0.2]
     write_by_hand(surface / "surface.json", record)
     section = _section(surface, done)
     page = (surface / "report.html").read_text()
@@ -350,6 +358,7 @@ def test_unexplained_surface_says_so_first(
     assert says in page[banner:figures]
     assert "sharp everywhere" not in page
     assert "explain what other cameras see" not in section
+    assert "fits it" not in page
 
 
 def test_overlarge_picture_is_refused(surface: Path, faintfield: Command, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -78,7 +78,10 @@ def test_error_of_held_out_boards_has_its_limit(ratio: float | None, boards: int
 
 def test_pages_show_link_and_compare_calibrations(session: Path, done: Command) -> None:
     folder = session / "reconstructions" / "scene"
-    of_noise = ("3.464", "3.4597 … 3.4685", "all darks have one exposure time", "1 hot", "the darks drift", "−20.0 °C")
+    of_noise = (
+        "read noise, σ<sub>d</sub>", "3.464", "3.4597 … 3.4685", "all darks have one exposure time", "1 hot",
+        "the darks drift", "−20.0 °C",
+    )  # fmt: skip
 
     def page(folder: Path) -> str:
         done("report", folder)
@@ -119,7 +122,7 @@ def test_calibrations_can_be_named(drawn: Path, session: Path, tmp_path: Path) -
 @pytest.mark.parametrize(
     ("poses", "noise", "says"),
     [
-        ("measured", "noise.json", ["measured", "measured; its uncertainty is in noise.json"]),
+        ("measured", "noise.json", ["measured", "in the noise.json that was used, which is not here"]),
         ("nominal", "noise.json", ["nominal", "where the stage was sent"]),
         ("stated", "elemental.toml", ["as stated", "not measured", "as the set states it"]),
     ],

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+from msgspec import UNSET, UnsetType
 
 from faintfield.pipelines.reconstruction.depth.scene_structure import recommendation
 from tests.pipelines.conftest import Command, run_undrawn
@@ -12,9 +13,9 @@ from tests.pipelines.conftest import Command, run_undrawn
 @pytest.mark.parametrize(
     ("shares", "words"),
     [
-        ([0.95], "a single plane there fits"),
-        ([0.5, 0.45], "2 separate depths: planes there with --occlusion fit"),
+        ([0.5, 0.45], "2 separate depths: if nothing stands in between, planes there with --occlusion fit"),
         ([0.1, 0.2, 0.1], "continuum (40% of the samples of sure depth lie at the 3 depths that stand out): --surface"),
+        ([0.6], "the depth that stands out): --surface fits it"),
         ([], "--surface fits it"),
     ],
 )
@@ -24,8 +25,8 @@ def test_recommended_mode_follows_distribution_of_depths(shares: list[float], wo
     assert words in advice
 
 
-@pytest.mark.parametrize("shares", [[0.4, 0.38], [0.93 / 7] * 7, None])
-def test_nothing_is_recommended_without_clear_evidence(shares: list[float] | None) -> None:
+@pytest.mark.parametrize("shares", [[0.4, 0.38], [1.0], [0.93 / 7] * 7, UNSET])
+def test_nothing_is_recommended_without_clear_evidence(shares: list[float] | UnsetType) -> None:
     assert recommendation(shares) is None
 
 
@@ -37,4 +38,14 @@ def test_mode_is_named_at_end_and_on_page(tmp_path: Path, done: Command) -> None
     ended = done("reconstruct", tmp_path / "set", *method, "auto", "--json")
     assert "--surface fits it" in ended.stderr.splitlines()[-1]
     assert json.loads(ended.stdout)["recommendation"] == ended.stderr.splitlines()[-1]
+    assert "--surface fits it" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_depth_map_names_mode_as_often_as_asked(tmp_path: Path, done: Command) -> None:
+    words = ("--objects", "surfaces", "--size-px", 96, 72, "--rows", 5, "--columns", 5, "--snr", 30, "--seed", 7)
+    run_undrawn("simulate", tmp_path / "set", *words)
+    asked = ("--sweep-mm", "450:1100:6", "--depth-map", "--method", "backprojection", "--json")
+    ends = [json.loads(done("reconstruct", tmp_path / "set", "--out", tmp_path / "out", *asked).stdout) for _ in "12"]
+    assert "--surface fits it" in ends[0]["recommendation"]
+    assert ends[1]["recommendation"] == ends[0]["recommendation"]
     assert "--surface fits it" in (tmp_path / "out" / "report.html").read_text()

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 import tifffile
 
+from faintfield.pipelines.formats.results.surface import SurfaceChannel
 from faintfield.pipelines.formats.sets.elemental_set import load_set
+from faintfield.pipelines.reconstruction.planes.saturation import saturation_text
 from tests.pipelines.conftest import Command, Edit, made_once, run_undrawn
 from tests.pipelines.forms import read_record
 
@@ -58,7 +60,7 @@ def test_samples_above_saturation_are_unknown(
     assert np.mean(unknown[truth > 1.2 * saturation_e]) > 0.95
     assert np.mean(unknown[visible & (truth < 0.8 * saturation_e)]) < 0.05
     assert "% of the pixels are saturated and do not count" in ended.stderr
-    assert "brighter than that: NaN, hatched in the pictures; use a shorter exposure" in ended.stderr
+    assert "seen mostly by such pixels: NaN, hatched in the pictures; use a shorter exposure" in ended.stderr
     record = read_record(out)["planes"][0]
     assert record["saturated_share"] == pytest.approx(0.1, abs=0.02)
     assert record["unknown_share"] == pytest.approx(unknown.mean())
@@ -69,3 +71,13 @@ def test_samples_above_saturation_are_unknown(
         known = visible & ~unknown
         assert (np.isnan(sigma) == unknown).all()
         assert np.sqrt(np.mean(np.square((plane - truth)[known] / sigma[known]))) < 1.5
+
+
+def test_share_of_one_saturated_pixel_is_not_zero() -> None:
+    channel = SurfaceChannel(
+        channel="grey", penalty_weight=None, penalty_weight_chosen="given", certificate=None, passes=1,
+        likelihood="", mean_e=1.0, saturated_share=1 / 172_800, unknown_share=0.0,
+    )  # fmt: skip
+    text = saturation_text([channel])
+    assert text is not None
+    assert text.startswith("0.00058% of the pixels are saturated and do not count; use")
