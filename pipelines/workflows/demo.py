@@ -13,7 +13,7 @@ from faintfield.calib.noise_model import NoiseModel
 from faintfield.pipelines.arguments import Method
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.exchange.imported_set import relative
-from faintfield.pipelines.formats.files import check_free, write_json, write_record
+from faintfield.pipelines.formats.files import check_free, exclusive, write_json, write_record
 from faintfield.pipelines.formats.results.figures import METRICS_FILE, GeometryErrors, KnownValue, Metrics
 from faintfield.pipelines.formats.results.geometry import CameraPoses, read_geometry
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, read_noise
@@ -28,9 +28,9 @@ from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.reconstruction.accuracy import assess
 from faintfield.pipelines.reconstruction.options import Options
 from faintfield.pipelines.reconstruction.request import DEFAULT_METHOD, Request, folder_of_method, select_planes
+from faintfield.pipelines.reconstruction.run import reconstruct_set
 from faintfield.pipelines.reconstruction.surface.request import select_surface
 from faintfield.pipelines.simulation.synthetic_set import NOISE_FREE, render_scene, write_ground_truth
-from faintfield.pipelines.workflows.reconstruct import reconstruct_and_report
 from faintfield.pipelines.workflows.session import run_steps, session_steps
 from faintfield.recon.metrics import signal_scale_for_snr
 from faintfield.rig.cameras.settings import SimulatedSettings
@@ -105,14 +105,20 @@ def run_demo(out: Path, quick: bool, snr: float, seed: int) -> DemoResult:
     run_steps(session, session_steps(session, select_planes(asked), select_surface(asked)))
     inform("looking up the truth, and reconstructing with it and without any measured poses, for comparison")
     truth = write_truth(out / "truth", session, snr)
-    reconstruct_and_report(load_set(truth / NOISE_FREE), out / "noise-free", Request(depths, ["backprojection"]))
+    _reconstruct(load_set(truth / NOISE_FREE), out / "noise-free", Request(depths, ["backprojection"]))
     alone = Request(depths, [DEFAULT_METHOD])  # by total variation
-    reconstruct_and_report(load_session(session), out / "tv", alone)
-    reconstruct_and_report(nominal_session(session), out / "nominal", alone)
-    reconstruct_and_report(true_set(session, truth), out / "true", alone)
+    _reconstruct(load_session(session), out / "tv", alone)
+    _reconstruct(nominal_session(session), out / "nominal", alone)
+    _reconstruct(true_set(session, truth), out / "true", alone)
     metrics = demo_metrics(out, session, truth)
     write_record(out / METRICS_FILE, metrics)
     return DemoResult(str(out), str(write_report(out)), metrics)
+
+
+def _reconstruct(elemental_set: ElementalSet, out: Path, request: Request) -> None:
+    """Reconstruct planes without a report of their own: the demo's shows them."""
+    with exclusive(out):
+        reconstruct_set(elemental_set, out, request)
 
 
 def _make_free(out: Path) -> None:

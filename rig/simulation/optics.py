@@ -37,10 +37,7 @@ class SimulatedOptics:
 
     def relative_illumination(self) -> NDArray[np.float32]:
         """Return the light (row, column) of a scene of uniform radiance, relative to the optical axis."""
-        if not self.vignetting:
-            return np.ones(self.size_px[::-1], np.float32)
-        rays = self.rays()
-        return (1 / (1 + np.square(rays).sum(axis=-1)) ** 2).astype(np.float32)
+        return _relative_illumination(self)
 
     def ideal(self) -> "SimulatedOptics":
         """Return the optics without distortion and vignetting."""
@@ -58,6 +55,17 @@ def _rays(optics: SimulatedOptics, samples_per_px: int) -> NDArray[np.float32]:
     rays = np.stack(_undistort(x, y, optics.distortion), axis=-1).astype(np.float32)
     rays.flags.writeable = False
     return rays
+
+
+@lru_cache(maxsize=8)
+def _relative_illumination(optics: SimulatedOptics) -> NDArray[np.float32]:
+    """Return cos⁴ of the angle of each pixel's ray, cached as the rays are."""
+    if not optics.vignetting:
+        return np.ones(optics.size_px[::-1], np.float32)
+    x, y = np.moveaxis(optics.rays(), -1, 0)
+    illumination: NDArray[np.float32] = 1 / (1 + x * x + y * y) ** 2
+    illumination.flags.writeable = False
+    return illumination
 
 
 def distort(x: Points, y: Points, distortion: tuple[float, ...]) -> tuple[Points, Points]:

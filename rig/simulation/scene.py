@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import cv2
 import numpy as np
@@ -25,6 +25,12 @@ class TexturedPlane:
     opacity: NDArray[np.float32]
     pitch_mm: float
     rt_ref_plane: tuple[float, float, float, float, float, float]
+
+    @cached_property
+    def texture(self) -> NDArray[np.float32]:
+        """Reflectance times opacity, and opacity, (row, column, 2 or 4); cached because every view samples it."""
+        reflected = self.reflectance * _for_colours(self.opacity, self.reflectance.shape[2:])
+        return np.dstack([reflected, self.opacity]).astype(np.float32)
 
     @property
     def depth_mm(self) -> float:
@@ -102,10 +108,8 @@ def _sample(
     with np.errstate(divide="ignore", invalid="ignore"):
         columns = np.where(in_front, x / scale / plane.pitch_mm + (plane.opacity.shape[1] - 1) / 2, -10)
         rows = np.where(in_front, y / scale / plane.pitch_mm + (plane.opacity.shape[0] - 1) / 2, -10)
-    reflected_light = plane.reflectance * _for_colours(plane.opacity, plane.reflectance.shape[2:])
-    texture = np.dstack([reflected_light, plane.opacity]).astype(np.float32)
     place = columns.astype(np.float32), rows.astype(np.float32)
-    samples = cv2.remap(texture, *place, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+    samples = cv2.remap(plane.texture, *place, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
     reflected = samples[:, :, :-1]
     return (reflected if plane.reflectance.ndim == 3 else reflected[:, :, 0]), samples[:, :, -1]
 

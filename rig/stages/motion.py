@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from itertools import pairwise
 
 from msgspec import Struct
@@ -10,6 +11,7 @@ from faintfield.rig.errors import KeepOutCrossed, OutsideTravel
 from faintfield.rig.stages.protocol import Box, MotionLimits, Point
 
 
+@lru_cache(maxsize=4096)  # the time to go is predicted before every frame, over all that are left
 def duration_s(start: Point, end: Point, motion: MotionLimits, feed_mm_per_s: float = math.inf) -> float:
     """Return the duration of a straight motion from rest to rest; `feed_mm_per_s` is the requested speed.
 
