@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.library_solver import LibraryProblem, installed_solvers, iterates_of
-from benchmarks.problem import BenchmarkProblem
+from benchmarks.speed.library_solver import LibraryProblem, installed_solvers, iterates_of
+from benchmarks.speed.problem import BenchmarkProblem
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.single_plane import PlaneOperator
 from faintfield.recon.solver.data_fit import DataFit

@@ -1,9 +1,10 @@
 """Compare penalties, each at its best weight for the true picture, on four objects at SNR 0.16.
 
-The paper claims that total variation is best. Run `python -m benchmarks.penalties`; it prints one JSON object of mean
-square errors, the object scaled to run from 0 to 1.
+The paper claims that total variation is best. Run `python -m benchmarks.imaging.penalties`; it prints one JSON object
+of mean square errors, the object scaled to run from 0 to 1.
 """
 
+import argparse
 import json
 import sys
 from collections.abc import Callable
@@ -78,4 +79,5 @@ def smallest_errors(picture: Image, seed: int = 1) -> dict[str, float]:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(prog="python -m benchmarks.imaging.penalties", description=__doc__).parse_args()
     sys.stdout.write(json.dumps({name: smallest_errors(picture) for name, picture in pictures().items()}) + "\n")
