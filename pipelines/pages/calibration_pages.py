@@ -3,7 +3,7 @@
 from collections.abc import Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import msgspec
 import numpy as np
@@ -217,6 +217,12 @@ class Section[Record]:
     maps: list[str] = field(default_factory=list)
 
 
+class _Origin(TypedDict):
+    where: str
+    sha256: str
+    used: bool
+
+
 type NoiseSection = Section[NoiseRecord]
 type GeometrySection = Section[GeometryRecord]
 
@@ -260,7 +266,7 @@ def geometry_section(directory: Path, path: Path, inputs: Set[str]) -> GeometryS
     )
 
 
-def _origin(directory: Path, path: Path, inputs: Set[str]) -> dict[str, Any]:
+def _origin(directory: Path, path: Path, inputs: Set[str]) -> _Origin:
     digest = sha256(path)
     return {"where": _link(directory, path), "sha256": digest, "used": digest in inputs}
 

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple, NotRequired, TypedDict
+from typing import Literal, NamedTuple, NotRequired, TypedDict
 
 import cv2
 import numpy as np
@@ -47,8 +47,17 @@ _MAP_STEPS, _SIGMA_STEPS = 512, 128
 
 type Kind = Literal["light", "sigma", "view", "bright", "depth", "depth_sigma", "confidence"]
 
-# Black, white and name of the pictures of each kind when the page opens; maps in `colours` instead of grey.
-type Scales = dict[Kind, dict[str, float | str | bool]]
+
+class Scale(TypedDict):
+    """Black, white and name of the pictures of a kind when the page opens; maps in `colours` instead of grey."""
+
+    black: float
+    white: float
+    name: str
+    colours: NotRequired[bool]
+
+
+type Scales = dict[Kind, Scale]
 
 
 class Fineness(NamedTuple):
@@ -98,13 +107,30 @@ class ViewerPicture(TypedDict):
     toned: NotRequired[bool]
 
 
+class ViewerData(TypedDict):
+    """Data of the viewer; JSON for the page's script.
+
+    `first` are the indices of the pictures that it opens with, and `length` is the unit of length. Planes are in bins
+    if `binned`.
+    """
+
+    pictures: list[ViewerPicture]
+    scales: Scales
+    places: list[str]
+    quantity: str
+    toned: bool
+    length: str
+    binned: bool
+    first: tuple[int, int]
+
+
 def viewer_of(
     planes: list[Plane],
     shown: PlaneSections,
     the_set: SetSection | None,
     surfaces: Mapping[Path, SurfaceFileRecord] = MappingProxyType({}),
-) -> dict[str, Any] | None:
-    """Return the data of the viewer as JSON for the page's script, None without planes and surfaces.
+) -> ViewerData | None:
+    """Return the data of the viewer, None without planes and surfaces.
 
     The grey scales are those of the pictures `shown`. The views are those of `the_set`, if there is one.
     """

@@ -161,7 +161,7 @@ def test_titles_say_whether_occlusion_was_kept(kept: bool, planes: Path, done: C
 
 def test_errors_follow_prior_of_each_plane(planes: Path, done: Command) -> None:
     """Where a prior is left out at one depth, its errors lead the page beside those of the other."""
-    priors: dict[float, dict[str, Any]] = {
+    priors: dict[float, dict[str, str | float]] = {
         500.0: {"name": "tv", "left_out": "the views contradict it"},
         700.0: {"name": "auto", "moved_sigma": 0.5},
     }
