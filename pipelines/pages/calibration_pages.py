@@ -49,7 +49,7 @@ _LENS = (
     *((f"distortion {name}", "") for name in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
 )
 
-# The quantities of a sensor that matter most: name, words, symbol, unit, factor to it.
+# The quantities of a sensor that matter most: key, name, symbol, unit, factor to it.
 NOISE_QUANTITIES = (
     ("gain_dn_per_e", "gain", "K", "DN/e⁻", 1.0),
     ("read_noise_e", "read noise", "σ_d", "e⁻", 1.0),
@@ -85,7 +85,7 @@ def geometry_page(geometry: GeometryRecord, limits: "GeometrySettings") -> str:
 
 def stage_rows(stage: StageReport) -> list[Row]:
     """Return the table of the stage."""
-    return [_row(getattr(stage, name), words, unit, factor) for name, words, unit, factor in _FIGURES]
+    return [_row(getattr(stage, key), name, unit, factor) for key, name, unit, factor in _FIGURES]
 
 
 def holdout_rows(geometry: GeometryRecord, limits: "GeometrySettings") -> list[Row]:
@@ -242,9 +242,9 @@ def noise_section(directory: Path, path: Path, inputs: Set[str]) -> NoiseSection
         made=record.provenance,
         record=record,
         rows=[
-            estimate_row(measured, html_symbols(f"{words}, {symbol}"), unit, factor)
-            for name, words, symbol, unit, factor in NOISE_QUANTITIES
-            if isinstance(measured := getattr(record, name), Estimate)
+            estimate_row(measured, html_symbols(f"{name}, {symbol}"), unit, factor)
+            for key, name, symbol, unit, factor in NOISE_QUANTITIES
+            if isinstance(measured := getattr(record, key), Estimate)
         ],
         unusable={kind: len(getattr(record, f"{kind}_pixels")) for kind in ("hot", "noisy", "dead")},
     )

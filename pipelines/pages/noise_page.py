@@ -13,7 +13,7 @@ from faintfield.pipelines.pages.noise_plots import emva_drawings, fit_drawings
 from faintfield.pipelines.pages.page import Row, estimate_row, html_symbols, template
 from faintfield.pipelines.pages.pixel_maps import map_drawings
 
-# Name, words, symbol, unit, factor to it.
+# Key, name, symbol, unit, factor to it.
 type _Quantity = tuple[str, str, str, str, float]
 
 # Groups of lines by title. First those that matter most and how far the frames keep to the model, then EMVA 1288.
@@ -124,13 +124,13 @@ def _table(
     groups = []
     for title, lines in quantities.items():
         rows = []
-        for key, words, symbol, unit, factor in lines:
+        for key, name, symbol, unit, factor in lines:
             versions: dict[str, Callable[[float], float]] = {unit: float}
             if key in ("snr_max", "dynamic_range") and all(of_phase[key].value is not None for of_phase in known):
                 versions |= _RATIOS
             for shown, function in versions.items():
                 cells = [
-                    estimate_row(_mapped(of_phase[key], function), words, shown, factor, symbol) for of_phase in known
+                    estimate_row(_mapped(of_phase[key], function), name, shown, factor, symbol) for of_phase in known
                 ]
                 rows.append([_explained(cell, of_phase) for cell, of_phase in zip(cells, explained, strict=True)])
         groups.append((title, rows))
@@ -141,6 +141,6 @@ def _explained(cell: Row, explained: dict[str, str]) -> Row:
     """Return a cell that refers to an earlier one of the same phase with the same reason."""
     if not cell.why:
         return cell
-    words = f"{cell.words}, {cell.symbol}".removesuffix(", ")
-    first = explained.setdefault(cell.why, words)
-    return cell if first == words else cell._replace(why=f"as for {first}")
+    quantity = f"{cell.name}, {cell.symbol}".removesuffix(", ")
+    first = explained.setdefault(cell.why, quantity)
+    return cell if first == quantity else cell._replace(why=f"as for {first}")

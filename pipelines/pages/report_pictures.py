@@ -41,7 +41,7 @@ class Slide(TypedDict):
     """One plane of a slider; JSON for the page's script. `samples` are those of a row."""
 
     depth: float
-    words: str
+    label: str
     samples: int
 
 
@@ -114,7 +114,7 @@ def plane_sections(planes: list[Plane], results: Iterable[ReconstructionRecord])
         best_title=titles[best],
         left_out=next((record.occlusion_left_out for _, record in records if record.occlusion_left_out), None),
         blurred=len(places) > 1 and of_best[0].method not in JOINT_METHODS,
-        best_planes=[(words, cell) for words, cells in best_rows for cell in cells if cell],
+        best_planes=[(label, cell) for label, cells in best_rows for cell in cells if cell],
         weight_curves=_weight_curves(of_best),
         certificates=[
             (label, record.certificate)
@@ -138,7 +138,7 @@ def plane_sections(planes: list[Plane], results: Iterable[ReconstructionRecord])
 
 def _slides(title: str, planes: list[Plane]) -> Slides:
     """Return the planes of a column, whose pictures the page's script takes from the viewer."""
-    slides = [Slide(depth=plane.depth_mm, words=plane.label, samples=plane.pixels().shape[1]) for plane in planes]
+    slides = [Slide(depth=plane.depth_mm, label=plane.label, samples=plane.pixels().shape[1]) for plane in planes]
     return Slides(title=title, planes=slides)
 
 

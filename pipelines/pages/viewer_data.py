@@ -90,7 +90,7 @@ class ViewerPicture(TypedDict):
 
     kind: Kind
     title: str
-    words: str
+    label: str
     place: int | None
     unit: str
     low: float
@@ -229,10 +229,10 @@ def _views(the_set: SetSection, scales: Scales) -> list[ViewerPicture]:
     return views
 
 
-def _view(kind: Kind, title: str, words: str, unit: str, low: float, step: float) -> ViewerPicture:
+def _view(kind: Kind, title: str, label: str, unit: str, low: float, step: float) -> ViewerPicture:
     element = f"{'recorded' if kind == 'view' else kind}-view"
     return ViewerPicture(
-        kind=kind, title=title, words=words, place=None, unit=unit, low=low, step=step, bins=1, element=element
+        kind=kind, title=title, label=label, place=None, unit=unit, low=low, step=step, bins=1, element=element
     )
 
 
@@ -245,7 +245,7 @@ class _Source(NamedTuple):
     read: Callable[[], NDArray[np.floating]]
     kind: Kind
     title: str
-    words: str
+    label: str
     place: int | None
     unit: str
     pitch: float | None = None
@@ -308,12 +308,12 @@ def _surface_sources(
         return robust_limits(values)
 
     sources = []
-    for kind, name, words, unit in entries:
+    for kind, name, label, unit in entries:
         sure_above = surface.sure_above if kind == "depth" else None
-        sources.append(_Source(partial(read, name), kind, title, words, None, unit, sure_above=sure_above))
+        sources.append(_Source(partial(read, name), kind, title, label, None, unit, sure_above=sure_above))
         if kind not in scales:
             black, white = limits(kind, name)
-            scales[kind] = {"black": black, "white": white, "name": words}
+            scales[kind] = {"black": black, "white": white, "name": label}
             if kind not in ("light", "sigma"):
                 scales[kind]["colours"] = True
     return sources
@@ -396,7 +396,7 @@ def _packed_picture(source: _Source, numbers: NDArray[np.floating], step: float,
     picture = ViewerPicture(
         kind=source.kind,
         title=source.title,
-        words=source.words,
+        label=source.label,
         place=source.place,
         unit=source.unit,
         low=packed.low,

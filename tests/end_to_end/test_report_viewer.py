@@ -284,7 +284,7 @@ def test_keyboard_reads_sample_aloud(page: Tab, report: Path) -> None:
 def _page_of(numbers: NDArray[np.float32], folder: Path) -> str:
     """Return the address of a page with the viewer alone, of one plane (row, column, colour)."""
     packed = pack(numbers, 1e-3)
-    picture: dict[str, Any] = {"kind": "light", "title": "PMLEM", "words": "500 mm", "place": 0, "unit": "e⁻ per pixel"}
+    picture: dict[str, Any] = {"kind": "light", "title": "PMLEM", "label": "500 mm", "place": 0, "unit": "e⁻ per pixel"}
     picture |= {"low": packed.low, "step": packed.step, "bins": 1, "pitch": 0.5, "origin": (-10.0, 20.0)}
     shown: dict[str, Any] = {"pictures": [{**picture, "src": smaller_uri(packed.png)}], "places": ["500 mm"]}
     shown |= {"scales": {"light": {"black": 0.0, "white": 2.0, "name": "planes"}}}

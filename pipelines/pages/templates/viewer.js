@@ -86,7 +86,7 @@ const viewer = (() => {
     return one.canvas;
   }
   const sure = (one, doubt, at) => doubt.levels[at] !== UNKNOWN && number(doubt, doubt.levels[at]) >= one.sure_above;
-  const name = one => one.title + ", " + one.words;
+  const name = one => one.title + ", " + one.label;
   /** Numbers of the sample at a place, in words with their units; null outside the picture. */
   function valueAt(one, u, v) {
     const [column, row] = [Math.floor(u * one.width), Math.floor(v * one.width)];
@@ -557,5 +557,5 @@ const viewer = (() => {
     stage.dataset.ready = "all";
     draw();
   })();
-  return { ready, still, find: (title, words) => pictures.find(one => one.kind === "light" && one.title === title && one.words === words) };
+  return { ready, still, find: (title, label) => pictures.find(one => one.kind === "light" && one.title === title && one.label === label) };
 })();

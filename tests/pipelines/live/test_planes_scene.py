@@ -1,4 +1,4 @@
-"""What live planes know of a session that is not complete, and what they compute from it."""
+"""Scenes of live planes from a session that is not complete, and the planes computed from them."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -28,7 +28,7 @@ VOID = {"meta", "img", "input", "br", "hr", "link"}
 
 
 class _Page(HTMLParser):
-    """What is on a page: its elements, its words, and whether every element is closed in turn."""
+    """Content of a page: its elements, its words, and elements that are not closed in turn."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -160,7 +160,7 @@ def test_titles_say_whether_occlusion_was_kept(kept: bool, planes: Path, done: C
 
 
 def test_errors_follow_prior_of_each_plane(planes: Path, done: Command) -> None:
-    """Where a prior is left out at one depth, its errors lead the page beside those of the other."""
+    """Errors of a prior lead the page beside those at the depth where it is left out."""
     priors: dict[float, dict[str, str | float]] = {
         500.0: {"name": "tv", "left_out": "the views contradict it"},
         700.0: {"name": "auto", "moved_sigma": 0.5},

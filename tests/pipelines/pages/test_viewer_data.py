@@ -121,7 +121,7 @@ def test_joint_planes_stand_beside_best_found_alone(tmp_path: Path) -> None:
     first, second = (shown["pictures"][index] for index in shown["first"])
     assert first["title"] == "PMLEM"
     assert second["title"].startswith("PMLEM, all planes together")
-    assert first["words"] == second["words"] == "500 mm"
+    assert first["label"] == second["label"] == "500 mm"
 
 
 def test_page_of_set_states_numbers_units_and_places(simulated_scene: Path, tmp_path: Path) -> None:
