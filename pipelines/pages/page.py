@@ -50,6 +50,16 @@ class Row(NamedTuple):
     symbol: str = ""
 
 
+class Quantity(NamedTuple):
+    """A quantity of a table: its key in a record, and its unit on a page, to which the recorded value has a factor."""
+
+    key: str
+    name: str
+    unit: str = ""
+    symbol: str = ""
+    factor: float = 1.0
+
+
 class Fact(NamedTuple):
     """A number with its name and meaning."""
 
@@ -76,8 +86,9 @@ def _environment() -> Environment:
     return environment
 
 
-def estimate_row(known: Estimate, name: str, unit: str, factor: float = 1.0, symbol: str = "") -> Row:
+def estimate_row(known: Estimate, quantity: Quantity) -> Row:
     """Return the line of a quantity, its interval to two digits of half its width."""
+    _, name, unit, symbol, factor = quantity
     if known.value is None:
         return Row(name, unit=unit, why=known.why or "no reason stated", symbol=symbol)
     value = known.value * factor

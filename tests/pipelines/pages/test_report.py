@@ -305,12 +305,12 @@ def test_viewer_shows_surface_with_its_uncertainty(surface: Path, done: Command)
     done("report", surface)
     data = (surface / "report.html").read_text().partition('id="viewer-data">')[2].partition("</script>")[0]
     viewer = json.loads(data)
-    pictures = {picture["words"]: picture for picture in viewer["pictures"]}
+    pictures = {picture["label"]: picture for picture in viewer["pictures"]}
     depth, picture = pictures["depth"], pictures["picture"]
     assert viewer["pictures"][viewer["first"][1]] == picture
-    assert viewer["pictures"][picture["sigma"]]["words"] == "σ of the picture"
-    assert viewer["pictures"][depth["sigma"]]["words"] == "σ of the depth"
-    assert viewer["pictures"][depth["confidence"]]["words"] == "probability of the depth"
+    assert viewer["pictures"][picture["sigma"]]["label"] == "σ of the picture"
+    assert viewer["pictures"][depth["sigma"]]["label"] == "σ of the depth"
+    assert viewer["pictures"][depth["confidence"]]["label"] == "probability of the depth"
     assert (depth["unit"], depth["sure_above"]) == ("mm", 0.9)
     assert viewer["scales"]["depth"] == {
         "black": 449.775,
