@@ -16,8 +16,9 @@ from faintfield.recon.metrics import mean_square_error, signal_scale_for_snr
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.single_plane import PlaneOperator
 from faintfield.recon.solver.data_fit import DataFit
-from faintfield.recon.solver.initialization import smooth_start, universal_penalty_weight
+from faintfield.recon.solver.initialization import smooth_start
 from faintfield.recon.solver.penalties import Penalty, PenaltyName
+from faintfield.recon.solver.penalty_weight import universal_penalty_weight
 from faintfield.recon.solver.pmlem import pmlem
 from faintfield.rig.simulation.objects import shaded_ball, star_chart, toy_airplane, toy_truck
 from faintfield.rig.simulation.scene import TexturedPlane

@@ -12,9 +12,9 @@ from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.formats.results.records import Certificate, PenaltyRecord, SolveRecord, WeightScore
 from faintfield.recon.likelihood.images import Image, select_likelihood
 from faintfield.recon.solver.data_fit import SceneProblem
-from faintfield.recon.solver.initialization import mean_light_e, universal_penalty_weight
+from faintfield.recon.solver.initialization import mean_light_e
 from faintfield.recon.solver.penalties import Penalty
-from faintfield.recon.solver.penalty_weight import MIN_VIEWS, cross_validated_weight
+from faintfield.recon.solver.penalty_weight import MIN_VIEWS, cross_validated_weight, universal_penalty_weight
 from faintfield.recon.solver.pmlem import iterate_until, pmlem
 from faintfield.recon.solver.proximal import DualField
 from faintfield.recon.solver.uncertainty import (
