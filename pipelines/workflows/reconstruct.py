@@ -84,7 +84,7 @@ def surface_and_report(elemental_set: ElementalSet, out: Path, request: SurfaceR
     sure = f"{record.known_share:.0%} of its depths known, {record.sure_share:.0%} sure"
     inform(f"a surface in {time.monotonic() - started:.1f} s, {sure}: {report}")
     advice = recommendation(record.share_of_sure) if record.warning is None else None
-    if last := record.warning or advice:
+    if last := record.warning or record.remark or advice:
         inform(last)
     return Outcome(
         out=str(out),
