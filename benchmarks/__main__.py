@@ -13,9 +13,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from benchmarks.passes import compare_passes, memory, scaling
-from benchmarks.problem import BenchmarkProblem
-from benchmarks.solvers import compare_solvers
+from benchmarks.speed.passes import compare_passes, memory, scaling
+from benchmarks.speed.problem import BenchmarkProblem
+from benchmarks.speed.solvers import compare_solvers
 
 _MEANING = {
     "size_px": "width and height of the detector and of the plane",

@@ -48,7 +48,7 @@ _MODULES = {
     "simulate": "pipelines.commands.simulation",
     "smooth_start": "recon.solver.initialization",
     "taken_frames": "rig.session.session",
-    "universal_penalty_weight": "recon.solver.initialization",
+    "universal_penalty_weight": "recon.solver.penalty_weight",
 }
 __all__ = list(_MODULES)
 
@@ -79,7 +79,7 @@ if TYPE_CHECKING:  # type checkers and editors read these lines; a test compares
     from faintfield.recon.solver.data_fit import DataFit as DataFit
     from faintfield.recon.solver.initialization import back_projection as back_projection
     from faintfield.recon.solver.initialization import smooth_start as smooth_start
-    from faintfield.recon.solver.initialization import universal_penalty_weight as universal_penalty_weight
+    from faintfield.recon.solver.penalty_weight import universal_penalty_weight as universal_penalty_weight
     from faintfield.recon.solver.pmlem import pmlem as pmlem
     from faintfield.rig.devices import open_rig as open_rig
     from faintfield.rig.devices import open_stage as open_stage

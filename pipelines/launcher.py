@@ -79,15 +79,15 @@ _START = """Start with: faintfield demo first-demo
 The --help of every command ends with an example; docs/guide.md leads from the parts list to the first plane."""
 
 
-def _words_of_usage(failure: CycloptsError) -> str:
-    """Return what is wrong with the words of a command, and of words without a place what to do with them."""
+def _explain_usage(failure: CycloptsError) -> str:
+    """Return what is wrong with the arguments of a command, and the remedy for arguments without a place."""
     unused = failure.unused_tokens if isinstance(failure, UnusedCliTokensError) else None
     if not unused or failure.app is None:
         return str(failure)
     repeatable = {item.name for item in failure.app.assemble_argument_collection() if item.token_count()[1]}
     tokens = failure.root_input_tokens or []
-    words = [part for token in tokens for part in (token.split("=", 1) if token.startswith("--") else [token])]
-    for option, *values in (words[place:] for place, word in enumerate(words) if word in repeatable):
+    parts = [part for token in tokens for part in (token.split("=", 1) if token.startswith("--") else [token])]
+    for option, *values in (parts[place:] for place, part in enumerate(parts) if part in repeatable):
         if values[1:2] == unused[:1]:
             several = [values[0], *takewhile(unused.__contains__, values[1:])]
             calls = " ".join(f"{option} {value}" for value in several)
@@ -102,7 +102,7 @@ app = App(
     help_epilogue=_START,
     version=lambda: faintfield.__version__,
     error_console=framed_console,
-    error_formatter=lambda failure: CycloptsPanel(visible(_words_of_usage(failure))),
+    error_formatter=lambda failure: CycloptsPanel(visible(_explain_usage(failure))),
     help_format="plaintext",  # the help of a command is in Markdown, which takes long to load
     default_parameter=Parameter(negative=()),
     result_action="return_value",
@@ -129,10 +129,10 @@ def _register(parent: App, name: str, target: str, example: str, place: int, gro
     )
 
 
-def _register_verb(examples: Sequence[str], words: str) -> None:
+def _register_verb(examples: Sequence[str], description: str) -> None:
     verb = examples[0].split()[0]
     epilogue = f"Example: faintfield {examples[0]}"
-    app.command(App(name=verb, help=words, group=_FILES, help_epilogue=epilogue, help_format="plaintext"))
+    app.command(App(name=verb, help=description, group=_FILES, help_epilogue=epilogue, help_format="plaintext"))
     for place, example in enumerate(examples, start=1):
         name = example.split()[1]
         _register(app[verb], name, f"{verb}s:{verb}_{name}", example, place)

@@ -88,7 +88,7 @@ class SettleSettings(Struct, frozen=True, forbid_unknown_fields=True):
     limit_px: float = 0.1
     board_limit_px: float = 0.01
     longest_s: float = 3.0
-    wait_s: float = 0.5
+    wait_s: float = 1.0
 
     def __post_init__(self) -> None:
         positive = (self.exposure_s, self.longest_s, self.limit_px, self.board_limit_px)

@@ -222,8 +222,8 @@ def _check_scene(
     background, variance = generator.uniform(0.2, 3.0, (2, lattices, rows, columns)).astype(dtype)
     kept = samples.copy(), images.copy()
 
-    def check_sums(operation: int, chosen: NDArray[np.intp], allowed: float = tolerance, **given: Any) -> None:
-        sums, wanted = (sweeps.run(Sweep(operation, chosen, everything, **given))[1] for sweeps in (tested, truth))
+    def check_sums(operation: int, chosen: NDArray[np.intp], allowed: float = tolerance, **arrays: Any) -> None:
+        sums, wanted = (sweeps.run(Sweep(operation, chosen, everything, **arrays))[1] for sweeps in (tested, truth))
         _close(sums, wanted, allowed)
 
     for chosen in (everything, everything[-2::-2].copy()):

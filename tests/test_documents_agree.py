@@ -39,6 +39,12 @@ def test_links_lead_somewhere() -> None:
                 assert not anchor or anchor in _anchors(path), (document, target)
 
 
+def test_benchmarks_of_documents_exist() -> None:
+    for document in _DOCUMENTS:
+        for module in re.findall(r"python -m (benchmarks[\w.]*)", document.read_text()):
+            assert importlib.util.find_spec(module), (document, module)
+
+
 def _anchors(document: Path) -> set[str]:
     """Return the anchors of a document's headings, as GitHub makes them."""
     headings = re.findall(r"^#+ (.*)$", document.read_text(), flags=re.MULTILINE)

@@ -16,7 +16,8 @@ from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.single_plane import PlaneOperator
 from faintfield.recon.prior.collaborative import Patches, collaborative_wiener, wiener_and_thresholded
 from faintfield.recon.prior.evidence import noise_of_back_projection
-from faintfield.recon.solver.initialization import back_projection, smooth_start, universal_penalty_weight
+from faintfield.recon.solver.initialization import back_projection, smooth_start
+from faintfield.recon.solver.penalty_weight import universal_penalty_weight
 from training.pictures import Picture, picture
 
 # Samples of a plane along each side, and pixels of a view: a view is smaller or larger than the plane.

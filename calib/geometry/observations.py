@@ -101,31 +101,33 @@ def gather(
     ValueError
         A corner does not exist on its board.
     """
-    useful = [seen for seen in observations if _determines_pose(seen, corner_shapes)]
+    useful = [observation for observation in observations if _determines_pose(observation, corner_shapes)]
     nodes = _connected_nodes(useful, reference)
     if not nodes:
         raise TooFewViews(
             f"node {reference}, whose camera is the reference, shows no board with {_MIN_CORNERS} corners or more; "
             "take it again with a board in view"
         )
-    kept = [seen for seen in useful if seen.node in nodes]
-    targets = sorted({seen.target for seen in kept}, key=lambda target: (target.sweep, target.homing, target.board))
-    kept.sort(key=lambda seen: (targets.index(seen.target), nodes.index(seen.node)))
-    node_of = np.array([nodes.index(seen.node) for seen in kept], np.int32)
-    target_of = np.array([targets.index(seen.target) for seen in kept], np.int32)
+    kept = [observation for observation in useful if observation.node in nodes]
+    targets = sorted(
+        {observation.target for observation in kept}, key=lambda target: (target.sweep, target.homing, target.board)
+    )
+    kept.sort(key=lambda observation: (targets.index(observation.target), nodes.index(observation.node)))
+    node_of = np.array([nodes.index(observation.node) for observation in kept], np.int32)
+    target_of = np.array([targets.index(observation.target) for observation in kept], np.int32)
     return Observations(nodes, targets, node_of, target_of, *_lattices(kept, corner_shapes))
 
 
 def as_one_homing(observations: Sequence[BoardObservation]) -> list[BoardObservation]:
     """Return the observations as if no homing had interrupted a sweep."""
-    return [replace(seen, target=replace(seen.target, homing=0)) for seen in observations]
+    return [replace(observation, target=replace(observation.target, homing=0)) for observation in observations]
 
 
 def interrupted_sweeps(observations: Sequence[BoardObservation]) -> list[int]:
     """Return the sweeps within which the stage homed."""
     homings: dict[int, set[int]] = {}
-    for seen in observations:
-        homings.setdefault(seen.target.sweep, set()).add(seen.target.homing)
+    for observation in observations:
+        homings.setdefault(observation.target.sweep, set()).add(observation.target.homing)
     return sorted(sweep for sweep, of_sweep in homings.items() if len(of_sweep) > 1)
 
 
@@ -133,32 +135,31 @@ def _lattices(
     views: Sequence[BoardObservation], corner_shapes: dict[str, tuple[int, int]]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return `pixels` and `weights` of the views' corners, see `Observations`."""
-    shape = np.max([corner_shapes[seen.target.board] for seen in views], axis=0)
+    shape = np.max([corner_shapes[observation.target.board] for observation in views], axis=0)
     pixels, weights = np.zeros((len(views), *shape, 2)), np.full((len(views), *shape), -1.0)
-    typical_px = float(np.median(np.concatenate([seen.sigma_px for seen in views])))
-    for view, seen in enumerate(views):
-        rows, columns = corner_shapes[seen.target.board]
-        row, column = np.divmod(seen.corners, columns)
+    typical_px = float(np.median(np.concatenate([observation.sigma_px for observation in views])))
+    for view, observation in enumerate(views):
+        rows, columns = corner_shapes[observation.target.board]
+        row, column = np.divmod(observation.corners, columns)
         if row.max() >= rows:
-            raise ValueError(
-                f"board '{seen.target.board}' has no corner {seen.corners.max()}; give the board as printed"
-            )
-        pixels[view, row, column] = seen.pixels
-        weights[view, row, column] = typical_px / seen.sigma_px
+            board, corner = observation.target.board, observation.corners.max()
+            raise ValueError(f"board '{board}' has no corner {corner}; give the board as printed")
+        pixels[view, row, column] = observation.pixels
+        weights[view, row, column] = typical_px / observation.sigma_px
     return pixels, weights
 
 
-def _determines_pose(seen: BoardObservation, corner_shapes: dict[str, tuple[int, int]]) -> bool:
+def _determines_pose(observation: BoardObservation, corner_shapes: dict[str, tuple[int, int]]) -> bool:
     """Return whether corners are enough, and on two rows and two columns at least: they then determine the pose."""
-    row, column = np.divmod(seen.corners, corner_shapes[seen.target.board][1])
-    return len(seen.corners) >= _MIN_CORNERS and len(np.unique(row)) > 1 and len(np.unique(column)) > 1
+    row, column = np.divmod(observation.corners, corner_shapes[observation.target.board][1])
+    return len(observation.corners) >= _MIN_CORNERS and len(np.unique(row)) > 1 and len(np.unique(column)) > 1
 
 
 def _connected_nodes(observations: Sequence[BoardObservation], reference: Node) -> list[Node]:
     """Return the nodes that chains of common boards connect to the reference, the reference first."""
     nodes_of: dict[Target, set[Node]] = {}
-    for seen in observations:
-        nodes_of.setdefault(seen.target, set()).add(seen.node)
+    for observation in observations:
+        nodes_of.setdefault(observation.target, set()).add(observation.node)
     reached = {reference} if any(reference in nodes for nodes in nodes_of.values()) else set()
     waiting = list(reached)
     while waiting:

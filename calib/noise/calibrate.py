@@ -174,8 +174,9 @@ def calibrate(series: Sequence[Series], saturation_dn: float = np.inf) -> NoiseC
     fitted = replace(fitted, fit=with_doubling_error(fitted.fit, fitted.moments, darks, warmth))
     pixels, points = measure_pixels(fitted, hot, outlying), transfer_points(fitted)
     level, noise = level_warning(fitted), noise_warning(fitted, points)
+    goodness = series_goodness(fitted)
     estimates, covariance = estimate_all(
-        fitted, pixels.response, saturation, levels_hold=level is None, noise_holds=noise is None
+        fitted, pixels.response, saturation, goodness, levels_hold=level is None, noise_holds=noise is None
     )
     return NoiseCalibration(
         estimates=estimates,
@@ -189,7 +190,7 @@ def calibrate(series: Sequence[Series], saturation_dn: float = np.inf) -> NoiseC
         saturation=saturation,
         response=_bent_response(fitted),
         goodness=(
-            *series_goodness(fitted),
+            *goodness,
             *(goodness_of(flat, left_out=why) for flat, why in saturation.left_out),
         ),
         warnings=(

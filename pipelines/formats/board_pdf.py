@@ -86,12 +86,12 @@ def _page(board: Board, width_mm: float, height_mm: float) -> str:
         lines.append(f"{left + x:.5f} {top - y - down:.5f} {across:.5f} {down:.5f} re")
     lines.append("f")
     lines += _scale_bar(_MARGIN_MM, _MARGIN_MM)
-    words = (
+    entry = (
         f'[[board]] name = "{board.name}"  columns = {board.columns}  rows = {board.rows}  '
         f"square_mm = {board.square_mm:g}  marker_mm = {board.marker_mm:g}  "
         f'dictionary = "{board.dictionary}"  first_marker_id = {board.first_marker_id}'
     )
-    lines.append(_text(_MARGIN_MM + _SCALE_BAR_MM + 8, _MARGIN_MM + 3.2, 2.6, words))
+    lines.append(_text(_MARGIN_MM + _SCALE_BAR_MM + 8, _MARGIN_MM + 3.2, 2.6, entry))
     lines.append(_text(_MARGIN_MM + _SCALE_BAR_MM + 8, _MARGIN_MM - 0.8, 2.6, "Print at 100 %. If the bar is not "
                        f"{_SCALE_BAR_MM:g} mm long, correct square_mm and marker_mm in the same ratio."))  # fmt: skip
     return "\n".join(lines)

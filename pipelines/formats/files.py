@@ -138,7 +138,7 @@ def check_free(
     that match the patterns `replace_only`. Raises OutputExists if it is another, or holds a path of `reads`.
     """
     with translated_write_errors(out):
-        out = out.resolve()
+        folder = out.resolve()
         if out.exists() and not out.is_dir():
             raise OutputExists(f"{out}: is a file, and a folder is to be written there; name another place")
         held = sorted(path.name for path in out.iterdir()) if out.exists() else []
@@ -152,7 +152,7 @@ def check_free(
         )
     for path in reads:
         # A link counts both where it leads and where it lies
-        if any(place.resolve().is_relative_to(out) for place in (path, path.parent)):
+        if any(place.resolve().is_relative_to(folder) for place in (path, path.parent)):
             raise OutputExists(f"{out}: holds {path}, which is read; name another folder")
     if held and not overwrite:
         raise OutputExists(

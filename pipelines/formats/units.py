@@ -122,7 +122,7 @@ class StatedUnits(Units, frozen=True, forbid_unknown_fields=False, omit_defaults
         return {"electrons": "e⁻", "dn": "DN", "relative": "of white"}[self.light]
 
     @property
-    def light_in_words(self) -> str:
+    def light_description(self) -> str:
         """Quantity of the values of a plane."""
         return {
             "electrons": "expected electrons per detector pixel of the reference view",

@@ -287,12 +287,12 @@ def _planes(planes: PlanesClient) -> dict[str, Any]:
 def _state(panel: CapturePanel) -> dict[str, Any]:
     """Return the content of the page, except the picture, as a JSON object."""
     asked, status, shown = panel.asked, panel.status, panel.shown
-    words = REQUESTS if asked is None else asked.prompt.answers
+    buttons = REQUESTS if asked is None else asked.prompt.answers
     return {
         "prompt": None if asked is None else {"number": asked.number, **msgspec.to_builtins(asked.prompt)},
         "status": None if status is None else msgspec.to_builtins(status),
         "to_go": "" if status is None else format_duration(status.to_go_s),
-        "buttons": [{"word": word, "label": LABELS[word]} for word in words],
+        "buttons": [{"word": word, "label": LABELS[word]} for word in buttons],
         "frame": None if shown is None else _frame(shown),
         "outcome": panel.outcome,
     }

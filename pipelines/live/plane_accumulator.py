@@ -18,7 +18,7 @@ from faintfield.recon.depth.focus import FocusMeasure, RunningPlane, SeenByView,
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages, Image, binned
 from faintfield.recon.solver.data_fit import SceneProblem
-from faintfield.recon.solver.initialization import universal_penalty_weight
+from faintfield.recon.solver.penalty_weight import universal_penalty_weight
 from faintfield.recon.solver.pmlem import pmlem
 from faintfield.recon.solver.proximal import DualField
 

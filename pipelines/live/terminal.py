@@ -79,8 +79,8 @@ class TerminalView:
         if asked is not None and asked.number != self._prompt_number:
             self._prompt_number = asked.number
             prompt = asked.prompt
-            answers = f"{_key_line(prompt.answers, '   ')}   (Enter: {LABELS[prompt.answers[0]]})"
-            for line in ("", prompt.title, *(f"  {line}" for line in (*prompt.lines, answers))):
+            keys = f"{_key_line(prompt.answers, '   ')}   (Enter: {LABELS[prompt.answers[0]]})"
+            for line in ("", prompt.title, *(f"  {line}" for line in (*prompt.lines, keys))):
                 inform(line)
         if status is not None:
             title = [status.title] if self._panel.unattended else []
@@ -103,8 +103,8 @@ class TerminalView:
         return Group(*parts)
 
 
-def _key_line(answers: Iterable[str], gap: str) -> str:
-    return gap.join(f"[{_KEYS[answer]}] {LABELS[answer]}" for answer in answers)
+def _key_line(buttons: Iterable[str], gap: str) -> str:
+    return gap.join(f"[{_KEYS[button]}] {LABELS[button]}" for button in buttons)
 
 
 def _describe_status(status: Status) -> str:
@@ -123,10 +123,10 @@ def _describe_frame(shown: ShownFrame) -> str:
 
 def describe_values(shown: ShownFrame) -> list[str]:
     """Return the measured values of a frame in words, and black and white of its picture if they are fixed."""
-    words = [_VALUES.get(name, f"{visible(name)} {{:g}}").format(value) for name, value in shown.values.items()]
+    values = [_VALUES.get(name, f"{visible(name)} {{:g}}").format(value) for name, value in shown.values.items()]
     if shown.scale_dn is not None:
-        words.append("black {:.0f} DN, white {:.0f} DN in this step".format(*shown.scale_dn))
-    return words
+        values.append("black {:.0f} DN, white {:.0f} DN in this step".format(*shown.scale_dn))
+    return values
 
 
 def display_levels(pixels: Pixels, width_px: int, scale: tuple[float, float] | None = None) -> NDArray[np.uint8]:
@@ -160,7 +160,7 @@ def _keys(panel: CapturePanel) -> Iterator[None]:
         return
     before = termios.tcgetattr(sys.stdin)
     ended = threading.Event()
-    words = {key: word for word, key in _KEYS.items()}
+    buttons = {key: button for button, key in _KEYS.items()}
 
     def listen() -> None:
         while not ended.is_set():
@@ -173,8 +173,8 @@ def _keys(panel: CapturePanel) -> Iterator[None]:
                 asked = panel.asked
                 if key in "\r\n" and asked is not None:
                     panel.press(asked.prompt.answers[0], asked.number)
-                elif key in words:
-                    panel.press(words[key])
+                elif key in buttons:
+                    panel.press(buttons[key])
 
     tty.setcbreak(sys.stdin)
     listener = threading.Thread(target=listen, daemon=True)

@@ -3,7 +3,7 @@
 from collections.abc import Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import msgspec
 import numpy as np
@@ -16,6 +16,7 @@ from faintfield.pipelines.formats.results.geometry import GEOMETRY_PAGE, Geometr
 from faintfield.pipelines.formats.results.noise import NOISE_PAGES, NoiseRecord, read_noise
 from faintfield.pipelines.pages.page import (
     INK,
+    Quantity,
     Row,
     blank_drawing,
     colour_bar,
@@ -31,34 +32,37 @@ from faintfield.pipelines.pages.page import (
 if TYPE_CHECKING:
     from faintfield.calib.geometry import GeometrySettings
 
-_FIGURES: tuple[tuple[str, str, str, float], ...] = (
-    ("pitch_x_mm", "pitch along rows", "mm", 1.0),
-    ("pitch_y_mm", "pitch along columns", "mm", 1.0),
-    ("scale_x", "scale along rows, measured over asked", "", 1.0),
-    ("scale_y", "scale along columns, measured over asked", "", 1.0),
-    ("squareness_rad", "squareness: angle between the axes less 90°", "mrad", 1e3),
-    ("backlash_x_mm", "backlash along rows", "µm", 1e3),
-    ("backlash_y_mm", "backlash along columns", "µm", 1e3),
-    ("tilt_rad", "tilt of the camera's axis to the grid", "mrad", 1e3),
-    ("node_residual_rms_mm", "nodes off the regular grid, rms", "µm", 1e3),
+_FIGURES = (
+    Quantity("pitch_x_mm", "pitch along rows", "mm"),
+    Quantity("pitch_y_mm", "pitch along columns", "mm"),
+    Quantity("scale_x", "scale along rows, measured over asked"),
+    Quantity("scale_y", "scale along columns, measured over asked"),
+    Quantity("squareness_rad", "squareness: angle between the axes less 90°", "mrad", factor=1e3),
+    Quantity("backlash_x_mm", "backlash along rows", "µm", factor=1e3),
+    Quantity("backlash_y_mm", "backlash along columns", "µm", factor=1e3),
+    Quantity("tilt_rad", "tilt of the camera's axis to the grid", "mrad", factor=1e3),
+    Quantity("node_residual_rms_mm", "nodes off the regular grid, rms", "µm", factor=1e3),
 )
 
 # In the order of `LensRecord.sigma`, whose distortion is in that of OpenCV.
 _LENS = (
-    *((name, "px") for name in ("focal length fx", "focal length fy", "principal point cx", "principal point cy")),
-    *((f"distortion {name}", "") for name in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
+    Quantity("fx_px", "focal length fx", "px"),
+    Quantity("fy_px", "focal length fy", "px"),
+    Quantity("cx_px", "principal point cx", "px"),
+    Quantity("cy_px", "principal point cy", "px"),
+    *(Quantity("distortion", f"distortion {name}") for name in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
 )
 
-# The quantities of a sensor that matter most: name, words, symbol, unit, factor to it.
+# The quantities of a sensor that matter most.
 NOISE_QUANTITIES = (
-    ("gain_dn_per_e", "gain", "K", "DN/e⁻", 1.0),
-    ("read_noise_e", "read noise", "σ_d", "e⁻", 1.0),
-    ("dark_current_e_per_s", "dark current", "μ_I", "e⁻/s", 1.0),
-    ("offset_dn", "offset", "μ_y.dark", "DN", 1.0),
-    ("quantum_efficiency", "quantum efficiency", "η", "%", 100.0),
-    ("prnu", "response differs between pixels by", "PRNU", "%", 100.0),
-    ("dsnu_e", "offset differs between pixels by", "DSNU", "e⁻", 1.0),
-    ("dcnu_e_per_s", "dark current differs between pixels by", "DCNU", "e⁻/s", 1.0),
+    Quantity("gain_dn_per_e", "gain", "DN/e⁻", symbol="K"),
+    Quantity("read_noise_e", "read noise", "e⁻", symbol="σ_d"),
+    Quantity("dark_current_e_per_s", "dark current", "e⁻/s", symbol="μ_I"),
+    Quantity("offset_dn", "offset", "DN", symbol="μ_y.dark"),
+    Quantity("quantum_efficiency", "quantum efficiency", "%", symbol="η", factor=100.0),
+    Quantity("prnu", "response differs between pixels by", "%", symbol="PRNU", factor=100.0),
+    Quantity("dsnu_e", "offset differs between pixels by", "e⁻", symbol="DSNU"),
+    Quantity("dcnu_e_per_s", "dark current differs between pixels by", "e⁻/s", symbol="DCNU"),
 )
 
 # The largest deviation is drawn at most this long, as a share of the pitch, so that it stays within its cell.
@@ -85,7 +89,7 @@ def geometry_page(geometry: GeometryRecord, limits: "GeometrySettings") -> str:
 
 def stage_rows(stage: StageReport) -> list[Row]:
     """Return the table of the stage."""
-    return [_row(getattr(stage, name), words, unit, factor) for name, words, unit, factor in _FIGURES]
+    return [_row(getattr(stage, quantity.key), quantity) for quantity in _FIGURES]
 
 
 def holdout_rows(geometry: GeometryRecord, limits: "GeometrySettings") -> list[Row]:
@@ -109,12 +113,13 @@ def holdout_rows(geometry: GeometryRecord, limits: "GeometrySettings") -> list[R
 def _lens_rows(lens: LensRecord) -> list[Row]:
     values = [lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, *lens.distortion]
     return [
-        _row(StageFigure(value, sigma), name, unit, 1.0)
-        for value, sigma, (name, unit) in zip(values, lens.sigma, _LENS, strict=False)
+        _row(StageFigure(value, sigma), quantity)
+        for value, sigma, quantity in zip(values, lens.sigma, _LENS, strict=False)
     ]
 
 
-def _row(estimate: StageFigure, name: str, unit: str, factor: float) -> Row:
+def _row(estimate: StageFigure, quantity: Quantity) -> Row:
+    _, name, unit, _, factor = quantity
     if estimate.value is None or estimate.sigma is None:
         return Row(name, why=estimate.why or "")
     sigma = estimate.sigma * factor
@@ -217,6 +222,12 @@ class Section[Record]:
     maps: list[str] = field(default_factory=list)
 
 
+class _Origin(TypedDict):
+    where: str
+    sha256: str
+    used: bool
+
+
 type NoiseSection = Section[NoiseRecord]
 type GeometrySection = Section[GeometryRecord]
 
@@ -236,9 +247,11 @@ def noise_section(directory: Path, path: Path, inputs: Set[str]) -> NoiseSection
         made=record.provenance,
         record=record,
         rows=[
-            estimate_row(measured, html_symbols(f"{words}, {symbol}"), unit, factor)
-            for name, words, symbol, unit, factor in NOISE_QUANTITIES
-            if isinstance(measured := getattr(record, name), Estimate)
+            estimate_row(
+                measured, quantity._replace(name=html_symbols(f"{quantity.name}, {quantity.symbol}"), symbol="")
+            )
+            for quantity in NOISE_QUANTITIES
+            if isinstance(measured := getattr(record, quantity.key), Estimate)
         ],
         unusable={kind: len(getattr(record, f"{kind}_pixels")) for kind in ("hot", "noisy", "dead")},
     )
@@ -260,7 +273,7 @@ def geometry_section(directory: Path, path: Path, inputs: Set[str]) -> GeometryS
     )
 
 
-def _origin(directory: Path, path: Path, inputs: Set[str]) -> dict[str, Any]:
+def _origin(directory: Path, path: Path, inputs: Set[str]) -> _Origin:
     digest = sha256(path)
     return {"where": _link(directory, path), "sha256": digest, "used": digest in inputs}
 

@@ -10,64 +10,65 @@ from faintfield.pipelines.calibration.noise_emva import EmvaMeasurement
 from faintfield.pipelines.formats.results.noise import STANDARD, NoiseRecord
 from faintfield.pipelines.pages.calibration_pages import NOISE_QUANTITIES
 from faintfield.pipelines.pages.noise_plots import emva_drawings, fit_drawings
-from faintfield.pipelines.pages.page import Row, estimate_row, html_symbols, template
+from faintfield.pipelines.pages.page import Quantity, Row, estimate_row, html_symbols, template
 from faintfield.pipelines.pages.pixel_maps import map_drawings
 
-# Name, words, symbol, unit, factor to it.
-type _Quantity = tuple[str, str, str, str, float]
-
 # Groups of lines by title. First those that matter most and how far the frames keep to the model, then EMVA 1288.
-_VALUES: dict[str, tuple[_Quantity, ...]] = {
+_VALUES: dict[str, tuple[Quantity, ...]] = {
     "The sensor": (
         *NOISE_QUANTITIES[:5],
-        ("saturation_e", "saturation capacity (full well, or end of the converter)", "μ_e.sat", "e⁻", 1.0),
+        Quantity("saturation_e", "saturation capacity (full well, or end of the converter)", "e⁻", symbol="μ_e.sat"),
         *NOISE_QUANTITIES[5:],
-        ("frame_jitter_dn", "whole frames jitter by", "", "DN", 1.0),
-        ("row_noise_dn", "rows of a frame jitter by", "", "DN", 1.0),
-        ("column_noise_dn", "columns of a frame jitter by", "", "DN", 1.0),
+        Quantity("frame_jitter_dn", "whole frames jitter by", "DN"),
+        Quantity("row_noise_dn", "rows of a frame jitter by", "DN"),
+        Quantity("column_noise_dn", "columns of a frame jitter by", "DN"),
     ),
     "Scatter of the series about the model, beyond chance": (
-        ("noise_error", "noise of a series, in variance", "", "%", 100.0),
-        ("drift_dn", "dark level of a series", "", "DN", 1.0),
-        ("light_error", "level of a series of flats", "", "%", 100.0),
+        Quantity("noise_error", "noise of a series, in variance", "%", factor=100.0),
+        Quantity("drift_dn", "dark level of a series", "DN"),
+        Quantity("light_error", "level of a series of flats", "%", factor=100.0),
     ),
 }
-_EMVA: dict[str, tuple[_Quantity, ...]] = {
+_EMVA: dict[str, tuple[Quantity, ...]] = {
     "Sensitivity": (
-        ("quantum_efficiency", "quantum efficiency", "η", "%", 100.0),
-        ("gain_dn_per_e", "system gain", "K", "DN/e⁻", 1.0),
-        ("gain_e_per_dn", "inverse of the gain", "1/K", "e⁻/DN", 1.0),
-        ("responsivity_dn_per_photon", "responsivity", "R", "DN/photon", 1.0),
+        Quantity("quantum_efficiency", "quantum efficiency", "%", symbol="η", factor=100.0),
+        Quantity("gain_dn_per_e", "system gain", "DN/e⁻", symbol="K"),
+        Quantity("gain_e_per_dn", "inverse of the gain", "e⁻/DN", symbol="1/K"),
+        Quantity("responsivity_dn_per_photon", "responsivity", "DN/photon", symbol="R"),
     ),
     "Temporal dark noise": (
-        ("read_noise_e", "read noise: at zero exposure", "σ_d(0)", "e⁻", 1.0),
-        ("dark_noise_e", "dark noise: at the exposure stated above", "σ_d", "e⁻", 1.0),
-        ("read_noise_dn", "read noise, without rounding", "K σ_d(0)", "DN", 1.0),
-        ("dark_noise_dn", "read noise, with rounding", "σ_y.dark(0)", "DN", 1.0),
+        Quantity("read_noise_e", "read noise: at zero exposure", "e⁻", symbol="σ_d(0)"),
+        Quantity("dark_noise_e", "dark noise: at the exposure stated above", "e⁻", symbol="σ_d"),
+        Quantity("read_noise_dn", "read noise, without rounding", "DN", symbol="K σ_d(0)"),
+        Quantity("dark_noise_dn", "read noise, with rounding", "DN", symbol="σ_y.dark(0)"),
     ),
     "Range": (
-        ("threshold_photons", "absolute sensitivity threshold", "μ_p.min", "photons", 1.0),
-        ("threshold_e", "absolute sensitivity threshold", "μ_e.min", "e⁻", 1.0),
-        ("saturation_photons", "saturation capacity", "μ_p.sat", "photons", 1.0),
-        ("saturation_e", "saturation capacity", "μ_e.sat", "e⁻", 1.0),
-        ("snr_max", "largest signal-to-noise ratio", "SNR_max", "", 1.0),
-        ("dynamic_range", "dynamic range", "DR", "", 1.0),
+        Quantity("threshold_photons", "absolute sensitivity threshold", "photons", symbol="μ_p.min"),
+        Quantity("threshold_e", "absolute sensitivity threshold", "e⁻", symbol="μ_e.min"),
+        Quantity("saturation_photons", "saturation capacity", "photons", symbol="μ_p.sat"),
+        Quantity("saturation_e", "saturation capacity", "e⁻", symbol="μ_e.sat"),
+        Quantity("snr_max", "largest signal-to-noise ratio", "", symbol="SNR_max"),
+        Quantity("dynamic_range", "dynamic range", "", symbol="DR"),
     ),
     "Nonuniformity": (
-        ("dsnu_total_e", "dark signal, all", "DSNU", "e⁻", 1.0),
-        ("dsnu_total_dn", "dark signal, all", "DSNU", "DN", 1.0),
-        ("dsnu_row_e", "its row part", "DSNU.row", "e⁻", 1.0),
-        ("dsnu_column_e", "its column part", "DSNU.col", "e⁻", 1.0),
-        ("dsnu_pixel_e", "its pixel part", "DSNU.pixel", "e⁻", 1.0),
-        ("prnu_total", "response to light, all", "PRNU", "%", 100.0),
-        ("prnu_row", "its row part", "PRNU.row", "%", 100.0),
-        ("prnu_column", "its column part", "PRNU.col", "%", 100.0),
-        ("prnu_pixel", "its pixel part", "PRNU.pixel", "%", 100.0),
+        Quantity("dsnu_total_e", "dark signal, all", "e⁻", symbol="DSNU"),
+        Quantity("dsnu_total_dn", "dark signal, all", "DN", symbol="DSNU"),
+        Quantity("dsnu_row_e", "its row part", "e⁻", symbol="DSNU.row"),
+        Quantity("dsnu_column_e", "its column part", "e⁻", symbol="DSNU.col"),
+        Quantity("dsnu_pixel_e", "its pixel part", "e⁻", symbol="DSNU.pixel"),
+        Quantity("prnu_total", "response to light, all", "%", symbol="PRNU", factor=100.0),
+        Quantity("prnu_row", "its row part", "%", symbol="PRNU.row", factor=100.0),
+        Quantity("prnu_column", "its column part", "%", symbol="PRNU.col", factor=100.0),
+        Quantity("prnu_pixel", "its pixel part", "%", symbol="PRNU.pixel", factor=100.0),
     ),
-    "Linearity": (("linearity_error", "mean deviation of the fitted response from a line", "LE", "%", 100.0),),
+    "Linearity": (
+        Quantity(
+            "linearity_error", "mean deviation of the fitted response from a line", "%", symbol="LE", factor=100.0
+        ),
+    ),
     "Dark current": (
-        ("dark_current_e_per_s", "dark current", "μ_I", "e⁻/s", 1.0),
-        ("dark_current_doubling_k", "temperature difference that doubles it", "T_d", "K", 1.0),
+        Quantity("dark_current_e_per_s", "dark current", "e⁻/s", symbol="μ_I"),
+        Quantity("dark_current_doubling_k", "temperature difference that doubles it", "K", symbol="T_d"),
     ),
 }
 
@@ -117,21 +118,21 @@ def _mapped(known: Estimate, function: Callable[[float], float]) -> Estimate:
 
 
 def _table(
-    quantities: Mapping[str, Sequence[_Quantity]], known: Sequence[Mapping[str, Estimate]]
+    quantities: Mapping[str, Sequence[Quantity]], known: Sequence[Mapping[str, Estimate]]
 ) -> list[tuple[str, list[list[Row]]]]:
     """Return the lines of a table in groups by title, each with a cell of every phase."""
     explained: list[dict[str, str]] = [{} for _ in known]  # the quantity that each reason was given for
     groups = []
     for title, lines in quantities.items():
         rows = []
-        for key, words, symbol, unit, factor in lines:
-            versions: dict[str, Callable[[float], float]] = {unit: float}
+        for quantity in lines:
+            key = quantity.key
+            versions: dict[str, Callable[[float], float]] = {quantity.unit: float}
             if key in ("snr_max", "dynamic_range") and all(of_phase[key].value is not None for of_phase in known):
                 versions |= _RATIOS
-            for shown, function in versions.items():
-                cells = [
-                    estimate_row(_mapped(of_phase[key], function), words, shown, factor, symbol) for of_phase in known
-                ]
+            for unit, function in versions.items():
+                shown = quantity._replace(unit=unit)
+                cells = [estimate_row(_mapped(of_phase[key], function), shown) for of_phase in known]
                 rows.append([_explained(cell, of_phase) for cell, of_phase in zip(cells, explained, strict=True)])
         groups.append((title, rows))
     return groups
@@ -141,6 +142,6 @@ def _explained(cell: Row, explained: dict[str, str]) -> Row:
     """Return a cell that refers to an earlier one of the same phase with the same reason."""
     if not cell.why:
         return cell
-    words = f"{cell.words}, {cell.symbol}".removesuffix(", ")
-    first = explained.setdefault(cell.why, words)
-    return cell if first == words else cell._replace(why=f"as for {first}")
+    quantity = f"{cell.name}, {cell.symbol}".removesuffix(", ")
+    first = explained.setdefault(cell.why, quantity)
+    return cell if first == quantity else cell._replace(why=f"as for {first}")

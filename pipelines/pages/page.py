@@ -42,12 +42,22 @@ MAX_SNR = 1000
 class Row(NamedTuple):
     """A line of a table of quantities; `why` is a remark, or the reason for no value."""
 
-    words: str
+    name: str
     value: str = "–"
     error: str = ""
     unit: str = ""
     why: str = ""
     symbol: str = ""
+
+
+class Quantity(NamedTuple):
+    """A quantity of a table: its key in a record, and its unit on a page, to which the recorded value has a factor."""
+
+    key: str
+    name: str
+    unit: str = ""
+    symbol: str = ""
+    factor: float = 1.0
 
 
 class Fact(NamedTuple):
@@ -76,19 +86,20 @@ def _environment() -> Environment:
     return environment
 
 
-def estimate_row(known: Estimate, words: str, unit: str, factor: float = 1.0, symbol: str = "") -> Row:
+def estimate_row(known: Estimate, quantity: Quantity) -> Row:
     """Return the line of a quantity, its interval to two digits of half its width."""
+    _, name, unit, symbol, factor = quantity
     if known.value is None:
-        return Row(words, unit=unit, why=known.why or "no reason stated", symbol=symbol)
+        return Row(name, unit=unit, why=known.why or "no reason stated", symbol=symbol)
     value = known.value * factor
     if known.ci95 is None:
-        return Row(words, f"{value:.4g}".replace("-", "−"), "", unit, symbol=symbol)
+        return Row(name, f"{value:.4g}".replace("-", "−"), "", unit, symbol=symbol)
     low, high = known.ci95[0] * factor, known.ci95[1] * factor
     half = (high - low) / 2
     scale = half if half > 0 else 1e-4 * abs(value) or 1.0
     digits = int(np.clip(1 - np.floor(np.log10(scale)), -8, 8))
     low_end, middle, high_end = (fixed(round(number, digits), digits) for number in (low, value, high))
-    return Row(words, middle, f"{low_end} … {high_end}", unit, symbol=symbol)
+    return Row(name, middle, f"{low_end} … {high_end}", unit, symbol=symbol)
 
 
 def figure(value: float | None, digits: int = 3) -> str:

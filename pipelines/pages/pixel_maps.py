@@ -92,9 +92,10 @@ def _drawn(pixel_map: _PixelMap, usable: Mask, side_px: int) -> Drawing:
     error = pixel_map.error(usable) / float(np.sqrt(step))
     low, high = np.nanquantile(shown, [0.005, 0.995])
     first, last, steps = colour_scale(low, high, error)
-    figure, axes, look = _blank_map(values.shape)
-    look |= {"cmap": colormaps["viridis"].resampled(steps), "vmin": first, "vmax": last}
-    colour_bar(figure, axes.imshow(shown, **look), axes, unit)
+    figure, axes, extent = _blank_map(values.shape)
+    colours = colormaps["viridis"].resampled(steps)
+    image = axes.imshow(shown, colours, extent=extent, interpolation="none", vmin=first, vmax=last)
+    colour_bar(figure, image, axes, unit)
     what = "a pixel" if step == 1 else f"a mean over {step} × {step} pixels, at most"
     caption = f"Standard error of {what}: {error:.2g} {unit}; no step of the colours is finer." if error else ""
     if high - low < (last - first) / steps:
@@ -107,23 +108,23 @@ def _unusable_pixels(calibration: NoiseCalibration, side_px: int) -> Drawing:
     title, masks = "Unusable pixels", {kind: getattr(calibration.pixels, kind) for kind in _KINDS}
     if not calibration.maps.unusable.any():
         return Drawing(title, missing="no pixel is hot, noisy or dead")
-    figure, axes, look = _blank_map(calibration.maps.unusable.shape)
+    figure, axes, extent = _blank_map(calibration.maps.unusable.shape)
     for (kind, mask), colour in zip(masks.items(), _KINDS.values(), strict=True):
         share = _means(mask, np.ones_like(mask), _step(mask.shape, side_px))
         dots = cv2.dilate(share, np.ones((2, 2))) > 0
-        axes.imshow(np.where(dots, 1.0, np.nan), cmap=ListedColormap([colour]), **look)
+        axes.imshow(np.where(dots, 1.0, np.nan), ListedColormap([colour]), extent=extent, interpolation="none")
         axes.plot([], [], "s", color=colour, label=f"{mask.sum()} {kind}")
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, frameon=False, labelcolor=INK)
     return Drawing(title, "They are left out of every number.", svg(figure))
 
 
-def _blank_map(shape: tuple[int, ...]) -> tuple[Figure, Axes, dict[str, Any]]:
-    """Return a drawing for a map (row, column), and how the map is placed in it."""
+def _blank_map(shape: tuple[int, ...]) -> tuple[Figure, Axes, tuple[float, float, float, float]]:
+    """Return a drawing for a map (row, column), and the extent of the map in it."""
     height, width = shape
     figure, axes = blank_drawing(5.6, float(np.clip(4.2 * height / width, 1.5, 6.0)) + 0.7)
     axes.set(xlabel="column (px)", ylabel="row (px)")
     ink(axes)
-    return figure, axes, {"extent": (-0.5, width - 0.5, height - 0.5, -0.5), "interpolation": "none"}
+    return figure, axes, (-0.5, width - 0.5, height - 0.5, -0.5)
 
 
 def _step(shape: tuple[int, ...], side_px: int) -> int:

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import cycle
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,21 @@ class Sigmas(NamedTuple):
     pictures: list[tuple[str, float, str]]
 
 
+class Slide(TypedDict):
+    """One plane of a slider; JSON for the page's script. `samples` are those of a row."""
+
+    depth: float
+    label: str
+    samples: int
+
+
+class Slides(TypedDict):
+    """The planes of a column."""
+
+    title: str
+    planes: list[Slide]
+
+
 class Proposed(NamedTuple):
     """Proposal of a prior for a plane and its change by the data, as data URIs."""
 
@@ -62,7 +77,7 @@ class PlaneSections:
     certificates: list[tuple[str, Certificate]] = field(default_factory=list)
     columns: list[str] = field(default_factory=list)
     rows: list[tuple[str, list[str | None]]] = field(default_factory=list)
-    slider: list[dict[str, Any]] | None = None
+    slider: list[Slides] | None = None
     slider_column: int = 0
     slider_depth: int = 0
     slider_picture: str | None = None
@@ -99,7 +114,7 @@ def plane_sections(planes: list[Plane], results: Iterable[ReconstructionRecord])
         best_title=titles[best],
         left_out=next((record.occlusion_left_out for _, record in records if record.occlusion_left_out), None),
         blurred=len(places) > 1 and of_best[0].method not in JOINT_METHODS,
-        best_planes=[(words, cell) for words, cells in best_rows for cell in cells if cell],
+        best_planes=[(label, cell) for label, cells in best_rows for cell in cells if cell],
         weight_curves=_weight_curves(of_best),
         certificates=[
             (label, record.certificate)
@@ -121,10 +136,10 @@ def plane_sections(planes: list[Plane], results: Iterable[ReconstructionRecord])
     )
 
 
-def _slides(title: str, planes: list[Plane]) -> dict[str, Any]:
+def _slides(title: str, planes: list[Plane]) -> Slides:
     """Return the planes of a column, whose pictures the page's script takes from the viewer."""
-    slides = [{"depth": plane.depth_mm, "words": plane.label, "samples": plane.pixels().shape[1]} for plane in planes]
-    return {"title": title, "planes": slides}
+    slides = [Slide(depth=plane.depth_mm, label=plane.label, samples=plane.pixels().shape[1]) for plane in planes]
+    return Slides(title=title, planes=slides)
 
 
 def _sharp(focus: FocusCurve, units: StatedUnits) -> str:

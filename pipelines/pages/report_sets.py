@@ -35,7 +35,7 @@ _OVERVIEW_QUALITY = 45
 class LightRow(NamedTuple):
     """Light per pixel by one formula: electrons and photons of one view, photons per second, photons of all views."""
 
-    words: str
+    name: str
     electrons: float
     photons: float | None = None
     flux: float | None = None

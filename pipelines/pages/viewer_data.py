@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple, NotRequired, TypedDict
+from typing import Literal, NamedTuple, NotRequired, TypedDict
 
 import cv2
 import numpy as np
@@ -47,8 +47,17 @@ _MAP_STEPS, _SIGMA_STEPS = 512, 128
 
 type Kind = Literal["light", "sigma", "view", "bright", "depth", "depth_sigma", "confidence"]
 
-# Black, white and name of the pictures of each kind when the page opens; maps in `colours` instead of grey.
-type Scales = dict[Kind, dict[str, float | str | bool]]
+
+class Scale(TypedDict):
+    """Black, white and name of the pictures of a kind when the page opens; maps in `colours` instead of grey."""
+
+    black: float
+    white: float
+    name: str
+    colours: NotRequired[bool]
+
+
+type Scales = dict[Kind, Scale]
 
 
 class Fineness(NamedTuple):
@@ -81,7 +90,7 @@ class ViewerPicture(TypedDict):
 
     kind: Kind
     title: str
-    words: str
+    label: str
     place: int | None
     unit: str
     low: float
@@ -98,13 +107,30 @@ class ViewerPicture(TypedDict):
     toned: NotRequired[bool]
 
 
+class ViewerData(TypedDict):
+    """Data of the viewer; JSON for the page's script.
+
+    `first` are the indices of the pictures that it opens with, and `length` is the unit of length. Planes are in bins
+    if `binned`.
+    """
+
+    pictures: list[ViewerPicture]
+    scales: Scales
+    places: list[str]
+    quantity: str
+    toned: bool
+    length: str
+    binned: bool
+    first: tuple[int, int]
+
+
 def viewer_of(
     planes: list[Plane],
     shown: PlaneSections,
     the_set: SetSection | None,
     surfaces: Mapping[Path, SurfaceFileRecord] = MappingProxyType({}),
-) -> dict[str, Any] | None:
-    """Return the data of the viewer as JSON for the page's script, None without planes and surfaces.
+) -> ViewerData | None:
+    """Return the data of the viewer, None without planes and surfaces.
 
     The grey scales are those of the pictures `shown`. The views are those of `the_set`, if there is one.
     """
@@ -203,10 +229,10 @@ def _views(the_set: SetSection, scales: Scales) -> list[ViewerPicture]:
     return views
 
 
-def _view(kind: Kind, title: str, words: str, unit: str, low: float, step: float) -> ViewerPicture:
+def _view(kind: Kind, title: str, label: str, unit: str, low: float, step: float) -> ViewerPicture:
     element = f"{'recorded' if kind == 'view' else kind}-view"
     return ViewerPicture(
-        kind=kind, title=title, words=words, place=None, unit=unit, low=low, step=step, bins=1, element=element
+        kind=kind, title=title, label=label, place=None, unit=unit, low=low, step=step, bins=1, element=element
     )
 
 
@@ -219,7 +245,7 @@ class _Source(NamedTuple):
     read: Callable[[], NDArray[np.floating]]
     kind: Kind
     title: str
-    words: str
+    label: str
     place: int | None
     unit: str
     pitch: float | None = None
@@ -282,12 +308,12 @@ def _surface_sources(
         return robust_limits(values)
 
     sources = []
-    for kind, name, words, unit in entries:
+    for kind, name, label, unit in entries:
         sure_above = surface.sure_above if kind == "depth" else None
-        sources.append(_Source(partial(read, name), kind, title, words, None, unit, sure_above=sure_above))
+        sources.append(_Source(partial(read, name), kind, title, label, None, unit, sure_above=sure_above))
         if kind not in scales:
             black, white = limits(kind, name)
-            scales[kind] = {"black": black, "white": white, "name": words}
+            scales[kind] = {"black": black, "white": white, "name": label}
             if kind not in ("light", "sigma"):
                 scales[kind]["colours"] = True
     return sources
@@ -370,7 +396,7 @@ def _packed_picture(source: _Source, numbers: NDArray[np.floating], step: float,
     picture = ViewerPicture(
         kind=source.kind,
         title=source.title,
-        words=source.words,
+        label=source.label,
         place=source.place,
         unit=source.unit,
         low=packed.low,

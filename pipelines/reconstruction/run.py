@@ -86,7 +86,7 @@ def reconstruct_set(elemental_set: ElementalSet, out: Path, request: Request, ru
     depth_map = kept_depth_map(folders, sweep.origins) if request.with_depth_map else None
     search = None
     if request.with_depth_map and depth_map is None:
-        search = depths_of_set(elemental_set, _range_mm(request), out)
+        search = depths_of_set(elemental_set, _range_mm(request), out, "depth map")
     _make_planes(sweep, folders, out, runner)
     write_overview(overview, pictures, out)
     if search is not None:

@@ -12,7 +12,7 @@ from faintfield.pipelines.console import inform, working
 from faintfield.pipelines.errors import WrongUsage
 from faintfield.pipelines.formats.files import check_results_folder, exclusive
 from faintfield.pipelines.formats.results.records import REPORT_FILE
-from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, check_exists, load_set
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, load_session, with_measured_geometry
 from faintfield.pipelines.reconstruction.channels import keeping_frames
 from faintfield.pipelines.reconstruction.depth.scene_structure import recommendation
@@ -31,8 +31,10 @@ def reconstruct_folder(
 ) -> Outcome:
     """Reconstruct what the options ask of a set or session, and write the report.
 
-    Raises WrongUsage if options contradict one another, or no folder for the results is known.
+    Raises MissingFile if there is no such folder, and WrongUsage if options contradict one another, or no folder for
+    the results is known.
     """
+    check_exists(folder)
     if options.surface and (of_planes := options.given(OF_PLANES)):
         raise WrongUsage(
             f"--surface makes one picture at all depths, and {' and '.join(of_planes)} would have no effect; leave it "
@@ -82,7 +84,7 @@ def surface_and_report(elemental_set: ElementalSet, out: Path, request: SurfaceR
     sure = f"{record.known_share:.0%} of its depths known, {record.sure_share:.0%} sure"
     inform(f"a surface in {time.monotonic() - started:.1f} s, {sure}: {report}")
     advice = recommendation(record.share_of_sure) if record.warning is None else None
-    if last := record.warning or advice:
+    if last := record.warning or record.remark or advice:
         inform(last)
     return Outcome(
         out=str(out),

@@ -18,7 +18,8 @@ _WIDE_BLUR, _NARROW_BLUR = (1, 2, 4, 8, 12), (1, 1)
 _TINY = 1e-30
 
 # Largest excess of the squares of residuals over their variance in detail, and largest of detail over smooth parts: a
-# calibration of the noise may be off by a percent everywhere. Chosen on `CHOSEN_ON` in benchmarks/uncertainty.py.
+# calibration of the noise may be off by a percent everywhere. Chosen on `CHOSEN_ON` in
+# benchmarks/imaging/uncertainty.py.
 _MAX_EXCESS, _MAX_BEYOND_SMOOTH = 0.006, 0.012
 
 # Standard errors that are added to both.

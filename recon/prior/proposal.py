@@ -30,11 +30,11 @@ _BORDER_BLUR = (1, 1, 2)
 _DETAIL_SHARE, _CHANGE_BLUR, _DETAIL_BLUR = 0.15, (1, 1), (1, 1, 2)
 
 # What a plane has beyond its blurred self counts where its square exceeds this share of the noise's variance. Chosen on
-# the scenes of `CHOSEN_ON` in benchmarks/uncertainty.py; the blur of that square.
+# the scenes of `CHOSEN_ON` in benchmarks/imaging/uncertainty.py; the blur of that square.
 _SHARP_SHARE, _SHARP_BLUR = 0.1, (1,)
 
 # The penalty weight about a proposal over that of total variation. With 1, the data bring back single bright samples of
-# noise where the proposal is right. Chosen on the scenes of `CHOSEN_ON` in benchmarks/uncertainty.py.
+# noise where the proposal is right. Chosen on the scenes of `CHOSEN_ON` in benchmarks/imaging/uncertainty.py.
 WEIGHT_ABOUT_PROPOSAL = 1.2
 
 # Candidates of one plane by name, all as blurred as the evidence.
@@ -253,7 +253,7 @@ class ProposalAnswers(Answers):
     """
 
     # A filter that is told the noise of its data answers to more of it as to a picture: the noise added is small.
-    # Chosen on the scenes of `CHOSEN_ON` in benchmarks/uncertainty.py.
+    # Chosen on the scenes of `CHOSEN_ON` in benchmarks/imaging/uncertainty.py.
     usual = UsualErrors(0.2, Expected(1.7, 1.7, 1.0), Expected(0.7, 0.7, 0.4), Weights(0.5, 0.2, 0.1, 0.6))
 
     def __init__(self, problem: LocalProblem, proposal: PlaneProposal, pilot: Image) -> None:

@@ -1,4 +1,4 @@
-"""The start of every reconstruction: back-projection, smooth positive samples, a penalty weight from the noise."""
+"""The start of every reconstruction: back-projection, and smooth positive samples."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,17 +58,3 @@ def mean_light_e(operator: SceneOperator, samples: Image) -> float:
     """Return the mean light of a pixel: the sum of the means over each plane's well-seen samples."""
     planes = zip(operator.planes_of(samples), operator.planes_of(operator.sensitivity()), strict=True)
     return sum(float(plane[well_seen_samples(seen)].mean(dtype=np.float64)) for plane, seen in planes)
-
-
-def universal_penalty_weight(operator: SceneOperator, images: ElementalImages, samples: Image) -> float:
-    """Return a penalty weight from the noise alone: β = 0.7 √( s / (f + b + σ²) ), from the median of s and means.
-
-    The root is the standard deviation of the likelihood's gradient at each sample, and eq. (3) is of the order of one,
-    so this weight removes fluctuations of about that size. It is a starting point, not the best weight for a scene.
-    """
-    sensitivity = operator.sensitivity()
-    seen = well_seen_samples(sensitivity)
-    # A pixel of a scene sees the light of all planes
-    light_e = samples if len(operator.grids) == 1 else np.full_like(samples, mean_light_e(operator, samples))
-    per_view_e = light_e[seen].mean() + np.mean(images.known_variance_e2())
-    return float(0.7 * np.sqrt(np.median(sensitivity[seen]) / per_view_e))

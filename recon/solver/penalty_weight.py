@@ -1,4 +1,4 @@
-"""A penalty weight from the data by cross-validation: the weight under which some views best predict the others.
+"""A penalty weight from the noise alone, or by cross-validation: that under which some views best predict the others.
 
 Windows stand for a large plane.
 """
@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.recon.errors import GeometryMismatch
-from faintfield.recon.likelihood.images import Image
+from faintfield.recon.likelihood.images import ElementalImages, Image
+from faintfield.recon.operator.scene_operator import SceneOperator
 from faintfield.recon.operator.single_plane import PlaneOperator
 from faintfield.recon.solver.data_fit import SceneProblem
-from faintfield.recon.solver.initialization import mean_light_e
+from faintfield.recon.solver.initialization import mean_light_e, well_seen_samples
 from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.solver.pmlem import PmlemIterate, iterate_until, pmlem
 from faintfield.recon.solver.proximal import DualField
@@ -63,6 +64,20 @@ class CrossValidatedWeight:
     candidates: dict[float, float]
     passes: float
     solution: PmlemIterate | None
+
+
+def universal_penalty_weight(operator: SceneOperator, images: ElementalImages, samples: Image) -> float:
+    """Return a penalty weight from the noise alone: β = 0.7 √( s / (f + b + σ²) ), from the median of s and means.
+
+    The root is the standard deviation of the likelihood's gradient at each sample, and eq. (3) is of the order of one,
+    so this weight removes fluctuations of about that size. It is a starting point, not the best weight for a scene.
+    """
+    sensitivity = operator.sensitivity()
+    seen = well_seen_samples(sensitivity)
+    # A pixel of a scene sees the light of all planes
+    light_e = samples if len(operator.grids) == 1 else np.full_like(samples, mean_light_e(operator, samples))
+    per_view_e = light_e[seen].mean() + np.mean(images.known_variance_e2())
+    return float(0.7 * np.sqrt(np.median(sensitivity[seen]) / per_view_e))
 
 
 def validation_views(views: int, fold: int = 0) -> NDArray[np.intp]:

@@ -16,7 +16,8 @@ _FAR_FROM_EDGE, _FAR_FROM_BORDER = 12.0, 10.0
 # Share of the detail from which a surface explains the views well enough; least steps to alternatives to a depth.
 _EXPLAINED, _APART_STEPS = 0.5, 3.0
 
-# Coefficients of the logistic model, in the order of `features`: fitted by `python -m benchmarks.surface_confidence`.
+# Coefficients of the logistic model, in the order of `features`, fitted by
+# `python -m benchmarks.imaging.surface_confidence`.
 COEFFICIENTS = (-3.773, 1.015, 1.953, 0.814, 1.967)
 
 # Largest probability, as scenes contain what no model has, and where a surface explains less than this share of the

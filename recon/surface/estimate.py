@@ -214,7 +214,10 @@ def found_range(views: PinholeViews, far: float, near: float) -> tuple[float, fl
         index, costs = next_depths(evidence, evidence.explained(first_depths(evidence)))
         likely = confidence(index, costs, depths, explained_share(evidence, index)) >= _LIKELY
         if np.count_nonzero(likely) < _MIN_SAMPLES:
-            raise NothingInFocus(f"the views tell the depth of {likely.mean():.1%} of the picture; give a range")
+            needed = _MIN_SAMPLES / likely.size
+            raise NothingInFocus(
+                f"the views tell the depth of {likely.mean():.1%} of the picture, and {needed:.1%} are needed"
+            )
         first, last = np.quantile(index[likely], _QUANTILES)
         margin = _MARGIN * (last - first) + _MARGIN_STEPS
         before, step = near - far, depths[1] - depths[0]

@@ -135,13 +135,13 @@ def translate_errors(path: Path, *, read_only: bool = False) -> Iterator[None]:
     try:
         yield
     except OSError as failure:
-        place, words = failure.filename or path, failure.strerror or failure
+        place, reason = failure.filename or path, failure.strerror or failure
         if read_only:
             raise SessionUnreadable(
-                f"{place}: cannot be read ({words}); allow it to be read, or check the disk, and run the same command "
+                f"{place}: cannot be read ({reason}); allow it to be read, or check the disk, and run the same command "
                 "again"
             ) from failure
         remedy = _REMEDIES.get(failure.errno or 0, "see that the disk is whole and the path leads to a folder")
         raise SessionUnwritable(
-            f"{place}: {words}; what was committed is safe: {remedy}, and run the same command again"
+            f"{place}: {reason}; what was committed is safe: {remedy}, and run the same command again"
         ) from failure

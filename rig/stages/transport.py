@@ -199,7 +199,7 @@ class Unknown(Struct, frozen=True):
 
 
 def motion_words(axes: tuple[str, str], point: Point, feed_mm_per_s: float) -> str:
-    """Return coordinates and feed of a command that moves."""
+    """Return the G-code words of coordinates and feed of a command that moves."""
     x, y = axes
     return f"{x}{point.x_mm:.3f} {y}{point.y_mm:.3f} F{60.0 * feed_mm_per_s:.1f}"
 

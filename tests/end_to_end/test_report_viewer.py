@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from faintfield.pipelines import pages
-from faintfield.pipelines.formats.image_files import grey_levels, write_png
+from faintfield.pipelines.formats.image_files import grey_levels, light_picture, write_png
 from faintfield.pipelines.pages.page import smaller_uri
 from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.pages.viewer_data import pack
@@ -284,7 +285,7 @@ def test_keyboard_reads_sample_aloud(page: Tab, report: Path) -> None:
 def _page_of(numbers: NDArray[np.float32], folder: Path) -> str:
     """Return the address of a page with the viewer alone, of one plane (row, column, colour)."""
     packed = pack(numbers, 1e-3)
-    picture: dict[str, Any] = {"kind": "light", "title": "PMLEM", "words": "500 mm", "place": 0, "unit": "e⁻ per pixel"}
+    picture: dict[str, Any] = {"kind": "light", "title": "PMLEM", "label": "500 mm", "place": 0, "unit": "e⁻ per pixel"}
     picture |= {"low": packed.low, "step": packed.step, "bins": 1, "pitch": 0.5, "origin": (-10.0, 20.0)}
     shown: dict[str, Any] = {"pictures": [{**picture, "src": smaller_uri(packed.png)}], "places": ["500 mm"]}
     shown |= {"scales": {"light": {"black": 0.0, "white": 2.0, "name": "planes"}}}
@@ -315,6 +316,14 @@ def test_colours_and_missing_samples_are_read(browser: Tab, tmp_path: Path) -> N
         else:
             np.testing.assert_allclose([float(word) for word in reading.groups()], numbers[row, column], atol=1.1e-3)
     assert browser.complaints == []
+
+
+def test_unknown_samples_have_hatching_of_previews(browser: Tab, tmp_path: Path) -> None:
+    unknown = np.full((30, 40, 3), np.nan, np.float32)
+    browser.open(_page_of(unknown, tmp_path))
+    browser.wait_until("document.querySelector('.v-stage').dataset.ready === 'all'")
+    (light, _), (dark, _) = Counter(_canvas(browser)[60:-60].ravel().tolist()).most_common(2)
+    assert [dark, light] == sorted(set(light_picture(unknown, 1.0).ravel().tolist()))
 
 
 def test_readout_of_surface_has_uncertainty_and_integers(browser: Tab, tmp_path: Path) -> None:

@@ -19,9 +19,9 @@ from faintfield.recon.operator.single_plane import PlaneOperator
 from faintfield.recon.prior.evidence import evidence_of_planes
 from faintfield.recon.prior.proposal import WEIGHT_ABOUT_PROPOSAL
 from faintfield.recon.solver.data_fit import SceneProblem
-from faintfield.recon.solver.initialization import mean_light_e, universal_penalty_weight
+from faintfield.recon.solver.initialization import mean_light_e
 from faintfield.recon.solver.penalties import Penalty
-from faintfield.recon.solver.penalty_weight import cross_validated_weight
+from faintfield.recon.solver.penalty_weight import cross_validated_weight, universal_penalty_weight
 from faintfield.recon.solver.pmlem import pmlem
 from tests.recon.displaced import noisy_images, run_until, views_displaced_by
 

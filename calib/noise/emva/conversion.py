@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy import stats
 
-from faintfield.calib.estimate import NORMAL_QUANTILE, Estimate, interval, root
+from faintfield.calib.estimate import NORMAL_QUANTILE, Estimate, SeriesGoodness, interval, root
 from faintfield.calib.noise.emva.nonuniformity import nonuniformity, temporal_noise
 from faintfield.calib.noise.flats import Saturation
 from faintfield.calib.noise.likelihood.gaussian_fit import (
@@ -21,7 +21,6 @@ from faintfield.calib.noise.likelihood.gaussian_fit import (
 from faintfield.calib.noise.likelihood.moments import Moments
 from faintfield.calib.noise.likelihood.response import charge_dn, fitted_linearity, quantum_efficiency
 from faintfield.calib.noise.maps.photo_response import Response
-from faintfield.calib.noise.misfit import series_goodness
 from faintfield.calib.noise.sensor_fit import NoiseLikelihood, SeriesFit
 from faintfield.calib.noise.strips import Array, map_of
 
@@ -58,19 +57,27 @@ _NO_LIGHT = (
 
 
 def estimate_all(
-    fitted: SeriesFit, response: Response | None, saturation: Saturation, *, levels_hold: bool, noise_holds: bool
+    fitted: SeriesFit,
+    response: Response | None,
+    saturation: Saturation,
+    goodness: Sequence[SeriesGoodness],
+    *,
+    levels_hold: bool,
+    noise_holds: bool,
 ) -> tuple[dict[str, Estimate], tuple[tuple[str, ...], Array]]:
     """Return all quantities, and the covariance of offset, gain, read noise and dark current.
 
-    There is no response to light without flats. `levels_hold` if the dark levels lie on a straight line over exposure
-    time, and `noise_holds` if the noise of all series follows eq. (1).
+    There is no response to light without flats. `goodness` is that of each series; `levels_hold` if the dark levels lie
+    on a straight line over exposure time, and `noise_holds` if the noise of all series follows eq. (1).
     """
     fit, moments = fitted.fit, fitted.moments
     levels_quantile = _levels_quantile(fit, moments)
     why_rounded = _why_rounded(fitted)
     holds = levels_hold and noise_holds
     why_no_gain = (
-        why_rounded or _why_noise_denies(fitted) or _why_no_gain(fit, moments, from_darks=not fitted.flats, holds=holds)
+        why_rounded
+        or _why_noise_denies(fitted, goodness)
+        or _why_no_gain(fit, moments, from_darks=not fitted.flats, holds=holds)
     )
     whys = {"offset_dn": None, "gain_dn_per_e": why_no_gain, "read_noise_e": why_no_gain}
     whys["dark_current_e_per_s"] = _why_no_current(fit, moments, why_no_gain, levels_quantile, levels_hold=levels_hold)
@@ -140,11 +147,11 @@ def _why_rounded(fitted: SeriesFit) -> str | None:
     )
 
 
-def _why_noise_denies(fitted: SeriesFit) -> str | None:
+def _why_noise_denies(fitted: SeriesFit, goodness: Sequence[SeriesGoodness]) -> str | None:
     """Return why the noise of the series denies the model; only flats can, since pickup may move noise of darks."""
     if not fitted.flats:
         return None
-    for flat, item in zip(fitted.flats, series_goodness(fitted)[len(fitted.darks) :], strict=True):
+    for flat, item in zip(fitted.flats, goodness[len(fitted.darks) :], strict=True):
         excess, se = item.noise_excess or 0.0, item.noise_se or np.inf
         if abs(excess) > max(_MAX_DEPARTURE, _MIN_SIGMAS * se):
             return (

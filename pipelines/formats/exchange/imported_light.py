@@ -261,5 +261,5 @@ def _offset_dn(frame: Frame, options: GridOptions) -> NDArray[np.float32]:
 
 def _describe_variance(gain_dn: float, read_noise_dn: float, tone: Tone) -> str:
     """Return in words how the variance follows from the light, in the unit of the pictures."""
-    unit, words = (1.0, "DN") if tone == "linear" else (1.0 / WHITE_DN, "fractions of white")
-    return f"the variance of a pixel is {gain_dn * unit:.3g} · light + {read_noise_dn * unit:.3g}², in {words}"
+    unit, name = (1.0, "DN") if tone == "linear" else (1.0 / WHITE_DN, "fractions of white")
+    return f"the variance of a pixel is {gain_dn * unit:.3g} · light + {read_noise_dn * unit:.3g}², in {name}"

@@ -199,8 +199,8 @@ def _write_views(grid: ImageGrid, views: _Views, folder: Path) -> ImageGrid:
         paths[node] = folder / f"{path.stem}.tiff"
         whole = pixels if factor is None else np.rint(np.maximum(pixels, 0) * factor).astype(np.uint16)
         write_frame(paths[node], whole)
-    words = [] if factor is None else [f"float values became 16-bit numbers, linear, {factor:.6g} DN for 1"]
-    return replace(grid, paths=paths, remarks=grid.remarks + words, dn_per_value=factor)
+    remarks = [] if factor is None else [f"float values became 16-bit numbers, linear, {factor:.6g} DN for 1"]
+    return replace(grid, paths=paths, remarks=grid.remarks + remarks, dn_per_value=factor)
 
 
 def _dn_per_value(views: _Views) -> float:

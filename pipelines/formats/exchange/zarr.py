@@ -128,7 +128,7 @@ def _write_metadata(models: Any, group: Any, stack: _Stack, name: str) -> None:
     attributes = models.image.ImageAttrs(version="0.5", multiscales=[multiscale])
     group.attrs["ome"] = attributes.model_dump(mode="json", exclude_none=True)
     group.attrs["faintfield"] = {
-        "value": stack.units.light_in_words,
+        "value": stack.units.light_description,
         "row_and_column": stack.scale.unit or "relative",
         "units": msgspec.to_builtins(stack.units),
         "planes": [named_by(msgspec.to_builtins(record), stack.units) for record in stack.planes],

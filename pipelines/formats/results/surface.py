@@ -35,6 +35,9 @@ SURFACE_FILE = "surface.json"
 # below 7 up to an SNR of 1000 (docs/surface.md).
 MAX_DEVIANCE = 10.0
 
+# Share of sure depths below which 0 % is shown.
+_MIN_SURE_SHARE = 0.005
+
 type Share = Annotated[float, Meta(ge=0, le=1)]
 
 
@@ -158,6 +161,16 @@ class SurfaceRecord(SurfaceFacts, frozen=True, kw_only=True):
         else:
             return None
         return f"{what}; check poses, range of depths and noise model"
+
+    @property
+    def remark(self) -> str | None:
+        """Words on a surface of which no depth is sure, or too few to show as 1 %; None if there are more."""
+        if self.sure_share >= _MIN_SURE_SHARE:
+            return None
+        return (
+            f"{'Almost no' if self.sure_share else 'No'} depth of this surface is sure: do not measure in it; use more "
+            "light, more views or nodes farther apart, or check poses and range of depths"
+        )
 
     @property
     def maps(self) -> list[str]:

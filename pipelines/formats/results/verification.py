@@ -162,10 +162,10 @@ class _Verification:
             self.unchecked.append(f"{path}: has no digest: an earlier version wrote it, or a person")
         else:
             self.problems.append(f"{path}: was altered after it was written")
-        beside = _hashes_beside(record)
-        self._name(path, path.parent, beside, is_input=False)
+        hashes = _sidecar_hashes(record)
+        self._name(path, path.parent, hashes, is_input=False)
         if isinstance(record, PlaneFileRecord | DepthMapFileRecord | SurfaceFileRecord):
-            self.problems += [f"{path}: has no SHA-256 of {name}" for name in record.files if name not in beside]
+            self.problems += [f"{path}: has no SHA-256 of {name}" for name in record.files if name not in hashes]
 
     def compare_repeated(self, path: Path, record: ReconstructionRecord) -> None:
         """Compare a reconstruction.json with the records of its planes and of its depth map, which it repeats."""
@@ -240,7 +240,7 @@ def _decoded(path: Path, text: bytes) -> Struct:
     return record_of(text, last)
 
 
-def _hashes_beside(record: Struct) -> Mapping[str, str]:
+def _sidecar_hashes(record: Struct) -> Mapping[str, str]:
     if isinstance(record, NoiseRecord):
         return {record.maps: record.maps_sha256} if record.maps_sha256 else {}
     hashes: Mapping[str, str] = getattr(record, "sha256", {}) or {}  # it may be UNSET

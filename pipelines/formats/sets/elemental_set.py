@@ -239,10 +239,15 @@ def load_set(folder: Path) -> ElementalSet:
     )
 
 
+def check_exists(folder: Path) -> None:
+    """Refuse a set or session that is not there (MissingFile)."""
+    if not is_folder(folder) and not is_file(folder):
+        raise MissingFile(f"{folder}: no such folder; name a session, or a folder with {FILE_NAME}")
+
+
 def _refuse_pictures(folder: Path) -> None:
     """Refuse a folder that is not there, and one of pictures that is no set yet (MissingFile)."""
-    if not is_folder(folder):
-        raise MissingFile(f"{folder}: no such folder; name a session, or a folder with {FILE_NAME}")
+    check_exists(folder)
     pictures = [path.name for path in files_in(folder) if path.suffix.lower() in IMAGE_SUFFIXES]
     if pictures:
         raise MissingFile(

@@ -70,9 +70,11 @@ const viewer = (() => {
     const context = one.canvas.getContext("2d"), image = context.createImageData(one.width, one.height);
     const pixels = new Uint32Array(image.data.buffer), bytes = image.data, { levels, colours, width } = one;
     const inks = Array.from({ length: 256 }, (_, level) => bytesOf(scales[one.kind].colours ? colourOf(level) : [level, level, level]));
-    // Hatching as in the previews: where nothing is known, and through what is not sure
+    // Hatching as in the previews of maps (depth_map.py) and of light (image_files.py): where nothing is known, and
+    // through what is not sure
     const period = Math.max(6, Math.round(width / 53));
-    const hatch = i => (i % width + Math.floor(i / width)) % period < period / 6 ? 128 : 158;
+    const [stripe, dark, bright] = scales[one.kind].colours ? [period / 6, 128, 158] : [period / 4, 120, 235];
+    const hatch = i => (i % width + Math.floor(i / width)) % period < stripe ? dark : bright;
     const unknown = i => { for (let c = 0; c < colours; c++) if (levels[i * colours + c] === UNKNOWN) return true; return false; };
     for (let i = 0; i < pixels.length; i++) {
       const known = !unknown(i);
@@ -86,7 +88,7 @@ const viewer = (() => {
     return one.canvas;
   }
   const sure = (one, doubt, at) => doubt.levels[at] !== UNKNOWN && number(doubt, doubt.levels[at]) >= one.sure_above;
-  const name = one => one.title + ", " + one.words;
+  const name = one => one.title + ", " + one.label;
   /** Numbers of the sample at a place, in words with their units; null outside the picture. */
   function valueAt(one, u, v) {
     const [column, row] = [Math.floor(u * one.width), Math.floor(v * one.width)];
@@ -557,5 +559,5 @@ const viewer = (() => {
     stage.dataset.ready = "all";
     draw();
   })();
-  return { ready, still, find: (title, words) => pictures.find(one => one.kind === "light" && one.title === title && one.words === words) };
+  return { ready, still, find: (title, label) => pictures.find(one => one.kind === "light" && one.title === title && one.label === label) };
 })();

@@ -181,6 +181,9 @@ def check_overlap(elemental_set: ElementalSet, range_mm: tuple[float, float]) ->
         )
 
 
+type Purpose = Literal["surface", "depth map"]
+
+
 @dataclass(frozen=True)
 class DepthSearch:
     """The depth of each pixel of the reference view, found in bins of `bins_px` detector pixels.
@@ -195,11 +198,14 @@ class DepthSearch:
     estimate: SurfaceEstimate
 
 
-def depths_of_set(elemental_set: ElementalSet, range_mm: tuple[float, float] | None, out: Path) -> DepthSearch:
+def depths_of_set(
+    elemental_set: ElementalSet, range_mm: tuple[float, float] | None, out: Path, purpose: Purpose = "surface"
+) -> DepthSearch:
     """Return the depth of each pixel of the reference view in a range, by default in that of the scene.
 
-    `out` is for a temporary file. Raises GeometryMismatch if the range is too wide, or views, poses and range do not
-    fit together, and NothingInFocus if nothing is found, or shuffled views agree as well.
+    `out` is for a temporary file, and `purpose` is named in messages. Raises GeometryMismatch if the range is too wide,
+    or views, poses and range do not fit together, and NothingInFocus if nothing is found, or shuffled views agree as
+    well.
     """
     bins, grid = default_bins(elemental_set), plane_grid(elemental_set, 1.0)
     arrangement = elemental_set.settings.arrangement
@@ -207,16 +213,16 @@ def depths_of_set(elemental_set: ElementalSet, range_mm: tuple[float, float] | N
     range_mm = range_mm or searched_range_mm(elemental_set)
     views = luminance(elemental_set, bins)
     near, far = 1 / range_mm[0], 1 / range_mm[1]
-    with naming_range(elemental_set, far, near):
+    with naming_range(elemental_set, far, near, purpose):
         if find_range:
             with working("searching the range of depths"):
                 far, near = found_range(views, far, near)
         depths = equal_steps(views, far, near)
         _check_steps(views, depths)
     check_places(views_of_search(elemental_set, range_mm, out), range_mm)
-    with naming_range(elemental_set, far, near):
-        inform(f"surface {_between(elemental_set, far, near)}: comparing {len(depths)} depths")
-        with working("finding the depths of the surface"):
+    with naming_range(elemental_set, far, near, purpose):
+        inform(f"{purpose} {_between(elemental_set, far, near)}: comparing {len(depths)} depths")
+        with working(f"finding the depths of the {purpose}"):
             found = estimate_surface(views, depths)
     inverse_depth = enlarged(found.inverse_depth, grid.shape, bins)
     found = replace(found, inverse_depth=inverse_depth, confidence=enlarged(found.confidence, grid.shape, bins))
@@ -224,12 +230,12 @@ def depths_of_set(elemental_set: ElementalSet, range_mm: tuple[float, float] | N
 
 
 @contextmanager
-def naming_range(elemental_set: ElementalSet, far: float, near: float) -> Iterator[None]:
-    """Name the range of 1/depth in which views, poses and surface do not fit together."""
+def naming_range(elemental_set: ElementalSet, far: float, near: float, purpose: Purpose = "surface") -> Iterator[None]:
+    """Name the range of 1/depth in which views, poses and surface or depth map do not fit together."""
     try:
         yield
     except GeometryMismatch as failure:
-        raise GeometryMismatch(f"surface {_between(elemental_set, far, near)}: {failure}") from failure
+        raise GeometryMismatch(f"{purpose} {_between(elemental_set, far, near)}: {failure}") from failure
     except NothingInFocus as failure:
         option = "--disparity-range-px" if elemental_set.units.depth == "disparity_px" else "--depth-range-mm"
         raise NothingInFocus(

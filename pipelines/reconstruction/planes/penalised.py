@@ -12,9 +12,9 @@ from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.formats.results.records import Certificate, PenaltyRecord, SolveRecord, WeightScore
 from faintfield.recon.likelihood.images import Image, select_likelihood
 from faintfield.recon.solver.data_fit import SceneProblem
-from faintfield.recon.solver.initialization import mean_light_e, universal_penalty_weight
+from faintfield.recon.solver.initialization import mean_light_e
 from faintfield.recon.solver.penalties import Penalty
-from faintfield.recon.solver.penalty_weight import MIN_VIEWS, cross_validated_weight
+from faintfield.recon.solver.penalty_weight import MIN_VIEWS, cross_validated_weight, universal_penalty_weight
 from faintfield.recon.solver.pmlem import iterate_until, pmlem
 from faintfield.recon.solver.proximal import DualField
 from faintfield.recon.solver.uncertainty import (
@@ -99,18 +99,18 @@ def solve_pmlem(objective: Objective) -> list[Solution]:
 
 
 def with_sigma(
-    objective: Objective, solutions: list[Solution], answers: Sequence[Callable[[LocalProblem], Answers] | None] = ()
+    objective: Objective, solutions: list[Solution], responses: Sequence[Callable[[LocalProblem], Answers] | None] = ()
 ) -> list[Solution]:
     """Return all planes of one colour with their standard deviation beside them.
 
-    `answers` are those of each plane, as for `standard_deviation`; of likelihood and penalty by default.
+    `responses` are those of each plane, as for `standard_deviation`; of likelihood and penalty by default.
     """
     operator, weight = objective.posed.operator, solutions[0].record.penalty_weight or 0.0
     samples = operator.samples_of([solution.plane for solution in solutions])
     generator = np.random.default_rng(_SEED)
     fits = local_fits(operator, objective.posed.fit(objective.level_e), samples)
     found = []
-    for solution, local, of_plane in zip(solutions, fits, answers or [None] * len(fits), strict=True):
+    for solution, local, of_plane in zip(solutions, fits, responses or [None] * len(fits), strict=True):
         sigma = standard_deviation(local, weight, objective.penalty, generator, of_plane)
         found.append(replace(solution, sidecars=solution.sidecars | {"sigma": sigma}))
     return found

@@ -22,12 +22,7 @@ from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.occlusion import opacity
 from faintfield.recon.operator.single_plane import PlaneOperator
 from faintfield.recon.solver.data_fit import SceneProblem
-from faintfield.recon.solver.initialization import (
-    back_projection,
-    mean_light_e,
-    smooth_start,
-    universal_penalty_weight,
-)
+from faintfield.recon.solver.initialization import back_projection, mean_light_e, smooth_start
 from faintfield.recon.solver.one_step_late import (
     IterationStep,
     oscillates,
@@ -36,6 +31,7 @@ from faintfield.recon.solver.one_step_late import (
     updated_samples,
 )
 from faintfield.recon.solver.penalties import total_variation
+from faintfield.recon.solver.penalty_weight import universal_penalty_weight
 
 # Largest number of passes over the data. MLEM is stopped early on purpose: further passes fit the noise.
 _MAX_PASSES = {"mlem": 20, "pmlem-osl": 50}

@@ -22,7 +22,7 @@ BOARDS = {name: Board(name, 9, 7, 40.0, 30.0, "DICT_5X5_1000", 31 * k) for k, na
 
 @dataclass(frozen=True)
 class Simulated:
-    """What the calibration is given, and the truth."""
+    """Input of the calibration, and the truth."""
 
     observations: list[BoardObservation]
     poses: NDArray[np.float64]

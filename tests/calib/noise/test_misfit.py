@@ -1,4 +1,4 @@
-"""What series deny: scatter that widens intervals, odd light, and temperatures."""
+"""Departures of series from the model: scatter that widens intervals, odd light, and temperatures."""
 
 from dataclasses import replace
 from functools import cache

@@ -253,6 +253,10 @@ def test_folders_that_are_no_sets_are_named(words: str, tmp_path: Path, faintfie
         assert_refused(ended, "MissingFile", message)
 
 
+def test_absent_folder_is_named_before_missing_depths(tmp_path: Path, faintfield: Command) -> None:
+    assert_refused(faintfield("reconstruct", tmp_path / "absent"), "MissingFile", "absent: no such folder")
+
+
 def test_room_for_all_of_a_sweep_is_needed(
     sweep: Path, simulated_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, faintfield: Command
 ) -> None:

@@ -1,4 +1,4 @@
-"""What is made of a session after its capture lies in it and leaves the session whole."""
+"""Results of a session that lie in its folder and leave the session whole."""
 
 import json
 from collections.abc import Callable

@@ -12,6 +12,7 @@ from faintfield.pipelines.errors import CannotWrite, DiskFull, OutputBusy, Outpu
 from faintfield.pipelines.formats.files import (
     CACHE_FILE,
     Hashes,
+    check_free,
     exclusive,
     removed_if_empty,
     require_room,
@@ -122,6 +123,13 @@ def test_foreign_files_are_left_alone(
     with pytest.raises(OutputExists, match=words), writing_folder(tmp_path / "out", **earlier):
         pytest.fail("nothing must be built")
     assert _everything_below(tmp_path) == before
+
+
+def test_refused_folder_is_named_as_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    _with_a_file(Path("out"))
+    with pytest.raises(OutputExists, match=r"^out: holds files"):
+        check_free(Path("out"))
 
 
 def test_folder_of_inputs_is_never_replaced(tmp_path: Path) -> None:

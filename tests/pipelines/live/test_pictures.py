@@ -29,7 +29,7 @@ def test_dark_frames_of_a_step_share_scale() -> None:
     noise = np.random.default_rng(4).normal(100.0, 7.0, (60, 80))
     first, lit = shown(panel, noise, "dark_scene"), shown(panel, noise + 30.0, "dark_scene")
     assert first.scale_dn == lit.scale_dn
-    levels = [float(display_levels(it.pixels, 80, it.scale_dn).mean()) for it in (first, lit)]
+    levels = [float(display_levels(frame.pixels, 80, frame.scale_dn).mean()) for frame in (first, lit)]
     assert levels[1] > levels[0] + 60
     assert describe_values(first) == ["SNR 0.16", "black 79 DN, white 142 DN in this step"]
     assert shown(panel, noise + 30.0, "dark", step=1).scale_dn != first.scale_dn

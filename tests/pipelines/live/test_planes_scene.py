@@ -1,4 +1,4 @@
-"""What live planes know of a session that is not complete, and what they compute from it."""
+"""Scenes of live planes from a session that is not complete, and the planes computed from them."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +20,8 @@ from faintfield.pipelines.reconstruction.channels import channel_layouts, load_c
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
 from faintfield.pipelines.reconstruction.planes.penalised import Objective, certified
 from faintfield.recon.solver.data_fit import SceneProblem
-from faintfield.recon.solver.initialization import back_projection, universal_penalty_weight
+from faintfield.recon.solver.initialization import back_projection
+from faintfield.recon.solver.penalty_weight import universal_penalty_weight
 from faintfield.rig.cameras.settings import FolderSettings
 from faintfield.rig.plan import nominal_poses_rt_cam_ref
 from faintfield.rig.session.session import read_plan, taken_frames

@@ -28,7 +28,7 @@ VOID = {"meta", "img", "input", "br", "hr", "link"}
 
 
 class _Page(HTMLParser):
-    """What is on a page: its elements, its words, and whether every element is closed in turn."""
+    """Content of a page: its elements, its words, and elements that are not closed in turn."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -160,8 +160,8 @@ def test_titles_say_whether_occlusion_was_kept(kept: bool, planes: Path, done: C
 
 
 def test_errors_follow_prior_of_each_plane(planes: Path, done: Command) -> None:
-    """Where a prior is left out at one depth, its errors lead the page beside those of the other."""
-    priors: dict[float, dict[str, Any]] = {
+    """Errors of a prior lead the page beside those at the depth where it is left out."""
+    priors: dict[float, dict[str, str | float]] = {
         500.0: {"name": "tv", "left_out": "the views contradict it"},
         700.0: {"name": "auto", "moved_sigma": 0.5},
     }
@@ -305,12 +305,12 @@ def test_viewer_shows_surface_with_its_uncertainty(surface: Path, done: Command)
     done("report", surface)
     data = (surface / "report.html").read_text().partition('id="viewer-data">')[2].partition("</script>")[0]
     viewer = json.loads(data)
-    pictures = {picture["words"]: picture for picture in viewer["pictures"]}
+    pictures = {picture["label"]: picture for picture in viewer["pictures"]}
     depth, picture = pictures["depth"], pictures["picture"]
     assert viewer["pictures"][viewer["first"][1]] == picture
-    assert viewer["pictures"][picture["sigma"]]["words"] == "σ of the picture"
-    assert viewer["pictures"][depth["sigma"]]["words"] == "σ of the depth"
-    assert viewer["pictures"][depth["confidence"]]["words"] == "probability of the depth"
+    assert viewer["pictures"][picture["sigma"]]["label"] == "σ of the picture"
+    assert viewer["pictures"][depth["sigma"]]["label"] == "σ of the depth"
+    assert viewer["pictures"][depth["confidence"]]["label"] == "probability of the depth"
     assert (depth["unit"], depth["sure_above"]) == ("mm", 0.9)
     assert viewer["scales"]["depth"] == {
         "black": 449.775,

@@ -1,4 +1,4 @@
-"""What a report says of light, noise and geometry, and of what it is worth to know the poses."""
+"""Sections of a report about light, noise and geometry, and about the value of known poses."""
 
 import base64
 import hashlib

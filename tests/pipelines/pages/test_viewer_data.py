@@ -4,7 +4,6 @@ import base64
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import msgspec
@@ -17,7 +16,15 @@ from faintfield.pipelines.formats.image_files import Spacing, write_plane
 from faintfield.pipelines.formats.results.records import Method, PlaneRecord
 from faintfield.pipelines.pages.report_pictures import PlaneSections
 from faintfield.pipelines.pages.report_planes import Plane
-from faintfield.pipelines.pages.viewer_data import UNKNOWN_LEVEL, Fineness, Packed, ViewerPicture, pack, viewer_of
+from faintfield.pipelines.pages.viewer_data import (
+    UNKNOWN_LEVEL,
+    Fineness,
+    Packed,
+    ViewerData,
+    ViewerPicture,
+    pack,
+    viewer_of,
+)
 from tests.pipelines.conftest import run_undrawn
 from tests.pipelines.forms import read_record
 
@@ -30,7 +37,7 @@ def _levels(png: bytes) -> NDArray[np.int64]:
     return np.asarray(256 * high + low)
 
 
-def _picture_levels(picture: Any) -> NDArray[np.int64]:
+def _picture_levels(picture: ViewerPicture) -> NDArray[np.int64]:
     levels = _levels(base64.b64decode(picture["src"].partition(",")[2]))
     return levels if levels.ndim == 2 else levels[:, :, 0]
 
@@ -76,8 +83,7 @@ def _plane(folder: Path, method: Method, depth_mm: float, pixels: NDArray[np.flo
 def _pictures(planes: list[Plane]) -> list[ViewerPicture]:
     shown = viewer_of(planes, PlaneSections(white=1.0), None)
     assert shown is not None
-    pictures: list[ViewerPicture] = shown["pictures"]
-    return pictures
+    return shown["pictures"]
 
 
 def test_small_plane_is_fine_and_large_one_binned(tmp_path: Path) -> None:
@@ -115,7 +121,7 @@ def test_joint_planes_stand_beside_best_found_alone(tmp_path: Path) -> None:
     first, second = (shown["pictures"][index] for index in shown["first"])
     assert first["title"] == "PMLEM"
     assert second["title"].startswith("PMLEM, all planes together")
-    assert first["words"] == second["words"] == "500 mm"
+    assert first["label"] == second["label"] == "500 mm"
 
 
 def test_page_of_set_states_numbers_units_and_places(simulated_scene: Path, tmp_path: Path) -> None:
@@ -123,7 +129,7 @@ def test_page_of_set_states_numbers_units_and_places(simulated_scene: Path, tmp_
     run_undrawn("reconstruct", simulated_scene, "--out", out, "--depth-mm", 500, "--method", "backprojection")
     page = (out / "report.html").read_text()
     assert "<script>alert(1)" not in page
-    data: dict[str, Any] = json.loads(page.partition('id="viewer-data">')[2].partition("</script>")[0])
+    data: ViewerData = json.loads(page.partition('id="viewer-data">')[2].partition("</script>")[0])
     (light,) = (picture for picture in data["pictures"] if picture["kind"] == "light")
     plane = tifffile.imread(out / "plane_00500.0.tiff")
     np.testing.assert_allclose(

@@ -14,7 +14,8 @@ from faintfield.recon.operator.occlusion import Occluders
 from faintfield.recon.operator.scene_operator import SceneOperator
 from faintfield.recon.prior.evidence import evidence_of_planes
 from faintfield.recon.solver.data_fit import DataFit, SceneProblem
-from faintfield.recon.solver.initialization import back_projection, mean_light_e, smooth_start, universal_penalty_weight
+from faintfield.recon.solver.initialization import back_projection, mean_light_e, smooth_start
+from faintfield.recon.solver.penalty_weight import universal_penalty_weight
 from faintfield.recon.solver.pmlem import PmlemIterate, pmlem
 from faintfield.recon.solver.uncertainty import local_fits
 from tests.recon.displaced import noisy_images, pixel_rays, planes_displaced_by, run_until, views_displaced_by

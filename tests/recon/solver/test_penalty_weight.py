@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 from faintfield.recon.likelihood.images import ElementalImages, Image, PixelLikelihood
 from faintfield.recon.solver import penalty_weight
 from faintfield.recon.solver.data_fit import DataFit, SceneProblem
-from faintfield.recon.solver.initialization import smooth_start, universal_penalty_weight
+from faintfield.recon.solver.initialization import smooth_start
 from faintfield.recon.solver.penalties import Penalty
-from faintfield.recon.solver.penalty_weight import cross_validated_weight, validation_views
+from faintfield.recon.solver.penalty_weight import cross_validated_weight, universal_penalty_weight, validation_views
 from faintfield.recon.solver.pmlem import pmlem
 from tests.recon.displaced import dark_views, pieces, run_until, views_displaced_by
 

@@ -46,7 +46,7 @@ def test_edge_moves_no_farther_than_the_band() -> None:
 
 
 def test_both_sides_keep_their_depths() -> None:
-    """Where the near side is slanted, the samples that join it have the depth of its edge, and no third depth."""
+    """Beside a slanted near side, the samples that join it have the depth of its edge, and no third depth."""
     index = _step(20) + np.where(_step(20) == NEAR, np.linspace(0, 2, SHAPE[0])[:, np.newaxis], 0).astype(np.float32)
     result = moved_edges(index, np.zeros((*SHAPE, DEPTHS), np.float32), _light(24))
     np.testing.assert_array_equal(result[:, :20], index[:, :20])

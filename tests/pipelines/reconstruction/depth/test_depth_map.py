@@ -274,15 +274,14 @@ def test_damaged_truth_is_refused(content: bytes, words: str, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    "options",
+    ("purpose", "options"),
     [
-        ("--sweep-mm", "400:900:5", "--method", "backprojection", "--depth-map"),
-        ("--surface", "--depth-range-mm", "400:900", "--penalty-weight", 0.5, "--passes", 2),
+        ("depth map", ("--sweep-mm", "400:900:5", "--method", "backprojection", "--depth-map")),
+        ("surface", ("--surface", "--depth-range-mm", "400:900", "--penalty-weight", 0.5, "--passes", 2)),
     ],
-    ids=["depth map", "surface"],
 )
 def test_reconstruction_with_depth_writes_its_errors(
-    options: tuple[object, ...], scene: Path, tmp_path: Path, done: Command, seen: Searches,
+    purpose: str, options: tuple[object, ...], scene: Path, tmp_path: Path, done: Command, seen: Searches,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     out = tmp_path / "out"
@@ -293,3 +292,4 @@ def test_reconstruction_with_depth_writes_its_errors(
     written = json.loads((out / "depth_errors.json").read_text())
     assert written["median_relative_error"] == pytest.approx(0.2, rel=1e-4)
     assert "median error 150 mm (20.00%)" in message
+    assert f"{purpose} between 400 and 900 mm: comparing " in message

@@ -26,7 +26,7 @@ _ROOT_MEAN_SQUARE = 0.236324
 
 
 class Known(NamedTuple):
-    """What is known of a dark plane, and its true light as blurred as the back-projection."""
+    """Inputs of the network for a dark plane, and its true light as blurred as the back-projection."""
 
     picture: Image
     pilot: Image

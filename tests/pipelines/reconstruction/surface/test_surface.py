@@ -68,6 +68,16 @@ def test_unexplained_surface_is_told_of_at_the_end(
     assert read_record(scene / "out", "overview.json")["brightness"]["snr"] is not None
 
 
+@pytest.mark.parametrize(("confidence", "remark"), [(0.5, "No depth of this surface is sure: "), (0.95, None)])
+def test_surface_without_sure_depths_says_so(
+    confidence: float, remark: str | None, seen: Searches, scene: Path, monkeypatch: pytest.MonkeyPatch, done: Command
+) -> None:
+    monkeypatch.setattr("tests.pipelines.surfaces.FOUND_CONFIDENCE", confidence)
+    last = done("reconstruct", scene, "--surface", *FAST, "--out", scene / "out").stderr.splitlines()[-1]
+    shown = "depth of this surface is sure" in (scene / "out" / "report.html").read_text()
+    assert (last.startswith(remark or "a surface in"), shown) == (True, remark is not None), last
+
+
 def test_maps_follow_from_depth_and_confidence(seen: Searches, scene: Path, done: Command) -> None:
     out = scene / "out"
     done("reconstruct", scene, "--surface", *FAST, "--out", out)

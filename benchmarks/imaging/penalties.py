@@ -1,9 +1,10 @@
 """Compare penalties, each at its best weight for the true picture, on four objects at SNR 0.16.
 
-The paper claims that total variation is best. Run `python -m benchmarks.penalties`; it prints one JSON object of mean
-square errors, the object scaled to run from 0 to 1.
+The paper claims that total variation is best. Run `python -m benchmarks.imaging.penalties`; it prints one JSON object
+of mean square errors, the object scaled to run from 0 to 1.
 """
 
+import argparse
 import json
 import sys
 from collections.abc import Callable
@@ -15,8 +16,9 @@ from faintfield.recon.metrics import mean_square_error, signal_scale_for_snr
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.single_plane import PlaneOperator
 from faintfield.recon.solver.data_fit import DataFit
-from faintfield.recon.solver.initialization import smooth_start, universal_penalty_weight
+from faintfield.recon.solver.initialization import smooth_start
 from faintfield.recon.solver.penalties import Penalty, PenaltyName
+from faintfield.recon.solver.penalty_weight import universal_penalty_weight
 from faintfield.recon.solver.pmlem import pmlem
 from faintfield.rig.simulation.objects import shaded_ball, star_chart, toy_airplane, toy_truck
 from faintfield.rig.simulation.scene import TexturedPlane
@@ -78,4 +80,5 @@ def smallest_errors(picture: Image, seed: int = 1) -> dict[str, float]:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(prog="python -m benchmarks.imaging.penalties", description=__doc__).parse_args()
     sys.stdout.write(json.dumps({name: smallest_errors(picture) for name, picture in pictures().items()}) + "\n")

@@ -11,13 +11,14 @@ from collections.abc import Callable, Iterable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.library_solver import LibraryProblem, installed_solvers, iterates_of
-from benchmarks.problem import BenchmarkProblem
+from benchmarks.speed.library_solver import LibraryProblem, installed_solvers, iterates_of
+from benchmarks.speed.problem import BenchmarkProblem
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.single_plane import PlaneOperator
 from faintfield.recon.solver.data_fit import DataFit
-from faintfield.recon.solver.initialization import smooth_start, universal_penalty_weight
+from faintfield.recon.solver.initialization import smooth_start
 from faintfield.recon.solver.one_step_late import pmlem_one_step_late
+from faintfield.recon.solver.penalty_weight import universal_penalty_weight
 from faintfield.recon.solver.pmlem import pmlem
 
 # Consecutive checks that must hold, and the time after which a solver is given up.

@@ -1,4 +1,4 @@
-"""Accuracy and speed of the noise calibration: `python -m benchmarks.noise_accuracy [study ...] [--repeats N]`.
+"""Accuracy and speed of noise calibration: `python -m benchmarks.calibration.noise_accuracy [study ...] [--repeats N]`.
 
 Errors are divided by the Cramér-Rao bound of the same frames; 1.00 cannot be beaten. Frames are simulated afresh in
 every repeat and go through the whole calibration. The tests run the same studies with fewer repeats.

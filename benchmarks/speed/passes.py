@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from benchmarks.problem import BenchmarkProblem
+from benchmarks.speed.problem import BenchmarkProblem
 
 type Run = Callable[[], object]
 
@@ -181,7 +181,7 @@ def _bilinear_matrix(problem: BenchmarkProblem, view: int) -> scipy.sparse.csr_a
 
 def memory(size_px: int) -> dict[str, float]:
     """Return the memory that passes and solvers need beside the data, each measured in a process of its own."""
-    command = [sys.executable, "-m", "benchmarks.memory", str(size_px)]
+    command = [sys.executable, "-m", "benchmarks.speed.memory", str(size_px)]
     figures: dict[str, float] = {}
     for what in ("passes", "joint", "occlusion"):
         figures |= json.loads(subprocess.run([*command, what], check=True, capture_output=True, text=True).stdout)

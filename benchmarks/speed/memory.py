@@ -1,4 +1,4 @@
-"""The peak memory of a process that loads a problem and works on it: `python -m benchmarks.memory SIZE_PX TASK`.
+"""The peak memory of a process that loads a problem and works on it: `python -m benchmarks.speed.memory SIZE_PX TASK`.
 
 Tasks are "passes" over the data of one plane, and "joint" and "occlusion", which solve two planes together.
 """
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.problem import BenchmarkProblem
+from benchmarks.speed.problem import BenchmarkProblem
 from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.solver.pmlem import pmlem
 

@@ -1,4 +1,4 @@
-"""Coverage of the intervals of the noise: `python -m benchmarks.noise_coverage [case ...] [--repeats N]`.
+"""Coverage of the intervals of the noise: `python -m benchmarks.calibration.noise_coverage [case ...] [--repeats N]`.
 
 Sensors that bend, saturate, drift, flicker and scatter are simulated here, apart from `calib`. Every repeat draws
 frames afresh and goes through the whole calibration. An interval holds if the truth is inside; quantities without a

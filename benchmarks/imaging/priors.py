@@ -1,4 +1,4 @@
-"""Planes by priors against total variation and BM3D: `python -m benchmarks.priors`.
+"""Planes by priors against total variation and BM3D: `python -m benchmarks.imaging.priors`.
 
 The four toys of figure 4, with its exposures and its errors: one line of JSON for each plane, then tables of the mean
 square errors over the draws, of bright specks in the dark, and of the residuals where there is nothing to see. With
@@ -17,9 +17,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.bm3d_peer import Bm3d
-from benchmarks.prior_faults import BANDS, Residual, dark_samples, residuals_of_fields, specks
-from benchmarks.prior_pictures import ShownPlane, draw
+from benchmarks.imaging.bm3d_peer import Bm3d
+from benchmarks.imaging.prior_faults import BANDS, Residual, dark_samples, residuals_of_fields, specks
+from benchmarks.imaging.prior_pictures import ShownPlane, draw
 from faintfield.pipelines.arguments import PriorName, SolverOptions
 from faintfield.pipelines.paper.figure4 import SNRS, StagedObject, stage_object
 from faintfield.pipelines.reconstruction.planes.penalised import Solution
@@ -219,7 +219,7 @@ def _names(names: Iterable[str]) -> list[str]:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.priors", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.imaging.priors", description=__doc__)
     parser.add_argument("--seeds", type=int, default=5, help="draws of the noise")
     parser.add_argument("--snr", type=float, nargs="+", choices=SNRS, default=[SNRS[0], SNRS[-1]])
     parser.add_argument("--bm3d", type=Path, metavar="PYTHON", help="Python of an environment with the package bm3d")

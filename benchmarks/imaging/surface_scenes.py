@@ -1,6 +1,6 @@
 """Scenes with true depth, rendered by a program that shares nothing with this one.
 
-    python -m benchmarks.surface_scenes room OUT
+    python -m benchmarks.imaging.surface_scenes room OUT
 
 renders a scene with Mitsuba 3 (https://www.mitsuba-renderer.org) from a grid of 7 × 7 nodes and writes a bright set,
 to be darkened by `faintfield darken`, with true_depth_mm.tiff and true_picture.tiff of its reference view. Mitsuba
@@ -29,7 +29,7 @@ try:
 except ModuleNotFoundError:
     mi = None
 
-from benchmarks.surface_models import SCENES, model, opaque
+from benchmarks.imaging.surface_models import SCENES, model, opaque
 
 _WHITE_DN = 50000
 
@@ -184,7 +184,9 @@ def write_scene(name: str, out: Path, camera: Camera, nodes: Sequence[Node]) -> 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Render the scene that is asked for."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.surface_scenes", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.imaging.surface_scenes", description=__doc__.splitlines()[0]
+    )
     parser.add_argument("scene", choices=SCENES)
     parser.add_argument("out", type=Path, help="folder to write, which must not exist")
     parser.add_argument("--size-px", type=int, nargs=2, default=(640, 480), metavar=("WIDTH", "HEIGHT"))
@@ -194,7 +196,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--pitch-mm", type=float, default=50.0)
     arguments = parser.parse_args(argv)
     if mi is None:
-        parser.error("mitsuba is not installed here; see the first lines of benchmarks/surface_scenes.py")
+        parser.error("mitsuba is not installed here; see the first lines of benchmarks/imaging/surface_scenes.py")
     if arguments.nodes % 2 == 0:
         parser.error(f"--nodes {arguments.nodes} has no node in the middle; give an odd number")
     if arguments.out.exists():

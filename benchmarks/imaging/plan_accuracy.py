@@ -1,4 +1,4 @@
-"""Predictions of `faintfield plan` against simulated captures: `python -m benchmarks.plan_accuracy [STUDY …]`.
+"""Predictions of `faintfield plan` against simulated captures: `python -m benchmarks.imaging.plan_accuracy [STUDY …]`.
 
 `sigma`: the paper's truck before the paper's camera, at SNRs by eq. (4) and on grids of several sizes. The rig's
 simulation renders and exposes the views, which share no code with the operator; each is exposed anew for every draw,
@@ -191,7 +191,7 @@ _STUDIES: dict[str, Callable[[argparse.Namespace], None]] = {"sigma": sigma, "fe
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.plan_accuracy", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.imaging.plan_accuracy", description=__doc__)
     parser.add_argument("studies", nargs="*", metavar="STUDY", help=", ".join(_STUDIES))
     parser.add_argument("--size-px", nargs=2, type=int, default=(320, 240))
     parser.add_argument("--draws", type=int, default=12)

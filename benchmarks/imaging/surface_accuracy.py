@@ -1,4 +1,4 @@
-"""Accuracy of a surface against the truth: `python -m benchmarks.surface_accuracy RESULT TRUTH [--scale-e X]`.
+"""Accuracy of a surface against the truth: `python -m benchmarks.imaging.surface_accuracy RESULT TRUTH [--scale-e X]`.
 
 RESULT holds picture.tiff, depth_mm.tiff and depth_confidence.tiff, TRUTH true_depth_mm.tiff and true_picture.tiff, all
 on the same samples. The picture is compared in electrons: `--scale-e` is the `scale_e` in the provenance.json of a set
@@ -165,7 +165,7 @@ def report_lines(
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.surface_accuracy", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.imaging.surface_accuracy", description=__doc__)
     parser.add_argument("result", type=Path, help="folder of the surface")
     parser.add_argument("truth", type=Path, help="folder of the true depth and picture")
     parser.add_argument("--scale-e", type=float, default=1.0, help="electrons per unit of the true picture")

@@ -1,7 +1,7 @@
-"""Cost of calibrating a large sensor: `python -m benchmarks.calibration_size MEGAPIXELS FRAMES`."""
+"""Cost of calibrating a large sensor: `python -m benchmarks.calibration.calibration_size MEGAPIXELS FRAMES`."""
 
+import argparse
 import resource
-import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,7 +20,11 @@ _SEED, _LIGHT_E = 1288, (1000.0, 4000.0, 16000.0)
 
 def main() -> None:
     """Print seconds, CPU seconds and peak memory of boards, of statistics and of the fit."""
-    pixels, frames = float(sys.argv[1]) * 1e6, int(sys.argv[2])
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.calibration.calibration_size", description=__doc__)
+    parser.add_argument("megapixels", type=float)
+    parser.add_argument("frames", type=int)
+    arguments = parser.parse_args()
+    pixels, frames = arguments.megapixels * 1e6, arguments.frames
     shape = int((pixels / 1.5) ** 0.5), int((pixels * 1.5) ** 0.5)
     boards = [Board(f"b{k}", 8, 6, 40.0, 29.0, "DICT_5X5_1000", 100 * k) for k in range(6)]
     scene = _scene(boards, shape)

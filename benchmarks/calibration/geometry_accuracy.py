@@ -1,4 +1,4 @@
-"""Accuracy of the geometry and of its stated uncertainty over many seeds: `python -m benchmarks.geometry_accuracy`.
+"""Accuracy of the geometry and its stated uncertainty: `python -m benchmarks.calibration.geometry_accuracy`.
 
 Per seed: 49 nodes with errors of 0.3 mm and 0.2 degrees, six boards, corners with noise of 0.2 px at 1600 x 1200 px.
 """
@@ -144,7 +144,7 @@ def _rms(vectors: NDArray[np.float64]) -> float:
 
 def main() -> None:
     """Print rms (errors) and means (the rest) over the seeds."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.geometry_accuracy", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.calibration.geometry_accuracy", description=__doc__)
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--miss-mm", type=float, default=0.0, help="boards one after another, nodes missed by this")
     parser.add_argument("--json", action="store_true", help="print one JSON object")

@@ -1,7 +1,7 @@
 """BM3D as a peer: the package `bm3d` of another Python environment, its strength found from the truth.
 
 The package is no requirement of the project, and an environment of its own may hold the versions that it needs.
-`python -m benchmarks.bm3d_peer PYTHON` measures it on the exposures of figure 4 and writes the table that
+`python -m benchmarks.imaging.bm3d_peer PYTHON` measures it on the exposures of figure 4 and writes the table that
 `faintfield figures` reads.
 """
 
@@ -115,12 +115,12 @@ def _mse(stage: StagedObject, scale_e: float, plane: Image) -> float:
 
 def main() -> None:
     """Write the table."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.bm3d_peer", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.imaging.bm3d_peer", description=__doc__)
     parser.add_argument("python", type=Path, help="Python of an environment with the package bm3d")
     python = parser.parse_args().python
     program = subprocess.run([str(python), "-c", _VERSION], check=True, capture_output=True, text=True).stdout.strip()
     table = PeerTable(
-        program, f"{datetime.now(UTC):%Y-%m-%d}", "python -m benchmarks.bm3d_peer PYTHON", measure(Bm3d(python))
+        program, f"{datetime.now(UTC):%Y-%m-%d}", "python -m benchmarks.imaging.bm3d_peer PYTHON", measure(Bm3d(python))
     )
     write_json(PEER_FILE, table)
 

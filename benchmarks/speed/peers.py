@@ -1,6 +1,6 @@
 """Solutions by libraries on the same operator, and the inner problem alone by scikit-image, each to one criterion.
 
-    python -m benchmarks.peers [--size-px 1024]
+    python -m benchmarks.speed.peers [--size-px 1024]
 
 Libraries that are not installed are left out. Contenders take turns in one run; times are of the wall clock.
 """
@@ -13,8 +13,8 @@ from functools import partial
 import numpy as np
 from skimage.restoration import denoise_tv_chambolle
 
-from benchmarks.library_solver import installed_solvers, iterates_of
-from benchmarks.solvers import seconds_to_criterion, solved_scene
+from benchmarks.speed.library_solver import installed_solvers, iterates_of
+from benchmarks.speed.solvers import seconds_to_criterion, solved_scene
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.solver.proximal import DualField
@@ -90,7 +90,7 @@ def _objective(plane: Image, point: Image, beta: float) -> float:
 
 def main() -> None:
     """Print both comparisons as tables in Markdown."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.peers", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.speed.peers", description=__doc__)
     parser.add_argument("--size-px", type=int, default=1024, help="width and height of the detector and the plane")
     size_px = parser.parse_args().size_px
     for title, unit, found in (

@@ -1,4 +1,4 @@
-"""The models that `benchmarks.surface_scenes` renders: shapes, textures and lamps, in the terms of Mitsuba 3.
+"""The models that `benchmarks.imaging.surface_scenes` renders: shapes, textures and lamps, in the terms of Mitsuba 3.
 
 The reference camera is at the origin and looks along z, with x to the right and y down, in mm.
 """

@@ -1,4 +1,4 @@
-"""Coverage of the 90 % interval of a sample: `python -m benchmarks.uncertainty [SCENE …]`.
+"""Coverage of the 90 % interval of a sample: `python -m benchmarks.imaging.uncertainty [SCENE …]`.
 
 Each scene is one picture as a plane at 500 mm before the paper's camera and grid, rendered by the simulated rig, whose
 lens and interpolation are not those of the reconstruction: an object of the demo alone, a picture that scikit-image
@@ -149,7 +149,7 @@ def covered(scene: Scene, prior: PriorName) -> dict[str, float]:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.uncertainty", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.imaging.uncertainty", description=__doc__)
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help=", ".join([*CHOSEN_ON, *OTHERS]))
     parser.add_argument("--size-px", nargs=2, type=int, default=(320, 240))
     parser.add_argument("--seed", type=int, default=1)

@@ -5,8 +5,9 @@ whether its depth is right; all sets count alike. Coefficients are the maximum o
 prior. The last, of how much of the detail is explained, is fitted on scenes that mislead, given all others: elsewhere
 there is little to learn about it.
 
-Call `python -m benchmarks.surface_confidence SET=TRUTH … --misleading SET=TRUTH …`, with a folder of elemental.toml and
-one that holds true_depth_mm.tiff, of several scenes at several levels of light. Report accuracy on other scenes.
+Call `python -m benchmarks.imaging.surface_confidence SET=TRUTH … --misleading SET=TRUTH …`, with a folder of
+elemental.toml and one that holds true_depth_mm.tiff, of several scenes at several levels of light. Report accuracy
+on other scenes.
 """
 
 import argparse
@@ -72,7 +73,7 @@ def fitted(
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Print the fitted coefficients, and what they and the present ones say of each set."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.surface_confidence", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.imaging.surface_confidence", description=__doc__)
     parser.add_argument("sets", nargs="+", metavar="SET=TRUTH")
     parser.add_argument("--misleading", nargs="*", default=[], metavar="SET=TRUTH")
     arguments = parser.parse_args(argv)

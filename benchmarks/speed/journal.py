@@ -1,6 +1,6 @@
-"""Time to record a frame of 24 MB (intent, file, commit): `python -m benchmarks.journal [FOLDER]`."""
+"""Time to record a frame of 24 MB (intent, file, commit): `python -m benchmarks.speed.journal [FOLDER]`."""
 
-import sys
+import argparse
 import tempfile
 import time
 from pathlib import Path
@@ -24,6 +24,9 @@ SHAPE = (3000, 4000)
 
 def main() -> None:
     """Print the median, 90 % quantile and maximum of the times of frames given as a file and as an array."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.speed.journal", description=__doc__)
+    parser.add_argument("folder", nargs="?")
+    parent = parser.parse_args().folder
     settings = RigSettings(
         stage=StageSettings("simulated"),
         camera=SimulatedSettings(),
@@ -33,7 +36,7 @@ def main() -> None:
     plan = FrozenPlan(survey(open_rig(settings), settings).plan, settings)
     generator = np.random.default_rng(1)
     pixels = generator.integers(0, 65536, SHAPE, dtype=np.uint16)
-    with tempfile.TemporaryDirectory(dir=sys.argv[1] if len(sys.argv) > 1 else None) as folder:
+    with tempfile.TemporaryDirectory(dir=parent) as folder:
         for name, exposure in (
             ("file", Exposure(".nef", content=pixels.tobytes())),
             ("array", Exposure(".tiff", pixels=pixels)),

@@ -1,4 +1,4 @@
-"""Raw Bayer frames of any size, the whole way: `python -m benchmarks.full_frame --mpx 1 6 24`.
+"""Raw Bayer frames of any size, the whole way: `python -m benchmarks.speed.full_frame --mpx 1 6 24`.
 
 Frames of a picture on one plane are made by OpenCV's warp, without the operator that is measured; then `faintfield`
 reconstructs them as a user would. Printed for each size: seconds, CPU seconds and peak memory of each command, and its

@@ -1,4 +1,4 @@
-"""Gain by maps per pixel on an sCMOS sensor: `python -m benchmarks.sensor_maps [SEEDS] [WIDTH HEIGHT]`.
+"""Gain by maps per pixel on an sCMOS sensor: `python -m benchmarks.calibration.sensor_maps [SEEDS] [WIDTH HEIGHT]`.
 
 Each simulated sensor has log-normal read noise (median 1.2 e⁻, a tail to 10 e⁻, columns that differ), 1 % telegraph
 pixels, offsets of pixels and columns, gains that differ by 1 % from pixel to pixel and by 2 % between two taps, and
@@ -8,8 +8,8 @@ and response, and defects left out; with all maps; and with the true maps. Print
 means: errors of the maps against the truth, and the mean squared error of each picture over that of one number.
 """
 
+import argparse
 import json
-import sys
 from dataclasses import dataclass
 from typing import Any
 
@@ -161,8 +161,12 @@ def picture_errors(sensor: Sensor, calibration: NoiseCalibration, rng: np.random
 
 def main() -> None:
     """Measure and print."""
-    seeds = int(sys.argv[1]) if len(sys.argv) > 1 else 5
-    width, height = (int(word) for word in sys.argv[2:4]) if len(sys.argv) > 3 else (128, 96)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.calibration.sensor_maps", description=__doc__)
+    parser.add_argument("seeds", type=int, nargs="?", default=5)
+    parser.add_argument("width", type=int, nargs="?", default=128)
+    parser.add_argument("height", type=int, nargs="?", default=96)
+    arguments = parser.parse_args()
+    seeds, width, height = arguments.seeds, arguments.width, arguments.height
     results = []
     for seed in range(seeds):
         rng = np.random.default_rng(seed)

@@ -1,0 +1,1 @@
+"""Accuracy, coverage and cost of the calibration of noise and geometry."""

@@ -1,0 +1,1 @@
+"""Planes, surfaces and predictions against the truth and against peers."""

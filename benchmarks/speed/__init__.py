@@ -1,0 +1,1 @@
+"""Speed and memory of passes, solvers, sessions and whole sets."""
