@@ -135,6 +135,7 @@ def propose(
     penalty_weight: float,
     candidates: Candidates,
     *,
+    drafts: Candidates | None = None,
     other_colours: Image | None = None,
 ) -> list[PlaneProposal]:
     """Return a proposal for each plane of a scene: a mixture of candidates, with weights from held-out views.
@@ -151,6 +152,8 @@ def propose(
     candidates : callable
         Returns the candidates for one plane by name, given its evidence: always the same names. The first is chosen
         where all predict alike.
+    drafts : callable, optional
+        Returns candidates that are nearly those, but made faster: good enough to find the weights.
     other_colours : float array (samples), optional
         The planes in other colours, for the evidence of the folds.
     """
@@ -158,7 +161,7 @@ def propose(
     regions = [regions_of(*of_plane) for of_plane in zip(operator.planes_of(samples), evidences, strict=True)]
     totals: list[list[Scores]] = [[] for _ in evidences]
     for number in range(max(_MIN_FOLDS, folds_to_predict(problem))):
-        found = _fold_scores(problem, samples, penalty_weight, number, candidates, regions, other_colours)
+        found = _fold_scores(problem, samples, penalty_weight, number, drafts or candidates, regions, other_colours)
         totals = [
             [a + b for a, b in zip(total, more, strict=True)] if total else more
             for total, more in zip(totals, found, strict=True)

@@ -36,12 +36,15 @@ _ODD = 0.01
 type _Tile = tuple[slice, slice]
 
 
-def learned_estimate(picture: Image, pilot: Image, patches: Image, noise_variance: Image) -> NDArray[np.float32]:
+def learned_estimate(
+    picture: Image, pilot: Image, patches: Image, noise_variance: Image, *, sides: int = 4
+) -> NDArray[np.float32]:
     """Return p improved by the network (row, column), in electrons; p itself where no view sees the sample.
 
     The arrays (row, column) are y, the back-projection; u, a solution as blurred as y; p, y filtered in groups of
     patches, all in electrons; and s², the variance of the noise of y, infinite where no view sees the sample. The
-    network sees the plane from four sides, and its answers are averaged: what it says turns with the plane.
+    network sees the plane from four sides, and its answers are averaged: what it says turns with the plane. Fewer
+    `sides` are faster, and nearly as good.
     """
     seen = _seen(noise_variance)
     if not seen.any():
@@ -51,8 +54,8 @@ def learned_estimate(picture: Image, pilot: Image, patches: Image, noise_varianc
     padded = np.pad(inputs, ((0, 0), (0, -rows % _MULTIPLE), (0, -columns % _MULTIPLE)), mode="symmetric")
     # One network for each call, since it is no function but keeps its input
     network = cv2.dnn.readNetFromONNX(np.frombuffer(files(__package__).joinpath(_FILE).read_bytes(), np.uint8))
-    sides = [np.rot90(_output(network, np.rot90(padded, turn, (1, 2))), -turn) for turn in range(4)]
-    change = np.mean(sides, axis=0)[:rows, :columns]
+    answers = [np.rot90(_output(network, np.rot90(padded, turn, (1, 2))), -turn) for turn in range(sides)]
+    change = np.mean(answers, axis=0)[:rows, :columns]
     return np.where(seen, patches + deviation * change, patches).astype(np.float32)
 
 

@@ -73,13 +73,17 @@ def _about_proposals(
     if contradiction := _contradiction(objective, samples, evidences):
         return contradiction
     candidates: Candidates = patch_candidates
+    drafts: Candidates | None = None
     no_network = None
     if options.prior != "patches":
         reasons = (outside_range(evidence.pilot, evidence.noise) for evidence in evidences)
         no_network = next((reason for reason in reasons if reason is not None), None)
         if no_network is None:
             candidates = partial(_with_network, alone=options.prior == "learned")
-    proposals = propose(objective.posed, samples, evidences, weight, candidates, other_colours=other_colours)
+            drafts = partial(candidates, sides=1)
+    proposals = propose(
+        objective.posed, samples, evidences, weight, candidates, drafts=drafts, other_colours=other_colours
+    )
     if all(weights.get("tv") == 1 for proposal in proposals for weights in proposal.mixture.values()):
         return "total variation predicts held-out views best"
     proposed = operator.samples_of([proposal.picture for proposal in proposals])
@@ -103,12 +107,12 @@ def _about_proposals(
     ]
 
 
-def _with_network(evidence: Evidence, *, alone: bool) -> dict[str, Image]:
+def _with_network(evidence: Evidence, *, alone: bool, sides: int = 4) -> dict[str, Image]:
     """Return the candidates from patches and what the network makes of them; alone: only that and total variation's."""
     found = patch_candidates(evidence)
     patches = (found["wiener"] + found["twice"]) / 2
     variance = evidence.noise.variance
-    found["learned"] = learned_estimate(evidence.picture, evidence.pilot, patches, variance)
+    found["learned"] = learned_estimate(evidence.picture, evidence.pilot, patches, variance, sides=sides)
     return {name: found[name] for name in ("tv", "learned")} if alone else found
 
 
