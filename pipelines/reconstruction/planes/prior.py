@@ -80,7 +80,7 @@ def _about_proposals(
         no_network = next((reason for reason in reasons if reason is not None), None)
         if no_network is None:
             candidates = partial(_with_network, alone=options.prior == "learned")
-            drafts = partial(candidates, sides=1)
+            drafts = partial(candidates, sides=2)
     proposals = propose(
         objective.posed, samples, evidences, weight, candidates, drafts=drafts, other_colours=other_colours
     )
