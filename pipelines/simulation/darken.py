@@ -92,8 +92,9 @@ def _check_noise(folder: Path, light_e: NDArray[np.floating], variance_e2: NDArr
     share = float(variance_e2.mean() / np.square(light_e).mean())
     if share > _MAX_NOISE_SHARE:
         raise BadValue(
-            f"{folder}: is dark already: its noise is {min(share, 1):.0%} of the power that is measured as light of its "
-            f"objects, at most {_MAX_NOISE_SHARE:.0%} may be; name the bright set, or the noise-free one of a simulation"
+            f"{folder}: is dark already: its noise is {min(share, 1):.0%} of the power that is measured as light of "
+            f"its objects, at most {_MAX_NOISE_SHARE:.0%} may be; name the bright set, or the noise-free one of a "
+            "simulation"
         )
 
 

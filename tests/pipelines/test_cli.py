@@ -13,7 +13,7 @@ from faintfield.pipelines import cli, launcher
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.launcher import COMMANDS, EXPORTS, IMPORTS
 from faintfield.recon.errors import NotConverged
-from tests.pipelines.conftest import Command
+from tests.pipelines.conftest import Command, assert_refused
 
 
 def test_version_is_printed(done: Command) -> None:
@@ -45,6 +45,22 @@ def test_wrong_usage_ends_with_code_2(
     assert ended.stdout == ""
     assert message in " ".join(ended.stderr.replace("│", " ").split())
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("noise absent", "noise.toml: no such file; name a session, or a folder with noise.toml"),
+        ("geometry absent", "charuco.toml: no such file; name a session with charuco frames"),
+        ("check absent.toml", "absent.toml: no such file; name a rig.toml; `faintfield init` writes one"),
+        ("capture absent.toml session", "absent.toml: no such file; name a rig.toml"),
+    ],
+)
+def test_missing_files_are_named_with_their_kind(
+    words: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, faintfield: Command
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert_refused(faintfield(*words.split()), "MissingFile", message)
 
 
 def test_output_is_a_report_or_one_json(scene: Path, tmp_path: Path, done: Command) -> None:

@@ -113,7 +113,7 @@ def test_dark_camera_is_that_described(bright: Path, tmp_path: Path, done: Comma
 def test_set_that_is_dark_already_is_refused(
     mean_e: int, make_set: SetMaker, tmp_path: Path, faintfield: Command
 ) -> None:
-    """Of 8 electrons with a read noise of 3.5, noise is (8 + 12) / (64 + 20) of the power, more in the brighter part."""
+    """Of 8 electrons with a read noise of 3.5, noise is (8 + 12) / (64 + 20) of the power; of 1 electron, most."""
     generator = np.random.default_rng(20110919)
     exposed_e = generator.poisson(mean_e, (150, 200)) + generator.normal(0, 12**0.5, (150, 200))
     noise = {"offset_dn": 100.0, "gain_dn_per_e": 2.0, "read_noise_e": 12**0.5}
