@@ -29,6 +29,11 @@ def test_version_is_printed(done: Command) -> None:
         (("simulate", "OUT", "--snr", "nan"), "got nan."),
         (("reconstruct", "SET", "--depth-mm", "500", "700", "--out", "OUT"), "--depth-mm 500 --depth-mm 700"),
         (("reconstruct", "SET", "--depth=3", "4", "5"), "repeat it for several: --depth 3 --depth 4 --depth 5"),
+        (("reconstruct", "SET", "--depth", "500,700"), "repeat it for several: --depth 500 --depth 700"),
+        (
+            ("reconstruct", "SET", "--depth-mm", "50cm"),
+            "--depth-mm 50cm: is no number; give digits alone in mm, such as 500 or 0.5, or auto",
+        ),
         (
             ("verify", "a", "b"),
             "b: no place for this; put a name with spaces in quotes",
