@@ -81,6 +81,8 @@ def test_output_is_a_report_or_one_json(scene: Path, tmp_path: Path, done: Comma
     assert [plane["depth_mm"] for plane in result["planes"]] == [500.0]
     assert {row["depth_mm"] for row in result["metrics"]["planes"]} == {500.0}
     assert json.loads(done("report", out, "--json").stdout) == {"report": str(out / "report.html")}
+    again = done("report", out)
+    assert (again.stdout, again.stderr) == (f"{out / 'report.html'}\n", "")
 
 
 # Each begins a line of its own, hides what follows, or turns its direction

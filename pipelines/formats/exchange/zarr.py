@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.pipelines.console import progress
+from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.errors import BadValue, InputError, import_optional
 from faintfield.pipelines.formats.files import check_free, writing_folder
 from faintfield.pipelines.formats.frames import read_frame
@@ -78,6 +78,7 @@ def export_planes(directory: Path, out: Path, *, overwrite: bool = False) -> Zar
             for level in range(stack.levels):
                 group[str(level)][:, index] = np.moveaxis(plane, 2, 0)
                 plane = _halve(plane)
+    inform(f"{out}: {len(stack.planes)} planes of {stack.shape[3]} x {stack.shape[2]} samples")
     return ZarrExport(str(out), stack.shape, stack.levels, stack.scale.unit or "relative")
 
 
