@@ -158,6 +158,10 @@ def test_completion_knows_commands_and_options(tmp_path: Path, capsys: pytest.Ca
     assert str(script) in (tmp_path / ".bashrc").read_text()
 
 
+def test_defaults_in_help_have_few_digits(done: Command) -> None:
+    assert "[default: 3.464]" in done("darken", "--help").stdout
+
+
 @pytest.mark.parametrize("command", ["reconstruct", "run"])
 def test_help_groups_options_by_purpose(command: str, done: Command) -> None:
     panels = re.findall(r"^╭─ (.*?) ─+╮$", done(command, "--help").stdout, re.MULTILINE)

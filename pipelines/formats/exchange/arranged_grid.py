@@ -192,8 +192,8 @@ def _refuse_unfit(inspection: GridInspection, paths: Sequence[Path], *, prescrib
     if inspection.order.verdict == "denied" and not prescribed:
         raise ShuffledPictures(
             f"{folder}: the neighbours of a picture, by the names, fit it better than {inspection.order.share:.0%} of "
-            "the others do, and in a light field better than nearly all do; give views of one scene in the order of the "
-            "grid, by their names, by --pattern, or by --rows and --columns"
+            "the others do, and in a light field better than nearly all do; give views of one scene in the order of "
+            "the grid, by their names, by --pattern, or by --rows and --columns"
         )
     (least, largest), orientation = inspection.range_px, inspection.orientation
     if inspection.undecided and not (aligned and not orientation.opposed):
