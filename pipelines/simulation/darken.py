@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.console import progress
 from faintfield.pipelines.errors import BadValue
-from faintfield.pipelines.formats.files import check_free, write_json, writing_folder
+from faintfield.pipelines.formats.files import check_free, require_room, write_json, writing_folder
 from faintfield.pipelines.formats.frames import ChannelLayout
 from faintfield.pipelines.formats.image_files import ONE_PIXEL, mask_picture, write_plane, write_png
 from faintfield.pipelines.formats.provenance import provenance
@@ -55,6 +55,8 @@ def darken_set(folder: Path, out: Path, options: DarkeningOptions, *, overwrite:
     light, variance_e2 = _light(bright, bright.image_paths[bright.reference_view], layouts)
     region, scale_e = _region_and_scale(folder, light, options)
     _check_noise(folder, light[region], variance_e2[region])
+    size_bytes = len(bright.image_paths) * light.size * np.dtype(np.uint16).itemsize
+    require_room(out, size_bytes, written_bytes=size_bytes)
     photons = float(light[region].mean()) * scale_e / options.quantum_efficiency
     with writing_folder(out, replace_if=FILE_NAME, overwrite=overwrite, reads=[folder]) as target:
         _write_dark_views(bright, layouts, target, options, scale_e)

@@ -106,6 +106,22 @@ def test_results_folder_is_checked_before_depths_are_searched(
     assert_refused(faintfield("reconstruct", simulated_scene, *words), "OutputExists", "holds a surface")
 
 
+@pytest.mark.parametrize("words", ["simulate {out}", "darken {bright} {out}", "export zarr {planes} {out}"])
+def test_room_for_all_that_is_written_is_needed(
+    words: str,
+    simulated_scene: Path,
+    sweep: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    faintfield: Command,
+) -> None:
+    places = {"bright": simulated_scene / "noise_free", "planes": sweep, "out": tmp_path / "out"}
+    monkeypatch.setattr("faintfield.pipelines.formats.files._free_bytes", lambda _: 50_000)
+    ended = faintfield(*(word.format(**places) for word in words.split()))
+    assert_refused(ended, "DiskFull", "MB are needed", "0.1 MB are free")
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(
     "words",
     [
