@@ -9,7 +9,7 @@ import numpy as np
 from msgspec import UNSET
 from numpy.typing import NDArray
 
-from faintfield.pipelines.console import progress
+from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import check_free, require_room, write_json, writing_folder
 from faintfield.pipelines.formats.frames import ChannelLayout
@@ -27,7 +27,8 @@ from faintfield.rig.simulation.optics import SimulatedSensor
 
 _FLAT = "flat.tiff"
 
-# Largest share of noise in the power of what is measured as the light of the objects.
+# Largest share of noise in the power of what is measured as the light of the objects, and in the variance of the dark
+# views as their noise model states it.
 _MAX_NOISE_SHARE = 0.1
 
 # Stems of files that stand beside the views: no view may have one.
@@ -54,7 +55,7 @@ def darken_set(folder: Path, out: Path, options: DarkeningOptions, *, overwrite:
     layouts = bright.layouts
     light, variance_e2 = _light(bright, bright.image_paths[bright.reference_view], layouts)
     region, scale_e = _region_and_scale(folder, light, options)
-    _check_noise(folder, light[region], variance_e2[region])
+    _check_noise(folder, light[region], variance_e2[region], scale_e, options)
     size_bytes = len(bright.image_paths) * light.size * np.dtype(np.uint16).itemsize
     require_room(out, size_bytes, written_bytes=size_bytes)
     photons = float(light[region].mean()) * scale_e / options.quantum_efficiency
@@ -89,14 +90,31 @@ def _region_and_scale(
         raise BadValue(f"{folder}: cannot be darkened: {failure}; is it the bright set?") from failure
 
 
-def _check_noise(folder: Path, light_e: NDArray[np.floating], variance_e2: NDArray[np.floating]) -> None:
-    """Refuse a set that is dark already, by light and noise of its objects: the noise would be darkened as light."""
+def _check_noise(
+    folder: Path,
+    light_e: NDArray[np.floating],
+    variance_e2: NDArray[np.floating],
+    scale_e: float,
+    options: DarkeningOptions,
+) -> None:
+    """Refuse a set that is dark already, by light and noise of its objects: the noise would be darkened as light.
+
+    Warn where so much of the noise remains that the noise model of the dark views does not describe them.
+    """
     share = float(variance_e2.mean() / np.square(light_e).mean())
     if share > _MAX_NOISE_SHARE:
         raise BadValue(
             f"{folder}: is dark already: its noise is {min(share, 1):.0%} of the power that is measured as light of "
             f"its objects, at most {_MAX_NOISE_SHARE:.0%} may be; name the bright set, or the noise-free one of a "
             "simulation"
+        )
+    added = float(variance_e2.mean()) * scale_e**2
+    stated = float(light_e.mean()) * scale_e + options.dark_e + options.read_noise_e**2
+    if added > _MAX_NOISE_SHARE * stated:
+        inform(
+            f"warning: the noise of {folder} adds {added / stated:.0%} to the variance of the dark views on the objects, and "
+            f"their noise model leaves it out; at most {_MAX_NOISE_SHARE:.0%} is harmless: give a set of more light, or "
+            "a lower --snr"
         )
 
 

@@ -122,6 +122,15 @@ def test_set_that_is_dark_already_is_refused(
     assert not (tmp_path / "out").exists()
 
 
+def test_noise_of_bright_set_that_stays_is_told(make_set: SetMaker, tmp_path: Path, done: Command) -> None:
+    """The brighter half of 200 electrons has 211; SNR 1000 scales by 0.52: 0.27 (211 + 12) is 49 % of 109 + 12."""
+    exposed_e = np.random.default_rng(20110919).poisson(200, (150, 200))
+    noise = {"offset_dn": 100.0, "gain_dn_per_e": 2.0, "read_noise_e": 12**0.5}
+    bright = make_set([np.rint(100 + 2 * exposed_e).astype(np.uint16)], noise=noise)
+    assert "adds 49%" in done("darken", bright, tmp_path / "little", "--snr", 1000).stderr
+    assert "warning" not in done("darken", bright, tmp_path / "dark", "--snr", 0.16).stderr
+
+
 def test_dim_light_without_noise_is_darkened(tmp_path: Path, done: Command) -> None:
     done("simulate", tmp_path / "scene", *SMALL)
     done("darken", tmp_path / "scene" / "noise_free", tmp_path / "dark")
