@@ -112,8 +112,8 @@ def _check_noise(
     stated = float(light_e.mean()) * scale_e + options.dark_e + options.read_noise_e**2
     if added > _MAX_NOISE_SHARE * stated:
         inform(
-            f"warning: the noise of {folder} adds {added / stated:.0%} to the variance of the dark views on the objects, and "
-            f"their noise model leaves it out; at most {_MAX_NOISE_SHARE:.0%} is harmless: give a set of more light, or "
+            f"warning: noise of {folder} adds {added / stated:.0%} to the variance of the dark views on their objects "
+            f"and is missing in their noise model; at most {_MAX_NOISE_SHARE:.0%} may be: give a set of more light, or "
             "a lower --snr"
         )
 
