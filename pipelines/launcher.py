@@ -11,10 +11,10 @@ from contextlib import contextmanager
 from itertools import takewhile
 from json import dumps
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import msgspec
-from cyclopts import App, CycloptsError, CycloptsPanel, Group, Parameter, UnusedCliTokensError
+from cyclopts import App, CoercionError, CycloptsError, CycloptsPanel, Group, Parameter, UnusedCliTokensError
 
 import faintfield
 from faintfield.pipelines.console import framed_console, inform, visible
@@ -80,7 +80,9 @@ The --help of every command ends with an example; docs/guide.md leads from the p
 
 
 def _explain_usage(failure: CycloptsError) -> str:
-    """Return what is wrong with the arguments of a command, and the remedy for arguments without a place."""
+    """Return what is wrong with the arguments of a command, and the remedy for no numbers and for superfluous words."""
+    if isinstance(failure, CoercionError) and (numbers := _explain_numbers(failure)):
+        return numbers
     unused = failure.unused_tokens if isinstance(failure, UnusedCliTokensError) else None
     if not unused or failure.app is None:
         return str(failure)
@@ -90,10 +92,29 @@ def _explain_usage(failure: CycloptsError) -> str:
     for option, *values in (parts[place:] for place, part in enumerate(parts) if part in repeatable):
         if values[1:2] == unused[:1]:
             several = [values[0], *takewhile(unused.__contains__, values[1:])]
-            calls = " ".join(f"{option} {value}" for value in several)
-            return f"{option} takes one value each time; repeat it for several: {calls}"
+            return _repeat(option, several)
     command = " ".join((app.name[0], *(failure.command_chain or ())))
     return f"{' '.join(unused)}: no place for this; put a name with spaces in quotes, or see {command} --help"
+
+
+def _explain_numbers(failure: CoercionError) -> str | None:
+    """Return the remedy for a value that is no number, None where none is wanted."""
+    kinds = get_args(failure.target_type) or (failure.target_type,)
+    if float not in kinds or failure.token is None or failure.token.keyword is None:
+        return None
+    option, value = failure.token.keyword, failure.token.value
+    several = value.split(",")
+    if len(several) > 1 and failure.argument is not None and failure.argument.token_count()[1]:
+        return _repeat(option, several)
+    unit = option.rpartition("-")[2]
+    inside = f" in {unit}" if unit in ("mm", "px", "ms") else ""
+    otherwise = "".join(f", or {word}" for kind in kinds for word in get_args(kind))
+    return f"{option} {value}: is no number; give digits alone{inside}, such as 500 or 0.5{otherwise}"
+
+
+def _repeat(option: str, values: Sequence[str]) -> str:
+    calls = " ".join(f"{option} {value.strip()}" for value in values)
+    return f"{option} takes one value each time; repeat it for several: {calls}"
 
 
 app = App(

@@ -153,7 +153,7 @@ def _pixels_of(frame: Frame, path: Path, size_px: tuple[int, int] | None = None)
 
 
 def _calibrate_phase(phase: MosaicPhase, saturation_dn: float) -> NoiseCalibration:
-    """Calibrate one phase of the mosaic; its name goes into its warnings and failures."""
+    """Calibrate one phase of the mosaic; its name goes into its failures."""
     prefix = f"plane {phase.name}: " if phase.name else ""
     try:
         calibration = calibrate(phase.series, saturation_dn)
@@ -164,7 +164,7 @@ def _calibrate_phase(phase: MosaicPhase, saturation_dn: float) -> NoiseCalibrati
     if why := _why_impossible(estimates["quantum_efficiency"]):
         estimates = estimates | {"quantum_efficiency": Estimate(None, why=why)}
         warnings.append(why)
-    return replace(calibration, estimates=estimates, warnings=tuple(prefix + warning for warning in warnings))
+    return replace(calibration, estimates=estimates, warnings=tuple(warnings))
 
 
 def _why_impossible(efficiency: Estimate) -> str:

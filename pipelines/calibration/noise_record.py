@@ -1,6 +1,7 @@
 """A calibrated sensor as its files have it: the record `noise.json`, and the maps of `noise_maps.npz`."""
 
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import msgspec
@@ -23,6 +24,8 @@ from faintfield.pipelines.formats.results.noise import (
     ResponseRecord,
     SaturationRecord,
 )
+
+_NUMBER = re.compile(r"\d[\d.]*(?:e[+-]?\d+)?")
 
 # Maps by their name in the file, with the fill for pixels that were not calibrated; these are masked anyway.
 _MAPS = {
@@ -50,7 +53,7 @@ def noise_record(sensor: SensorCalibration) -> NoiseRecord:
         ).tolist()
         for kind in ("hot", "noisy", "dead")
     }
-    warnings = [*frames.warnings, *(warning for calibration in phases for warning in calibration.warnings)]
+    warnings = [*frames.warnings, *_phase_warnings({p.name: c for p, c in zip(readout.phases, phases, strict=True)})]
     means: dict[str, Any] = {name: _mean([c.estimates[name] for c in phases]) for name in _quantities(phases[0])}
     first = min(phases, key=lambda c: c.saturation_dn)  # the phase that saturates first
     full_well = first.saturation.limit == "full well"
@@ -72,6 +75,22 @@ def noise_record(sensor: SensorCalibration) -> NoiseRecord:
         fit=UNSET if readout.mosaic else _fit_record(phases[0]),
         emva1288=UNSET if readout.mosaic else sensor.phases[0].record(),
     )
+
+
+def _phase_warnings(phases: Mapping[str, NoiseCalibration]) -> Iterator[str]:
+    """Yield the warnings of the phases by their names; what holds for all, numbers aside, once."""
+    alike: dict[str, dict[str, str]] = {}
+    for name, calibration in phases.items():
+        for warning in calibration.warnings:
+            alike.setdefault(_NUMBER.sub("", warning), {})[name] = warning
+    for warnings in alike.values():
+        name, first = next(iter(warnings.items()))
+        if len(warnings) < len(phases):
+            yield from (f"plane {name}: {warning}" for name, warning in warnings.items())
+        elif len(set(warnings.values())) == 1:
+            yield first
+        else:
+            yield f"all planes, with the numbers of {name}: {first}"
 
 
 def _phase_records(sensor: SensorCalibration) -> list[PhaseRecord]:

@@ -67,6 +67,8 @@ def plan(rig: Path, /, *, options: PlanOptions = _PLAN) -> Prediction:
     node, and with --sigma-e names the shortest session that reaches a wanted noise. What is not known is said to be
     unknown, and why. docs/capture.md explains the numbers, and compares them with simulated captures.
 
+    An option with several values takes them one after another, such as --exposures-ms 100 200 --grids 3x3 5x5.
+
     Parameters
     ----------
     rig

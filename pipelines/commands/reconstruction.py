@@ -16,7 +16,7 @@ from faintfield.pipelines.arguments import (
     Seed,
     SizePx,
 )
-from faintfield.pipelines.console import inform, working
+from faintfield.pipelines.console import working
 from faintfield.pipelines.reconstruction.options import DEFAULTS, Options
 
 if TYPE_CHECKING:
@@ -107,9 +107,7 @@ def report(directory: Path, /) -> dict[str, str]:
     from faintfield.pipelines.pages.report import write_report
 
     with working("writing the report"):
-        path = write_report(directory)
-    inform(f"{path}")
-    return {"report": str(path)}
+        return {"report": str(write_report(directory))}
 
 
 def view(directory: Path, /) -> dict[str, list[str]]:

@@ -92,7 +92,8 @@ def darken(
 
     Each bright view is taken as the expected light, scaled so that the object region of the reference view (its
     brighter part, by Otsu's threshold) has the SNR asked for, and exposed anew: photon, dark and read noise are drawn
-    for the paper's camera, or for the one given. An exposure without light is written as the noise reference.
+    for the paper's camera, or for the one given. An exposure without light is written as the noise reference. A set
+    that is dark already is refused: its noise would be taken as light.
 
     Parameters
     ----------

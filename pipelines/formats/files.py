@@ -139,8 +139,7 @@ def check_free(
     """
     with translated_write_errors(out):
         folder = out.resolve()
-        if out.exists() and not out.is_dir():
-            raise OutputExists(f"{out}: is a file, and a folder is to be written there; name another place")
+        _refuse_file(out)
         held = sorted(path.name for path in out.iterdir()) if out.exists() else []
         if replace_if is not None and (out / replace_if).is_file():
             kept = []
@@ -158,6 +157,11 @@ def check_free(
         raise OutputExists(
             f"{out}: holds an earlier result ({some(held)}); give --overwrite to replace it, or name another folder"
         )
+
+
+def _refuse_file(out: Path) -> None:
+    if out.exists() and not out.is_dir():
+        raise OutputExists(f"{out}: is a file, and a folder is to be written there; name another place")
 
 
 def some(names: Sequence[str], join: str = ", ") -> str:
@@ -181,10 +185,12 @@ def removed_if_empty(folder: Path) -> Iterator[None]:
 def exclusive(folder: Path) -> Iterator[None]:
     """Lock a folder of results while the block runs, and first remove what a killed process left unfinished there.
 
-    The folder is created if missing, and removed if it stays empty; OutputBusy if another command is writing there.
+    The folder is created if missing, and removed if it stays empty; OutputExists if it is a file, OutputBusy if another
+    command is writing there.
     On a file system without locks, such as some network disks, nothing keeps a second command out.
     """
     with translated_write_errors(folder):
+        _refuse_file(folder)
         folder.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(folder, os.O_RDONLY)
     try:

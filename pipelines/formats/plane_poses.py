@@ -81,7 +81,7 @@ def read_plane_poses(paths: Sequence[Path]) -> list[TiltedPlane]:
     """
     planes: dict[str, TiltedPlane] = {}
     for path in paths:
-        poses = read_toml(path, _Poses).plane
+        poses = read_toml(path, _Poses, remedy="name a TOML file with a [[plane]] for each plane (docs/depth.md)").plane
         if not poses:
             raise BadValue(f"{path}: names no [[plane]]; add one")
         for pose in poses:

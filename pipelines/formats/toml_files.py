@@ -27,14 +27,17 @@ _MAX_TOML_BYTES = 8_000_000
 _LONG_KEY = re.compile(rb"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){32}""")
 
 
-def read_toml[T](path: Path, kind: type[T], prepare: Callable[[Any], Any] = lambda content: content) -> T:
+def read_toml[T](
+    path: Path, kind: type[T], *, remedy: str, prepare: Callable[[Any], Any] = lambda content: content
+) -> T:
     """Read a TOML file into `kind`, a msgspec Struct that forbids unknown fields.
 
-    `prepare` gives the file's tables the form that `kind` has. Raises MissingFile, UnknownKey with the nearest key or
-    the table where it belongs, or BadValue with the place of a value of a wrong type or out of its limits.
+    `remedy` says what to name where there is no such file, and what makes one. `prepare` gives the file's tables the
+    form that `kind` has. Raises MissingFile, UnknownKey with the nearest key or the table where it belongs, or BadValue
+    with the place of a value of a wrong type or out of its limits.
     """
     if not is_file(path):
-        raise MissingFile(f"{path}: no such file; name a folder or file of the kind that this command reads")
+        raise MissingFile(f"{path}: no such file; {remedy}")
     content = _decoded(path)
     _require_finite(path, content)
     try:
@@ -153,7 +156,7 @@ def read_rig(path: Path) -> RigSettings:
 def read_rig_tables[T](path: Path, kind: type[T]) -> T:
     """Read a rig.toml, or those of its tables that `kind` has; raise as `read_toml` does, or UnknownPlugin."""
     try:
-        return read_toml(path, kind, fold_plugins)
+        return read_toml(path, kind, remedy="name a rig.toml; `faintfield init` writes one", prepare=fold_plugins)
     except UnknownPlugin as failure:
         raise UnknownPlugin(f"{path}: {failure}") from None
 

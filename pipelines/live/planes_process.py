@@ -4,8 +4,11 @@ It is started by `pipelines.live.planes_client`, reads frames and calibrations, 
 frames that wait are taken newest first; PMLEM runs when none does.
 """
 
+import os
+import select
 import sys
 from multiprocessing.connection import Connection
+from threading import Thread
 from typing import Literal
 
 import cv2
@@ -223,10 +226,19 @@ def stretch(plane: NDArray[np.floating], covered: NDArray[np.bool_]) -> tuple[fl
     return black, max(white, black + 1e-6)
 
 
+def _end_with_capture(line: Connection) -> None:
+    """Wait until the capture has hung up, however it ended, and end in the middle of a step."""
+    watch = select.poll()
+    watch.register(line.fileno(), 0)  # a hang-up is always told
+    watch.poll()
+    os._exit(0)
+
+
 def main() -> None:
     """Serve the connection whose number is the argument, until the capture ends."""
     cv2.setNumThreads(1)
     line = Connection(int(sys.argv[1]))
+    Thread(target=_end_with_capture, args=(line,), daemon=True, name="end with the capture").start()
     try:
         LivePlanes(line.recv(), line).run()
     except (EOFError, ConnectionError):  # the capture has ended

@@ -26,7 +26,7 @@ from faintfield.pipelines.formats.results.records import (
     PlaneRecord,
     ReconstructionRecord,
 )
-from faintfield.pipelines.formats.results.stacks import write_stack
+from faintfield.pipelines.formats.results.stacks import STACK_FILE, write_stack
 from faintfield.pipelines.formats.results.surface import SURFACE_FILE, SurfaceRecord
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, in_units, light_per_e, plane_stem
 from faintfield.pipelines.formats.sets.ground_truth import read_truth
@@ -110,8 +110,8 @@ def reconstruct_set(elemental_set: ElementalSet, out: Path, request: Request, ru
             **msgspec.structs.asdict(sweep.origins[name]),
         )
         write_record(folder / RECONSTRUCTION_FILE, result)
-        if request.with_focus:
-            write_stack(folder, result.planes, elemental_set.units)
+        if not (request.with_focus and write_stack(folder, result.planes, elemental_set.units)):
+            remove(folder / STACK_FILE)  # of an earlier sweep
         shutil.rmtree(folder / PARTS, ignore_errors=True)  # also those of another call that was interrupted
     _warn(elemental_set, records)
     shares = depth_map.share_of_sure if depth_map else found.share_of_sure if found else UNSET

@@ -1,7 +1,7 @@
 """Options of simulated and darkened sets, apart from the code that makes them: help is shown without loading that."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -81,7 +81,7 @@ class DarkeningOptions:
     seed: Seed = 1
     exposure_s: Positive = 0.1
     # As of the paper's camera, see `rig.simulation.optics`
-    read_noise_e: NotNegative = 12.0**0.5
+    read_noise_e: Annotated[NotNegative, Parameter(show_default="{:.3f}".format)] = 12.0**0.5
     dark_current_e_per_s: NotNegative = 0.2
     quantum_efficiency: Fraction = 0.5
 

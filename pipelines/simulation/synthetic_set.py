@@ -1,5 +1,6 @@
 """The elemental set of a synthetic scene with its ground truth, and the exposures of a simulated sensor."""
 
+import math
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.console import progress
 from faintfield.pipelines.errors import BadValue
-from faintfield.pipelines.formats.files import write_json, writing_folder
+from faintfield.pipelines.formats.files import check_free, require_room, write_json, writing_folder
 from faintfield.pipelines.formats.image_files import (
     ONE_PIXEL,
     Spacing,
@@ -52,6 +53,11 @@ def write_synthetic_set(out: Path, options: SyntheticOptions, *, overwrite: bool
     experiment = _experiment(options)
     sensor = experiment.sensor
     dark_e = sensor.dark_current_e_per_s * options.exposure_s
+    check_free(out, replace_if=FILE_NAME, overwrite=overwrite)
+    # Each view twice: as captured, and without noise
+    views, pixels = options.rows * options.columns, math.prod(options.size_px)
+    size_bytes = 2 * views * pixels * np.dtype(np.uint16).itemsize
+    require_room(out, size_bytes, written_bytes=size_bytes)
     with writing_folder(out, replace_if=FILE_NAME, overwrite=overwrite) as folder:
         true = experiment.poses_rt_cam_ref(options.position_error_mm, options.rotation_error_mrad * 1e-3, generator)
         scene = render_scene(experiment, true, ("RG", "GB") if options.colour == "bayer" else None)

@@ -35,6 +35,7 @@ def capture_or_resume(
     known: Known,
 ) -> Captured:
     """Capture a session, or go on with it."""
+    settings = read_rig(rig)
     if not (yes or page or (console.is_terminal and sys.stdin.isatty())):
         raise WrongUsage("there is no terminal to answer prompts on; give --yes, or --page and answer there")
     depths = [*(live_depth_mm or [])]
@@ -45,7 +46,7 @@ def capture_or_resume(
     planes = _live_order(rig, session, depths, known)
     if planes is not None and not page:
         raise WrongUsage("live planes are shown on the page, and there is none; give --page, too")
-    taken = capture_session(read_rig(rig), session, unattended=yes, page=page, planes=planes)
+    taken = capture_session(settings, session, unattended=yes, page=page, planes=planes)
     return Captured(str(session), complete=True, taken=taken)
 
 

@@ -8,11 +8,10 @@ from faintfield.pipelines.calibration.noise import calibrate_sensor
 from faintfield.pipelines.calibration.noise_comparison import CHANCE, NoiseComparison, compare_noise, label
 from faintfield.pipelines.calibration.noise_record import noise_maps, noise_record
 from faintfield.pipelines.console import inform, working
-from faintfield.pipelines.errors import MissingFile
 from faintfield.pipelines.formats.files import check_results_folder, removed_if_empty
 from faintfield.pipelines.formats.large_arrays import maps_in_files
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, STANDARD, FitRecord, NoiseRecord, write_noise
-from faintfield.pipelines.formats.sets.noise_set import FILE_NAME, load_noise_set
+from faintfield.pipelines.formats.sets.noise_set import load_noise_set
 from faintfield.pipelines.pages.noise_page import noise_page
 
 _SHOWN = (
@@ -28,8 +27,6 @@ _SHOWN = (
 
 def measure_sensor(folder: Path, out: Path | None = None) -> NoiseRecord:
     """Measure a sensor from the frames in a folder, and write the result with its page, there if not to `out`."""
-    if not folder.exists():
-        raise MissingFile(f"{folder}: no such folder; name a folder with {FILE_NAME} and frames")
     frames = load_noise_set(folder)
     out, title = out or frames.folder, frames.folder.resolve().name
     check_results_folder(out)

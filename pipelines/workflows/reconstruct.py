@@ -9,7 +9,7 @@ from msgspec import UNSET
 
 from faintfield.pipelines.arguments import SceneKind
 from faintfield.pipelines.console import inform, working
-from faintfield.pipelines.errors import WrongUsage
+from faintfield.pipelines.errors import OutputExists, WrongUsage
 from faintfield.pipelines.formats.files import check_results_folder, exclusive
 from faintfield.pipelines.formats.results.records import REPORT_FILE
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, check_exists, load_set
@@ -116,4 +116,6 @@ def open_set(
         if out is None:
             raise WrongUsage("no folder for the results is named; give --out")
         elemental_set = elemental_set if geometry is None else with_measured_geometry(elemental_set, geometry)
+    if out.resolve() == elemental_set.folder.resolve():
+        raise OutputExists(f"{out}: is the folder of the images, and results would lie among them; name another --out")
     return keeping_frames(elemental_set, out), out

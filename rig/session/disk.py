@@ -49,7 +49,7 @@ def write_new(path: Path, content: bytes | bytearray | memoryview) -> None:
                 file.flush()
                 os.fsync(file.fileno())
             part.rename(path)
-        except OSError:
+        except BaseException:  # an interrupt, too
             part.unlink(missing_ok=True)
             raise
         sync_folder(path.parent)

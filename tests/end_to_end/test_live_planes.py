@@ -255,6 +255,20 @@ def test_process_of_planes_ends_with_killed_capture(tmp_path: Path) -> None:
         assert process.wait(HANG_S) == 0
 
 
+def test_long_step_of_planes_ends_with_killed_capture() -> None:
+    line, end = Pipe()
+    endless = (
+        "import sys, time; from faintfield.pipelines.live import planes_process as planes; "
+        "planes.LivePlanes.run = lambda self: (self._report(), time.sleep(3600)); planes.main()"
+    )
+    with subprocess.Popen([sys.executable, "-c", endless, str(end.fileno())], pass_fds=[end.fileno()]) as process, line:
+        end.close()
+        line.send(LiveOrder(Path(), Path(), (500.0,)))
+        line.recv()
+        line.close()
+        assert process.wait(HANG_S) == 0
+
+
 def test_capture_goes_on_without_live_planes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

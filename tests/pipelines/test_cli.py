@@ -13,7 +13,7 @@ from faintfield.pipelines import cli, launcher
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.launcher import COMMANDS, EXPORTS, IMPORTS
 from faintfield.recon.errors import NotConverged
-from tests.pipelines.conftest import Command
+from tests.pipelines.conftest import Command, assert_refused
 
 
 def test_version_is_printed(done: Command) -> None:
@@ -29,6 +29,11 @@ def test_version_is_printed(done: Command) -> None:
         (("simulate", "OUT", "--snr", "nan"), "got nan."),
         (("reconstruct", "SET", "--depth-mm", "500", "700", "--out", "OUT"), "--depth-mm 500 --depth-mm 700"),
         (("reconstruct", "SET", "--depth=3", "4", "5"), "repeat it for several: --depth 3 --depth 4 --depth 5"),
+        (("reconstruct", "SET", "--depth", "500,700"), "repeat it for several: --depth 500 --depth 700"),
+        (
+            ("reconstruct", "SET", "--depth-mm", "50cm"),
+            "--depth-mm 50cm: is no number; give digits alone in mm, such as 500 or 0.5, or auto",
+        ),
         (
             ("verify", "a", "b"),
             "b: no place for this; put a name with spaces in quotes",
@@ -47,6 +52,22 @@ def test_wrong_usage_ends_with_code_2(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("noise absent", "noise.toml: no such file; name a session, or a folder with noise.toml"),
+        ("geometry absent", "charuco.toml: no such file; name a session with charuco frames"),
+        ("check absent.toml", "absent.toml: no such file; name a rig.toml; `faintfield init` writes one"),
+        ("capture absent.toml session", "absent.toml: no such file; name a rig.toml"),
+    ],
+)
+def test_missing_files_are_named_with_their_kind(
+    words: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, faintfield: Command
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert_refused(faintfield(*words.split()), "MissingFile", message)
+
+
 def test_output_is_a_report_or_one_json(scene: Path, tmp_path: Path, done: Command) -> None:
     out = tmp_path / "out"
     words = ("reconstruct", scene, "--out", out, "--depth-mm", 500, "--method", "backprojection")
@@ -60,6 +81,8 @@ def test_output_is_a_report_or_one_json(scene: Path, tmp_path: Path, done: Comma
     assert [plane["depth_mm"] for plane in result["planes"]] == [500.0]
     assert {row["depth_mm"] for row in result["metrics"]["planes"]} == {500.0}
     assert json.loads(done("report", out, "--json").stdout) == {"report": str(out / "report.html")}
+    again = done("report", out)
+    assert (again.stdout, again.stderr) == (f"{out / 'report.html'}\n", "")
 
 
 # Each begins a line of its own, hides what follows, or turns its direction
@@ -133,6 +156,10 @@ def test_completion_knows_commands_and_options(tmp_path: Path, capsys: pytest.Ca
     written = script.read_text()
     assert all(word in written for word in ("reconstruct", "--depth-mm", "colmap", "goto"))
     assert str(script) in (tmp_path / ".bashrc").read_text()
+
+
+def test_defaults_in_help_have_few_digits(done: Command) -> None:
+    assert "[default: 3.464]" in done("darken", "--help").stdout
 
 
 @pytest.mark.parametrize("command", ["reconstruct", "run"])

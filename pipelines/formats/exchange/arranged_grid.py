@@ -191,9 +191,9 @@ def _refuse_unfit(inspection: GridInspection, paths: Sequence[Path], *, prescrib
         )
     if inspection.order.verdict == "denied" and not prescribed:
         raise ShuffledPictures(
-            f"{folder}: neighbours by the names fit better than only {inspection.order.share:.0%} of other pictures, "
-            "in a light field they fit better than nearly all; give views of one scene in the order of the grid, by "
-            "their names, by --pattern, or by --rows and --columns"
+            f"{folder}: the neighbours of a picture, by the names, fit it better than {inspection.order.share:.0%} of "
+            "the others do, and in a light field better than nearly all do; give views of one scene in the order of "
+            "the grid, by their names, by --pattern, or by --rows and --columns"
         )
     (least, largest), orientation = inspection.range_px, inspection.orientation
     if inspection.undecided and not (aligned and not orientation.opposed):
@@ -267,8 +267,8 @@ def _warnings(record: Arrangement, inspection: GridInspection, count: int) -> It
     elif order.verdict == "few":
         yield f"{count} pictures are too few for their order to be checked"
     elif order.verdict == "denied":
-        share = f"neighbours fit better than only {order.share:.0%} of other pictures"
-        yield f"{share}, so the order may be wrong: in a light field they fit better than nearly all"
+        share = f"the neighbours of a picture fit it better than {order.share:.0%} of the others do"
+        yield f"{share}, so the order may be wrong: in a light field better than nearly all do"
     if record.told_by == "names":
         yield "the pictures do not tell where rows and columns begin; the order of the names is kept"
     if record.odd_views:

@@ -142,6 +142,7 @@ def export_posed(
     unit = stated_length(elemental_set, unit)
     with writing_folder(out, replace_only=held, overwrite=overwrite) as folder:
         write(folder, views)
+    inform(f"{out}: {len(views)} views, {'relative lengths' if unit == 'relative' else f'lengths in {unit}'}")
     return ExportedSet(str(out), len(views), unit)
 
 

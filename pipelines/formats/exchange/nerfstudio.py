@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from faintfield.calib.lens import Lens
-from faintfield.pipelines.errors import BadValue, MissingFile
+from faintfield.pipelines.errors import BadValue, MissingFile, WrongUsage
 from faintfield.pipelines.formats.exchange.grid_names import picture_named
 from faintfield.pipelines.formats.exchange.imported_set import (
     ExportedSet,
@@ -91,9 +91,13 @@ def export_transforms(set_path: Path, out: Path, *, overwrite: bool) -> Exported
 
     Raises
     ------
+    WrongUsage
+        `out` is the name of a file.
     BadValue
         The distortion has terms for which nerfstudio has no names.
     """
+    if out.suffix == ".json" and not is_folder(out):
+        raise WrongUsage(f"{out}: is the name of a file, and {FILE_NAME} is written into a folder; name the folder")
     return export_posed(set_path, out, "mm", [FILE_NAME], _write_transforms, overwrite=overwrite)
 
 

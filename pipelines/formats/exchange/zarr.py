@@ -1,5 +1,6 @@
 """Planes of a sweep as OME-Zarr 0.5, chunked and at several resolutions, for stacks too large for memory."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,9 +10,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.pipelines.console import progress
+from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.errors import BadValue, InputError, import_optional
-from faintfield.pipelines.formats.files import check_free, writing_folder
+from faintfield.pipelines.formats.files import check_free, require_room, writing_folder
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.reading import read_json
 from faintfield.pipelines.formats.results.records import PlaneRecord
@@ -55,6 +56,10 @@ class _Stack:
             levels, longest = levels + 1, longest // 2
         return levels
 
+    def size(self, level: int) -> tuple[int, int, int, int]:
+        """Return the shape of the array of a resolution."""
+        return (*self.shape[:2], self.shape[2] >> level, self.shape[3] >> level)
+
 
 def export_planes(directory: Path, out: Path, *, overwrite: bool = False) -> ZarrExport:
     """Write the planes in a folder as OME-Zarr.
@@ -70,6 +75,8 @@ def export_planes(directory: Path, out: Path, *, overwrite: bool = False) -> Zar
     held = _HELD if _is_export(out) else ()
     check_free(out, replace_only=held, overwrite=overwrite)
     stack = _stack_in(directory)
+    size_bytes = sum(math.prod(stack.size(level)) for level in range(stack.levels)) * np.dtype(np.float32).itemsize
+    require_room(out, size_bytes, written_bytes=size_bytes)
     with writing_folder(out, replace_only=held, overwrite=overwrite, reads=[stack.folder]) as building:
         group = zarr.open_group(building, mode="w", zarr_format=3)
         _write_metadata(models, group, stack, directory.resolve().name)
@@ -78,6 +85,7 @@ def export_planes(directory: Path, out: Path, *, overwrite: bool = False) -> Zar
             for level in range(stack.levels):
                 group[str(level)][:, index] = np.moveaxis(plane, 2, 0)
                 plane = _halve(plane)
+    inform(f"{out}: {len(stack.planes)} planes of {stack.shape[3]} x {stack.shape[2]} samples")
     return ZarrExport(str(out), stack.shape, stack.levels, stack.scale.unit or "relative")
 
 
@@ -137,8 +145,7 @@ def _write_metadata(models: Any, group: Any, stack: _Stack, name: str) -> None:
 
 def _dataset(models: Any, group: Any, stack: _Stack, level: int) -> Any:
     """Make the array of one resolution, and return its entry: where its samples lie."""
-    scale, shape, step = stack.scale, stack.shape, 2**level
-    size = (*shape[:2], shape[2] // step, shape[3] // step)
+    scale, size, step = stack.scale, stack.size(level), 2**level
     chunks = (1, 1, min(_CHUNK_PX, size[2]), min(_CHUNK_PX, size[3]))
     group.create_array(str(level), shape=size, chunks=chunks, dtype="float32", dimension_names=list("czyx"))
     x, y = scale.origin

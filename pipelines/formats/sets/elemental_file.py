@@ -122,7 +122,8 @@ class ElementalSetFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 
 def read_set_file(path: Path) -> ElementalSetFile:
     """Read and check `elemental.toml`, and that the files it names are there."""
-    settings = read_toml(path, ElementalSetFile)
+    remedy = f"name a session, or a folder with {FILE_NAME}; `faintfield import` makes one"
+    settings = read_toml(path, ElementalSetFile, remedy=remedy)
     _check_numbers(path, settings)
     _check_views(path, settings)
     for name in named_files(settings):

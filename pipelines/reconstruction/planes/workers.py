@@ -194,10 +194,10 @@ def _result_of[Job, Result](work: Callable[[Job], Result], job: Job) -> Result:
     """Do a job; a failure that cannot be sent is sent in words."""
     try:
         return work(job)
-    except Exception as failure:
+    except Exception as failure:  # of any kind: it is raised again, by the command
         try:
             ForkingPickler.dumps(failure)
-        except Exception:
+        except Exception:  # pickling calls the methods of the failure, and what it holds
             raise RuntimeError("".join(format_exception(failure))) from None
         raise
 

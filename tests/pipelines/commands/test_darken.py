@@ -13,7 +13,7 @@ from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from tests.pipelines.by_hand import channels_of
-from tests.pipelines.conftest import Command, Edit, SetMaker, assert_refused
+from tests.pipelines.conftest import SMALL, Command, Edit, SetMaker, assert_refused
 from tests.pipelines.noise_sets import check_noise_of_eq_6, deviation_of_snr
 
 READ_VARIANCE_E2 = 12 + 1 / 48
@@ -107,6 +107,33 @@ def test_dark_camera_is_that_described(bright: Path, tmp_path: Path, done: Comma
     nothing = noise.electrons(read_frame(tmp_path / "dark" / "noise_reference.tiff").pixels_dn)
     assert nothing.mean() == pytest.approx(0.15, abs=4 * 5 / np.sqrt(nothing.size))
     assert nothing.std() == pytest.approx(np.sqrt(25 + 0.15 + 1 / 48), rel=4 / np.sqrt(2 * nothing.size))
+
+
+@pytest.mark.parametrize("mean_e", [1, 8])
+def test_set_that_is_dark_already_is_refused(
+    mean_e: int, make_set: SetMaker, tmp_path: Path, faintfield: Command
+) -> None:
+    """Of 8 electrons with a read noise of 3.5, noise is (8 + 12) / (64 + 20) of the power; of 1 electron, most."""
+    generator = np.random.default_rng(20110919)
+    exposed_e = generator.poisson(mean_e, (150, 200)) + generator.normal(0, 12**0.5, (150, 200))
+    noise = {"offset_dn": 100.0, "gain_dn_per_e": 2.0, "read_noise_e": 12**0.5}
+    dark = make_set([np.rint(100 + 2 * exposed_e).astype(np.uint16)], noise=noise)
+    assert_refused(faintfield("darken", dark, tmp_path / "out"), "BadValue", "is dark already", "at most 10%")
+    assert not (tmp_path / "out").exists()
+
+
+def test_noise_of_bright_set_that_stays_is_told(make_set: SetMaker, tmp_path: Path, done: Command) -> None:
+    """The brighter half of 200 electrons has 211; SNR 1000 scales by 0.52: 0.27 (211 + 12) is 49 % of 109 + 12."""
+    exposed_e = np.random.default_rng(20110919).poisson(200, (150, 200))
+    noise = {"offset_dn": 100.0, "gain_dn_per_e": 2.0, "read_noise_e": 12**0.5}
+    bright = make_set([np.rint(100 + 2 * exposed_e).astype(np.uint16)], noise=noise)
+    assert "adds 49%" in done("darken", bright, tmp_path / "little", "--snr", 1000).stderr
+    assert "warning" not in done("darken", bright, tmp_path / "dark", "--snr", 0.16).stderr
+
+
+def test_dim_light_without_noise_is_darkened(tmp_path: Path, done: Command) -> None:
+    done("simulate", tmp_path / "scene", *SMALL)
+    done("darken", tmp_path / "scene" / "noise_free", tmp_path / "dark")
 
 
 def test_colour_stays_colour(make_set: SetMaker, tmp_path: Path, done: Command) -> None:

@@ -171,3 +171,16 @@ def test_masked_pixels_unlike_darks_raise_warning(tmp_path: Path, monkeypatch: p
     assert result.saturation_dn == 4095
     (warning,) = [warning for warning in result.warnings if "black level stated in the files" in warning]
     assert warning.startswith("plane B_r1c1: the darks' offset is ")
+
+
+def test_warnings_of_all_colours_are_given_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def raw_frame(path: Path, *_: object, **__: object) -> Frame:
+        return Frame(tifffile.imread(path), ("RG", "GB"), np.array([[140.0, 141.0], [142.0, 143.0]]), 4095.0, 1.0)
+
+    monkeypatch.setattr("faintfield.pipelines.calibration.noise.read_frame", raw_frame)
+    result = measure_sensor(write_frames(tmp_path / "set", take_set(*specimen(16), frames=2)), tmp_path / "out")
+    texts = [warning.rpartition(": ")[2] for warning in result.warnings]
+    assert len(set(texts)) == len(texts)
+    (warning,) = [warning for warning in result.warnings if "black level stated in the files" in warning]
+    assert warning.startswith("all planes, with the numbers of R_r0c0: the darks' offset is ")
+    assert "stated in the files 140.0 DN" in warning

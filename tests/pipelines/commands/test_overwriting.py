@@ -98,10 +98,28 @@ def test_results_folder_is_checked_before_depths_are_searched(
     monkeypatch.setattr("faintfield.pipelines.reconstruction.request.found_range_mm", pytest.fail)
     (tmp_path / "file").touch()
     ended = faintfield("reconstruct", simulated_scene, "--depth", "auto", "--out", tmp_path / "file")
-    assert_refused(ended, "CannotWrite", "file: File exists")
+    assert_refused(ended, "OutputExists", "file: is a file, and a folder")
+    ended = faintfield("reconstruct", simulated_scene, "--depth", "auto", "--out", simulated_scene)
+    assert_refused(ended, "OutputExists", "results would lie among")
     (tmp_path / "surface.json").touch()
     words = ("--sweep", "auto", "--depth-map", "--out", tmp_path)
     assert_refused(faintfield("reconstruct", simulated_scene, *words), "OutputExists", "holds a surface")
+
+
+@pytest.mark.parametrize("words", ["simulate {out}", "darken {bright} {out}", "export zarr {planes} {out}"])
+def test_room_for_all_that_is_written_is_needed(
+    words: str,
+    simulated_scene: Path,
+    sweep: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    faintfield: Command,
+) -> None:
+    places = {"bright": simulated_scene / "noise_free", "planes": sweep, "out": tmp_path / "out"}
+    monkeypatch.setattr("faintfield.pipelines.formats.files._free_bytes", lambda _: 50_000)
+    ended = faintfield(*(word.format(**places) for word in words.split()))
+    assert_refused(ended, "DiskFull", "MB are needed", "0.1 MB are free")
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

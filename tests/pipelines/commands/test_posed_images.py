@@ -82,6 +82,11 @@ def test_export_states_unit_of_its_lengths(
         ended = done("--json", "export", program, folder, tmp_path / program)
         assert json.loads(ended.stdout)["unit"] == unit
         assert ("has no scale" in ended.stderr) == (depth == "relative")
+        assert f"{tmp_path / program}: 2 views" in ended.stderr
+    ended = faintfield("export", "nerfstudio", folder, tmp_path / "transforms.json")
+    assert ended.returncode == 2
+    assert "transforms.json: is the name of a file" in ended.stderr
+    assert not (tmp_path / "transforms.json").exists()
     for name, side in (("view_0.tiff", "a"), ("view_1.tiff", "b")):
         (folder / side).mkdir()
         (folder / name).rename(folder / side / "x.tiff")

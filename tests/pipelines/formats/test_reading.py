@@ -41,7 +41,7 @@ def test_pipes_and_impossible_names_are_missing_files(tmp_path: Path) -> None:
         path = tmp_path / name
         assert not is_file(path)
         assert not is_folder(path)
-        for read in (read_frame, read_content, lambda path: read_toml(path, _Settings)):
+        for read in (read_frame, read_content, lambda path: read_toml(path, _Settings, remedy="name one")):
             with pytest.raises(MissingFile):
                 read(path)
     with pytest.raises(BadValue, match="name a file inside it"):
@@ -61,11 +61,11 @@ def test_pipes_and_impossible_names_are_missing_files(tmp_path: Path) -> None:
 def test_hostile_toml_is_refused(content: str, words: str, tmp_path: Path) -> None:
     (tmp_path / "rig.toml").write_text(content)
     with pytest.raises(InputError, match=words) as refused:
-        read_toml(tmp_path / "rig.toml", _Settings)
+        read_toml(tmp_path / "rig.toml", _Settings, remedy="name one")
     assert str(refused.value).startswith(f"{tmp_path / 'rig.toml'}: ")
     # Dots in text and in lists of numbers are no long key
     (tmp_path / "rig.toml").write_text("format = 1\nvalue = ['" + "a b." * 40 + "', " + "0.5, " * 100 + "]")
-    assert len(read_toml(tmp_path / "rig.toml", _Settings).value) == 101
+    assert len(read_toml(tmp_path / "rig.toml", _Settings, remedy="name one").value) == 101
 
 
 @pytest.mark.parametrize("content", [b"[" * 100_000, b'{"format": 1e999}', b"\xff\xfe", b""])

@@ -164,6 +164,13 @@ def test_frame_is_never_overwritten(tmp_path: Path) -> None:
     assert set_aside(path, tmp_path / "aside").read_bytes() == b"first"
 
 
+def test_interrupted_write_leaves_no_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.fsync", mock.Mock(side_effect=KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        write_new(tmp_path / "plan.json", b"{}")
+    assert not list(tmp_path.iterdir())
+
+
 def test_order_does_not_depend_on_the_clock(tmp_path: Path) -> None:
     backwards = iter(datetime(2030, 1, 1, tzinfo=UTC) - timedelta(days=day) for day in range(10_000))
     with mock.patch.object(journal_module, "datetime") as clock:

@@ -51,8 +51,8 @@ def test_planes_of_one_pitch_are_stacked_in_mm(scene: Path, tmp_path: Path, done
     assert description["spacing"] == pytest.approx(0.2)
     with tifffile.TiffFile(tmp_path / "plane_00600.0.tiff") as file:
         assert file.pages.first.tags["ResolutionUnit"].value == 3  # per centimetre; ImageJ then shows cm
-    done("reconstruct", scene, "--depth-mm", 600, "--method", "backprojection", "--out", tmp_path / "one")
-    assert not (tmp_path / "one" / "stack.tiff").exists()
+    done("reconstruct", scene, "--depth-mm", 600, "--method", "backprojection", "--out", tmp_path)
+    assert not (tmp_path / "stack.tiff").exists()
 
 
 def test_colour_sweep_is_composite(colour_set: Path, tmp_path: Path, done: Command) -> None:
