@@ -216,7 +216,8 @@ def found_range(views: PinholeViews, far: float, near: float) -> tuple[float, fl
         if np.count_nonzero(likely) < _MIN_SAMPLES:
             needed = _MIN_SAMPLES / likely.size
             raise NothingInFocus(
-                f"the views tell the depth of {likely.mean():.1%} of the picture, and {needed:.1%} are needed"
+                f"the views tell the depth of {likely.mean():.1%} of the picture, and {needed:.1%} are needed; "
+                "use more light or views"
             )
         first, last = np.quantile(index[likely], _QUANTILES)
         margin = _MARGIN * (last - first) + _MARGIN_STEPS

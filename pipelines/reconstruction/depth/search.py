@@ -239,7 +239,7 @@ def naming_range(elemental_set: ElementalSet, far: float, near: float, purpose: 
     except NothingInFocus as failure:
         option = "--disparity-range-px" if elemental_set.units.depth == "disparity_px" else "--depth-range-mm"
         raise NothingInFocus(
-            f"{_between(elemental_set, far, near)} {failure}; give the range by {option} NEAR:FAR, or more light"
+            f"{_between(elemental_set, far, near)} {failure}; or give the range by {option} NEAR:FAR"
         ) from failure
 
 
