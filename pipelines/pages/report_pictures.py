@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.pipelines.formats.image_files import encoded, grey_levels, light_picture, shrunk, white_level
+from faintfield.pipelines.formats.image_files import encoded, light_picture, shrunk, white_level
 from faintfield.pipelines.formats.results.records import JOINT_METHODS, Certificate, FocusCurve, ReconstructionRecord
 from faintfield.pipelines.formats.units import StatedUnits
 from faintfield.pipelines.pages.page import INK, blank_drawing, data_uri, format_depths, ink, svg
@@ -199,7 +199,7 @@ def _proposals(planes: list[Plane], titles: dict[str, str], white: float) -> lis
     for plane in sorted(planes, key=lambda plane: plane.depth_mm):
         proposal, moved = plane.sidecar_pixels("proposal_file"), plane.sidecar_pixels("moved_file")
         if proposal is not None and moved is not None:
-            levels = shrunk(grey_levels(moved, _MOST_MOVED, -_MOST_MOVED), _GRID_WIDTH_PX)
+            levels = shrunk(light_picture(moved, _MOST_MOVED, -_MOST_MOVED), _GRID_WIDTH_PX)
             picture = _picture(proposal, white, _GRID_WIDTH_PX, ".png", tone_curve=plane.units.tone_curve)
             title = f"{titles[plane.column]}, {plane.label}"
             proposals.append(Proposed(title, picture, data_uri(encoded(levels, ".png"), ".png")))

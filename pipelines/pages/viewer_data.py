@@ -21,6 +21,7 @@ from faintfield.pipelines.pages.report_pictures import PlaneSections
 from faintfield.pipelines.pages.report_planes import Plane, best_column, column_titles, existing
 from faintfield.pipelines.pages.report_sets import SetSection
 from faintfield.pipelines.reconstruction.depth.depth_map import robust_limits
+from faintfield.pipelines.reconstruction.planes.saturation import has_unknown
 
 # A plane of more samples is binned: a phone draws this many in a frame.
 _MAX_SAMPLES = 1_500_000
@@ -85,7 +86,7 @@ class ViewerPicture(TypedDict):
     bytes, or else `element` is the id of an 8-bit picture on the page: `toned` if it has the tone curve of sRGB, and
     of integers if `whole`. Lengths are those of the numbers after binning. `sigma` is the index of the picture of their
     standard deviations, and `confidence` that of the probabilities that they are right, which are sure from
-    `sure_above` on.
+    `sure_above` on. Samples without a number are not known, or else `saturated`.
     """
 
     kind: Kind
@@ -105,6 +106,7 @@ class ViewerPicture(TypedDict):
     confidence: NotRequired[int]
     sure_above: NotRequired[float]
     toned: NotRequired[bool]
+    saturated: NotRequired[bool]
 
 
 class ViewerData(TypedDict):
@@ -251,6 +253,7 @@ class _Source(NamedTuple):
     pitch: float | None = None
     origin: tuple[float, float] = (0.0, 0.0)
     sure_above: float | None = None
+    saturated: bool = False
 
     def binned(self, coarser: int) -> tuple[NDArray[np.floating], int]:
         """Return the numbers (row, column[, colour]) in bins, and the width of these; `coarser` is added to it."""
@@ -267,9 +270,10 @@ def _plane_sources(planes: list[Plane], places: list[tuple[float, str]]) -> list
     for plane in planes:
         title, place, record = titles[plane.column], places.index(plane.place), plane.records[0]
         at = (plane.label, place, plane.units.light_per_pixel, record.pitch_mm, record.origin_mm)
-        sources.append(_Source(plane.pixels, "light", title, *at))
+        saturated = has_unknown(plane.records)
+        sources.append(_Source(plane.pixels, "light", title, *at, saturated=saturated))
         if record.sigma_file:
-            sources.append(_Source(partial(_sigma_of, plane), "sigma", f"σ of {title}", *at))
+            sources.append(_Source(partial(_sigma_of, plane), "sigma", f"σ of {title}", *at, saturated=saturated))
     return sources
 
 
@@ -310,7 +314,11 @@ def _surface_sources(
     sources = []
     for kind, name, label, unit in entries:
         sure_above = surface.sure_above if kind == "depth" else None
-        sources.append(_Source(partial(read, name), kind, title, label, None, unit, sure_above=sure_above))
+        saturated = kind in ("light", "sigma") and has_unknown(surface.channels)
+        source = _Source(
+            partial(read, name), kind, title, label, None, unit, sure_above=sure_above, saturated=saturated
+        )
+        sources.append(source)
         if kind not in scales:
             black, white = limits(kind, name)
             scales[kind] = {"black": black, "white": white, "name": label}
@@ -404,6 +412,8 @@ def _packed_picture(source: _Source, numbers: NDArray[np.floating], step: float,
         bins=bins,
         src=smaller_uri(packed.png),
     )
+    if source.saturated:
+        picture["saturated"] = True
     if source.pitch is not None:
         # The first bin's centre lies half a bin less half a sample from that of the first sample
         x, y = (start + source.pitch * (bins - 1) / 2 for start in source.origin)

@@ -73,15 +73,15 @@ const viewer = (() => {
     // Hatching as in the previews of maps (depth_map.py) and of light (image_files.py): where nothing is known, and
     // through what is not sure
     const period = Math.max(6, Math.round(width / 53));
-    const [stripe, dark, bright] = scales[one.kind].colours ? [period / 6, 128, 158] : [period / 4, 120, 235];
+    const [stripe, dark, bright] = scales[one.kind].colours ? [period / 6, [128, 128, 128], [158, 158, 158]] : [period / 4, [125, 0, 95], [240, 60, 205]];
     const hatch = i => (i % width + Math.floor(i / width)) % period < stripe ? dark : bright;
     const unknown = i => { for (let c = 0; c < colours; c++) if (levels[i * colours + c] === UNKNOWN) return true; return false; };
     for (let i = 0; i < pixels.length; i++) {
       const known = !unknown(i);
-      if (!known) pixels[i] = bytesOf([hatch(i), hatch(i), hatch(i)]);
+      if (!known) pixels[i] = bytesOf(hatch(i));
       else if (colours === 1) pixels[i] = inks[grey[levels[i]]];
       else pixels[i] = 0xff000000 | grey[levels[3 * i + 2]] << 16 | grey[levels[3 * i + 1]] << 8 | grey[levels[3 * i]];
-      if (known && doubt?.levels && !sure(one, doubt, i)) for (let c = 0; c < 3; c++) bytes[4 * i + c] = 0.3 * bytes[4 * i + c] + 0.7 * hatch(i);
+      if (known && doubt?.levels && !sure(one, doubt, i)) for (let c = 0; c < 3; c++) bytes[4 * i + c] = 0.3 * bytes[4 * i + c] + 0.7 * hatch(i)[c];
     }
     context.putImageData(image, 0, 0);
     one.key = key;
@@ -93,12 +93,12 @@ const viewer = (() => {
   function valueAt(one, u, v) {
     const [column, row] = [Math.floor(u * one.width), Math.floor(v * one.width)];
     if (!one.levels || column < 0 || row < 0 || column >= one.width || row >= one.height) return null;
-    const at = (row * one.width + column) * one.colours;
+    const at = (row * one.width + column) * one.colours, unknown = one.saturated ? "saturated" : "not known";
     const levels = [...one.levels.subarray(at, at + one.colours)], known = levels.some(level => level !== UNKNOWN);
     const sigma = one.sigma === undefined ? null : pictures[one.sigma], off = [];
     const sigmas = known && sigma?.levels ? [...sigma.levels.subarray(at / one.colours * sigma.colours, (at / one.colours + 1) * sigma.colours)].map(level => level === UNKNOWN ? NaN : number(sigma, level)) : [];
     const values = levels.map((level, index) => {
-      if (level === UNKNOWN) return "not known";
+      if (level === UNKNOWN) return unknown;
       // Grey levels of a view stand for the integers that they were made of; beyond black and white nothing is known
       if (one.whole) return (level === 0 ? "\u2264 " : level === 255 ? "\u2265 " : "") + minus(Math.round(number(one, level)));
       const deviation = sigmas[index] ?? NaN;
@@ -110,7 +110,7 @@ const viewer = (() => {
     if (known && rounded > 0 && !sigmas.some(deviation => rounded < 0.1 * deviation)) off.push("rounded by up to " + minus(Number(rounded.toPrecision(1))));
     const doubt = one.confidence === undefined ? null : pictures[one.confidence];
     if (known && doubt?.levels) off.push((sure(one, doubt, at) ? "sure" : "not sure") + ": right within 2 % with a probability of " + number(doubt, doubt.levels[at]).toFixed(2));
-    const value = (one.colours === 3 ? "R " + values[0] + ", G " + values[1] + ", B " + values[2] : values[0]) + " " + one.unit;
+    const value = !known ? unknown : (one.colours === 3 ? "R " + values[0] + ", G " + values[1] + ", B " + values[2] : values[0]) + " " + one.unit;
     const [x, y] = one.pitch ? [one.origin[0] + column * one.pitch, one.origin[1] + row * one.pitch] : [];
     const many = one.bins > 1 ? "mean of " + one.bins + " \u00d7 " + one.bins + " samples, first " : "";
     return { value, off: off.length ? " (" + off.join("; ") + ")" : "", x, y, at: many + "column " + column * one.bins + ", row " + row * one.bins,

@@ -112,6 +112,13 @@ def test_plane_is_read_with_its_standard_deviation(tmp_path: Path) -> None:
     assert pictures[known["sigma"]]["title"] == "σ of PMLEM"
 
 
+def test_samples_without_number_are_saturated_by_record(tmp_path: Path) -> None:
+    plane = _plane(tmp_path, "pmlem", 500.0, np.full((4, 6), np.nan, np.float32))
+    record = msgspec.structs.replace(plane.records[0], saturated_share=0.1, unknown_share=0.2)
+    assert _pictures([replace(plane, records=[record])])[0]["saturated"]
+    assert "saturated" not in _pictures([plane])[0]
+
+
 def test_joint_planes_stand_beside_best_found_alone(tmp_path: Path) -> None:
     methods: list[Method] = ["backprojection", "pmlem", "occlusion"]
     light = np.eye(6, 8, dtype=np.float32)
