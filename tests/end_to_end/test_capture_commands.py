@@ -107,10 +107,10 @@ def test_check_moves_nothing_and_counts_frames(shell: Shell) -> None:
         result = shell.result("check", shell.rig)
         assert not move.called
         assert not home.called
-    assert result["frames"] == 511
-    assert result["disk_bytes"] == 511 * (2 * 64 * 48 + 512)
+    assert result["frames"] == 521
+    assert result["disk_bytes"] == 521 * (2 * 64 * 48 + 512)
     assert 300.0 < result["duration_s"] < 1200.0
-    assert "511 frames in 11 steps" in shell.words
+    assert "521 frames in 11 steps" in shell.words
 
 
 def test_check_remembers_settings_of_stage(shell: Shell) -> None:
