@@ -19,8 +19,7 @@ from faintfield.pipelines.pages.page import INK, blank_drawing, figure, ink, mat
 # Measured, model, and a second series; distinct without colour vision, and on black as on white.
 MEASURED, MODEL, SECOND = "#0072b2", "#d55e00", "#009e73"
 
-# Logarithmic axes over less than the first factor have even ticks, over less than the second 1, 2 and 5 of each power of
-# ten.
+# Logarithmic axes over less than the first factor have even ticks, over less than the second 1, 2, 5, 10, ...
 _FINE_RANGE, _SHORT_RANGE = 10.0, 1000.0
 
 _NO_FLATS = "there are no flats"
@@ -104,8 +103,9 @@ def drawn(title: str, plot: Plot | str) -> Drawing:
         panel.set(xlabel=math_symbols(panel.get_xlabel()), ylabel=math_symbols(panel.get_ylabel()))
     if axes.get_legend_handles_labels()[0]:
         # Above the axes, where it hides nothing
-        place = {"loc": "lower left", "bbox_to_anchor": (0, 1), "ncols": 2}
-        legend = axes.legend(frameon=False, labelcolor=INK, fontsize=9, **place)
+        legend = axes.legend(
+            loc="lower left", bbox_to_anchor=(0, 1), ncols=2, frameon=False, labelcolor=INK, fontsize=9
+        )
         for text in legend.get_texts():
             text.set_text(math_symbols(text.get_text()))
     return Drawing(title, plot.caption, svg(figure))

@@ -42,9 +42,8 @@ _TOP_GREY = 255
 # Median absolute difference of two samples of normal noise, in its standard deviations.
 _MEDIAN_DIFFERENCE = 0.6745 * np.sqrt(2)
 
-# Steps of a surface's depths and probabilities over nearly all of their range, and of standard deviations: depths are
-# known to a percent at best.
-_MAP_STEPS, _SIGMA_STEPS = 512, 128
+# Steps of a surface's maps over nearly all of their range: depths are known to a percent at best.
+_MAP_STEPS = 512
 
 type Kind = Literal["light", "sigma", "view", "bright", "depth", "depth_sigma", "confidence"]
 
@@ -331,8 +330,7 @@ def _map_picture(source: _Source, coarser: int) -> ViewerPicture:
     numbers, bins = source.binned(coarser)
     low, high = robust_limits(numbers)
     finite = numbers[np.isfinite(numbers)]
-    steps = _SIGMA_STEPS if source.kind in ("sigma", "depth_sigma") else _MAP_STEPS
-    step = max((high - low) / steps, float(np.ptp(finite)) / _TOP_LEVEL if finite.size else 0.0)
+    step = max((high - low) / _MAP_STEPS, float(np.ptp(finite)) / _TOP_LEVEL if finite.size else 0.0)
     picture = _packed_picture(source, numbers, step, bins)
     if source.sure_above is not None:
         picture["sure_above"] = source.sure_above
