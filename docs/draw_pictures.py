@@ -86,8 +86,23 @@ def draw_photographs(photographs: Path) -> None:
         colours = 255 * colormaps["viridis"](np.clip((disparity_px - near_px) / (far_px - near_px), 0, 1))[..., :3]
         depth = np.where(sure[..., None], colours, 0.35 * colours + 26).astype(np.uint8)
         dark_view = grey_levels(view, float(white), float(black))
-        pictures = [dark_view, np.asarray(picture, np.uint8), depth]
+        pictures = [dark_view, np.asarray(picture, np.uint8), _with_scale(depth, near_px, far_px)]
         write_png(_PICTURES / "photographs.png", shrunk(contact_sheet(pictures, 3), _WIDTH_PX))
+
+
+def _with_scale(depth: NDArray[np.uint8], near_px: float, far_px: float) -> NDArray[np.uint8]:
+    """Return a map of disparities in colours (row, column, RGB) with the scale of these in a strip at its lower end."""
+    height, width = depth.shape[:2]
+    strip, bar = height // 10, height // 40
+    colours = 255 * colormaps["viridis"](np.linspace(0, 1, width // 3))[:, :3]
+    shown = depth.copy()
+    shown[-strip:] = 0
+    shown[height - strip // 2 - bar : height - strip // 2 + bar, width // 3 : width // 3 + len(colours)] = colours
+    words = (f"near {near_px:.1f} px", width // 60), (f"far {far_px:.1f} px", 2 * width // 3 + width // 60)
+    for text, left in words:
+        place = (left, height - strip // 3)
+        cv2.putText(shown, text, place, cv2.FONT_HERSHEY_SIMPLEX, width / 750, (255, 255, 255), 2, cv2.LINE_AA)
+    return shown
 
 
 def draw_pages(demo: Path) -> None:

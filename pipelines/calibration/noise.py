@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,13 @@ class MosaicPhase:
         return at_phase(pixels, self.phase, self.period)
 
 
+class Lattice(NamedTuple):
+    """Places of a phase's pixels on the sensor: row and column of the first, and the distance to the next, in px."""
+
+    first: tuple[int, int]
+    period: tuple[int, int]
+
+
 @dataclass(frozen=True)
 class Readout:
     """All frames of a noise set, reduced: their width and height, the region that was used, and its phases.
@@ -57,6 +64,12 @@ class Readout:
     mosaic: tuple[str, ...] | None
     saturation_dn: float
     phases: list[MosaicPhase]
+
+    @property
+    def lattices(self) -> list[Lattice]:
+        """Places of the pixels of each phase."""
+        top, left = self.rows.start, self.columns.start
+        return [Lattice((top + phase.phase[0], left + phase.phase[1]), phase.period) for phase in self.phases]
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,9 @@ type Picture = NDArray[np.uint8]
 # Of a lossy film, 0 to 100: above it, size grows faster than anyone can see.
 _FILM_QUALITY = 80
 
-# Hatching of samples that are not known: its period along a row, and its two levels.
-_HATCH_PERIOD_PX, _HATCH_DARK, _HATCH_BRIGHT = 8, 120, 235
+# Hatching of samples of light that are not known, by its period along a row and its two RGB colours. Grey stripes would
+# be taken for what is painted on an object.
+_HATCH_PERIOD_PX, _HATCH_DARK, _HATCH_BRIGHT = 8, (125, 0, 95), (240, 60, 205)
 
 
 def write_frame(path: Path, pixels: NDArray[Any]) -> None:
@@ -100,7 +101,7 @@ def _relative(plane: NDArray[np.floating], white: float, black: float) -> NDArra
 def light_picture(
     light: NDArray[np.floating], white: float, black: float = 0.0, *, tone_curve: bool = False
 ) -> Picture:
-    """Return light (row, column[, colour]) as 8-bit levels from black to white; samples that are NaN are hatched.
+    """Return light (row, column[, colour]) as 8-bit levels from black to white; if some is NaN, as RGB, that hatched.
 
     With the tone curve of sRGB levels are what a screen expects, and what photographs have; without it they are
     proportional to light.
@@ -110,8 +111,9 @@ def light_picture(
     unknown = np.isnan(light) if light.ndim == 2 else np.isnan(light).any(axis=2)
     if unknown.any():
         rows, columns = np.nonzero(unknown)
-        stripes = np.where((rows + columns) % _HATCH_PERIOD_PX < 2, _HATCH_DARK, _HATCH_BRIGHT).astype(np.uint8)
-        levels[rows, columns] = stripes if light.ndim == 2 else stripes[:, np.newaxis]
+        dark = (rows + columns) % _HATCH_PERIOD_PX < 2
+        levels = levels if light.ndim == 3 else np.repeat(levels[:, :, np.newaxis], 3, axis=2)
+        levels[rows, columns] = np.where(dark[:, np.newaxis], _HATCH_DARK, _HATCH_BRIGHT)
     return levels
 
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from faintfield.calib.noise import Estimate
 from faintfield.calib.noise.likelihood.rounding import ROUNDING_DN2
+from faintfield.pipelines.calibration.noise import SensorCalibration
 from faintfield.pipelines.calibration.noise_emva import EmvaMeasurement
 from faintfield.pipelines.formats.results.noise import STANDARD, NoiseRecord
 from faintfield.pipelines.pages.calibration_pages import NOISE_QUANTITIES
@@ -79,8 +80,9 @@ _RATIOS: dict[str, Callable[[float], float]] = {"dB": lambda ratio: 20 * np.log1
 _MAP_PX, _MAP_OF_PHASE_PX = 400, 200
 
 
-def noise_page(name: str, record: NoiseRecord, measured: Sequence[EmvaMeasurement]) -> str:
+def noise_page(name: str, record: NoiseRecord, sensor: SensorCalibration) -> str:
     """Return the page about a sensor: of a mosaic, every table has columns and every drawing a part for each phase."""
+    measured = sensor.phases
     known = [_known(phase) for phase in measured]
     side_px = _MAP_PX if len(measured) == 1 else _MAP_OF_PHASE_PX
     return template("noise.html").render(
@@ -90,7 +92,10 @@ def noise_page(name: str, record: NoiseRecord, measured: Sequence[EmvaMeasuremen
         values=_table(_VALUES, known),
         emva=_table(_EMVA, known),
         fits=[fit_drawings(phase) for phase in measured],
-        maps=[list(map_drawings(phase.calibration, side_px)) for phase in measured],
+        maps=[
+            list(map_drawings(phase.calibration, lattice, side_px))
+            for phase, lattice in zip(measured, sensor.readout.lattices, strict=True)
+        ],
         emva_drawings=[emva_drawings(phase) for phase in measured],
         standard=STANDARD,
         sub=html_symbols,

@@ -19,8 +19,8 @@ from faintfield.pipelines.pages.page import INK, blank_drawing, figure, ink, mat
 # Measured, model, and a second series; distinct without colour vision, and on black as on white.
 MEASURED, MODEL, SECOND = "#0072b2", "#d55e00", "#009e73"
 
-# Logarithmic axes over less than this factor have even ticks, not powers of ten.
-_FINE_RANGE = 10.0
+# Logarithmic axes over less than the first factor have even ticks, over less than the second 1, 2, 5, 10, ...
+_FINE_RANGE, _SHORT_RANGE = 10.0, 1000.0
 
 _NO_FLATS = "there are no flats"
 
@@ -94,14 +94,18 @@ def drawn(title: str, plot: Plot | str) -> Drawing:
         panel.minorticks_off()
         for axis, (low, high) in ((panel.xaxis, panel.get_xlim()), (panel.yaxis, panel.get_ylim())):
             if axis.get_scale() == "log":
-                axis.set_major_locator(MaxNLocator(6) if high < _FINE_RANGE * low else LogLocator())
+                steps = (1, 2, 5) if high < _SHORT_RANGE * low else (1,)
+                axis.set_major_locator(MaxNLocator(6) if high < _FINE_RANGE * low else LogLocator(subs=steps))
                 axis.set_major_formatter("{x:g}")
             else:
                 axis.set_major_locator(MaxNLocator(6))
         ink(panel)
         panel.set(xlabel=math_symbols(panel.get_xlabel()), ylabel=math_symbols(panel.get_ylabel()))
     if axes.get_legend_handles_labels()[0]:
-        legend = axes.legend(frameon=False, labelcolor=INK, fontsize=9)
+        # Above the axes, where it hides nothing
+        legend = axes.legend(
+            loc="lower left", bbox_to_anchor=(0, 1), ncols=2, frameon=False, labelcolor=INK, fontsize=9
+        )
         for text in legend.get_texts():
             text.set_text(math_symbols(text.get_text()))
     return Drawing(title, plot.caption, svg(figure))
@@ -298,7 +302,7 @@ def _snr(measured: EmvaMeasurement, flats: _Levels) -> Plot | str:
         axes.set(xscale="log", yscale="log", xlabel=name, ylabel="SNR")
         axes.set_ylim(bottom=0.3)
 
-    return Plot("Where SNR = 1 is the absolute sensitivity threshold μ_p.min.", draw)
+    return Plot(f"Where SNR = 1 is the absolute sensitivity threshold {name[:3]}.min.", draw)
 
 
 def _dark_signal(measured: EmvaMeasurement) -> Plot | str:
@@ -314,17 +318,19 @@ def _dark_signal(measured: EmvaMeasurement) -> Plot | str:
     jitter = calibration.estimates["frame_jitter_dn"].value or 0.0
     error = np.sqrt((variance / max(pixels, 1) + jitter**2) / frames)
     offset = calibration.estimates["offset_dn"].value or 0.0
+    known = calibration.estimates["dark_current_e_per_s"].value is not None
 
     def draw(axes: Axes) -> None:
         axes.plot(exposure, mean - offset, "s", ms=4, color=SECOND, label="darks")
-        axes.plot(exposure, model - offset, color=MODEL, label="K μ_I t")
+        axes.plot(exposure, model - offset, color=MODEL, label="K μ_I t" if known else "line through the darks")
         axes.set(xlabel="exposure t (s)", ylabel="dark signal\nμ_y.dark − μ_y.dark(0) (DN)")
 
     def residuals(axes: Axes) -> None:
         axes.errorbar(exposure, mean - model, 2 * error, fmt="s", ms=4, color=SECOND)
         axes.set(ylabel="measured less\nmodel (DN)")
 
-    caption = "The slope over the gain K is the dark current μ_I. Bars: ± 2 s.e., noise of pixels and jitter of frames."
+    slope = "over the gain K is" if known else "does not determine"
+    caption = f"The slope {slope} the dark current μ_I. Bars: ± 2 s.e., noise of pixels and jitter of frames."
     return Plot(caption, draw, residuals)
 
 
@@ -359,8 +365,6 @@ def _spectrograms(measured: EmvaMeasurement, image: MeanImage, unit: str, factor
         left = factor * np.sqrt(image.noise.variances[0])
         axes.axhline(left, color=MODEL, lw=1, ls="--", label="temporal noise left in the mean")
         axes.set(xlabel="spatial frequency (cycles/pixel)", ylabel=f"amplitude ({unit})", xlim=(0, 0.5))
-        low, high = axes.get_ylim()
-        axes.set_ylim(low, high * (high / low) ** 0.5)  # room for the legend
 
     return Plot(_caption(image) + " White noise is level at its standard deviation; a peak is a pattern.", draw)
 

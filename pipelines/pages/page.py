@@ -73,6 +73,11 @@ def template(name: str) -> Template:
     return _environment().get_template(name)
 
 
+def unbroken_options(text: str) -> Markup:
+    """Return a text as HTML whose options, `--surface` for one, are code that no line breaks."""
+    return Markup(re.sub(r"--[a-z-]+", r'<code class="option">\g<0></code>', str(escape(text))))
+
+
 @cache
 def _environment() -> Environment:
     environment = Environment(
@@ -82,7 +87,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"figure": figure, "snr_text": snr_text}
+    environment.filters |= {"figure": figure, "snr_text": snr_text, "unbroken": unbroken_options}
     return environment
 
 

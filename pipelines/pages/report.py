@@ -37,6 +37,7 @@ from faintfield.pipelines.pages.report_sets import SetSection, set_sections
 from faintfield.pipelines.pages.report_surface import depth_sections, surface_sections
 from faintfield.pipelines.pages.viewer_data import viewer_of
 from faintfield.pipelines.reconstruction.depth.scene_structure import recommendation
+from faintfield.pipelines.reconstruction.planes.saturation import saturation_text
 
 # Origins of poses in words.
 _POSES: dict[Poses, str] = {
@@ -89,9 +90,11 @@ def write_report(directory: Path, *, noise: Path | None = None, geometry: Path |
         values = ", ".join(figure(row.mse_texture) for row in best)
         depths = format_depths(units, *(row.depth_mm for row in best))
         facts.append(Fact("Mean square error", values, f"against the object, 0…1, at {depths}"))
+    channels = [channel for result in results.values() for channel in result.planes]
     page = template("report.html").render(
         title=_title(directory, results, surfaces),
         recommendation=_recommendation(results, surfaces),
+        saturation=saturation_text([*channels, *(one for made in surfaces.values() for one in made.surface.channels)]),
         units=units,
         facts=facts,
         sets=sets,

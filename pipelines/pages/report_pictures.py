@@ -2,13 +2,12 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from itertools import cycle
 from typing import Any, NamedTuple, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.pipelines.formats.image_files import encoded, grey_levels, light_picture, shrunk, white_level
+from faintfield.pipelines.formats.image_files import encoded, light_picture, shrunk, white_level
 from faintfield.pipelines.formats.results.records import JOINT_METHODS, Certificate, FocusCurve, ReconstructionRecord
 from faintfield.pipelines.formats.units import StatedUnits
 from faintfield.pipelines.pages.page import INK, blank_drawing, data_uri, format_depths, ink, svg
@@ -23,11 +22,18 @@ _GRID_WIDTH_PX, _ROW_WIDTH_PX, _SLIDER_WIDTH_PX = 640, 1920, 800
 # Ends of the scale of what the data moved, in standard deviations.
 _MOST_MOVED = 3.0
 
-# Colour and mark of the curves of several planes.
-_LINES = (("#0072b2", "o"), ("#e69f00", "s"), ("#009e73", "^"), ("#cc79a7", "D"))
-
-# Largest number of curves in the legend: one of many planes would leave no room for the curves.
-_MAX_LABELLED = 8
+# Colour and mark of each of a few curves; of more, which nobody tells apart, only the colour channels differ.
+_LINES = (
+    ("#0072b2", "o"),
+    ("#e69f00", "s"),
+    ("#009e73", "^"),
+    ("#cc79a7", "D"),
+    ("#56b4e9", "v"),
+    ("#d55e00", "P"),
+    ("#8c6bb1", "X"),
+    ("#808080", "*"),
+)
+_OF_CHANNELS = {"red": "#d55e00", "green": "#009e73", "blue": "#0072b2"}
 
 
 class Sigmas(NamedTuple):
@@ -65,7 +71,8 @@ class PlaneSections:
     """Part of the page about the planes, by default without any; the names are those of the template.
 
     The page leads with the `best` column. Pictures are data URIs, on a scale whose `white` is in the unit of light;
-    `rows` are side by side, a cell per column, None if the plane was not reconstructed.
+    `rows` are side by side, a cell per column, None if the plane was not reconstructed. Certificates of a plane are by
+    channel.
     """
 
     best: Plane | None = None
@@ -74,7 +81,8 @@ class PlaneSections:
     blurred: bool = False
     best_planes: list[tuple[str, str]] = field(default_factory=list)
     weight_curves: str | None = None
-    certificates: list[tuple[str, Certificate]] = field(default_factory=list)
+    certificates: list[tuple[str, dict[str, Certificate]]] = field(default_factory=list)
+    channels: list[str] = field(default_factory=list)
     columns: list[str] = field(default_factory=list)
     rows: list[tuple[str, list[str | None]]] = field(default_factory=list)
     slider: list[Slides] | None = None
@@ -104,7 +112,8 @@ def plane_sections(planes: list[Plane], results: Iterable[ReconstructionRecord])
     shown = [plane for plane in planes if plane.name or plane.depth_mm in shown_depths]
     in_order = {column: sorted((p for p in planes if p.column == column), key=lambda p: p.place) for column in columns}
     of_best = [plane for plane in planes if plane.column == best]
-    records = [(plane.label, record) for plane in of_best for record in plane.records]
+    records = [record for plane in of_best for record in plane.records]
+    bounds = [(plane.label, _bounds(plane)) for plane in of_best]
     several = len(places) > 1 or len(columns) > 1
     slider_depth = _first_depth([depth for depth, _ in places], focus)
     first_slide = in_order[best][: slider_depth + 1][-1]
@@ -112,15 +121,12 @@ def plane_sections(planes: list[Plane], results: Iterable[ReconstructionRecord])
     return PlaneSections(
         best=of_best[0],
         best_title=titles[best],
-        left_out=next((record.occlusion_left_out for _, record in records if record.occlusion_left_out), None),
+        left_out=next((record.occlusion_left_out for record in records if record.occlusion_left_out), None),
         blurred=len(places) > 1 and of_best[0].method not in JOINT_METHODS,
         best_planes=[(label, cell) for label, cells in best_rows for cell in cells if cell],
         weight_curves=_weight_curves(of_best),
-        certificates=[
-            (label, record.certificate)
-            for label, record in records
-            if record.certificate and record.certificate.is_bound
-        ],
+        certificates=[(label, of_plane) for label, of_plane in bounds if of_plane],
+        channels=list(dict.fromkeys(channel for _, of_plane in bounds for channel in of_plane)),
         columns=list(titles.values()),
         rows=_side_by_side(shown, columns, white),
         slider=[_slides(titles[column], in_order[column]) for column in columns] if several else None,
@@ -134,6 +140,12 @@ def plane_sections(planes: list[Plane], results: Iterable[ReconstructionRecord])
         focus_curve=_focus_curve(focus, units) if focus else None,
         sharp=_sharp(focus, units) if focus else "",
     )
+
+
+def _bounds(plane: Plane) -> dict[str, Certificate]:
+    """Return the certificates of a plane that bound its distance to the optimum, by channel."""
+    of_channel = {record.channel: record.certificate for record in plane.records}
+    return {channel: certificate for channel, certificate in of_channel.items() if certificate and certificate.is_bound}
 
 
 def _slides(title: str, planes: list[Plane]) -> Slides:
@@ -199,7 +211,7 @@ def _proposals(planes: list[Plane], titles: dict[str, str], white: float) -> lis
     for plane in sorted(planes, key=lambda plane: plane.depth_mm):
         proposal, moved = plane.sidecar_pixels("proposal_file"), plane.sidecar_pixels("moved_file")
         if proposal is not None and moved is not None:
-            levels = shrunk(grey_levels(moved, _MOST_MOVED, -_MOST_MOVED), _GRID_WIDTH_PX)
+            levels = shrunk(light_picture(moved, _MOST_MOVED, -_MOST_MOVED), _GRID_WIDTH_PX)
             picture = _picture(proposal, white, _GRID_WIDTH_PX, ".png", tone_curve=plane.units.tone_curve)
             title = f"{titles[plane.column]}, {plane.label}"
             proposals.append(Proposed(title, picture, data_uri(encoded(levels, ".png"), ".png")))
@@ -250,21 +262,25 @@ def _weight_curves(planes: Sequence[Plane]) -> str | None:
     if not records:
         return None
     figure, axes = blank_drawing(5.6, 3.0)
-    for index, (((name, channel), record), (colour, marker)) in enumerate(zip(records.items(), cycle(_LINES))):
+    few = len(records) <= len(_LINES)
+    labels: dict[str, int] = {}
+    for (name, channel), record in records.items():
         curve = sorted(record.penalty_weight_curve or [], key=lambda score: score.weight)
         held_out = np.array([score.held_out for score in curve])
-        label: str | None = name if channel == "grey" else f"{name}, {channel}"
-        if index >= _MAX_LABELLED:
-            label = f"and {len(records) - _MAX_LABELLED} more" if index == _MAX_LABELLED else None
-        weights = [score.weight for score in curve]
-        axes.plot(weights, held_out - held_out.min(), marker=marker, markersize=4, color=colour, label=label)
+        of_colour = "" if channel == "grey" else f", {channel}"
+        label = f"{name}{of_colour}" if few else f"{len(planes)} planes{of_colour}"
+        look: dict[str, Any] = {"label": None if label in labels else label}
+        colour, marker = _LINES[labels.setdefault(label, len(labels)) % len(_LINES)]
+        colour = colour if few else _OF_CHANNELS.get(channel, colour)
+        look |= {"marker": marker, "markersize": 4} if few else {"linewidth": 0.8}
+        axes.plot([score.weight for score in curve], held_out - held_out.min(), color=colour, **look)
         if record.penalty_weight is not None:
             axes.axvline(record.penalty_weight, color=colour, linewidth=1, linestyle="--")
     axes.set_xscale("log")
     for axis_format in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
         axis_format("{x:g}")
     axes.set(xlabel="penalty weight β", ylabel="held-out views: −log likelihood\nabove their minimum")
-    axes.legend(frameon=False, labelcolor=INK)
+    axes.legend(frameon=False, labelcolor=INK, loc="lower left", bbox_to_anchor=(0, 1), ncols=2)
     ink(axes)
     return svg(figure)
 

@@ -12,7 +12,7 @@ from faintfield.pipelines.errors import MissingFile
 from faintfield.pipelines.formats.files import files_below
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.results.figures import METRICS_FILE, GeometryErrors, Metrics, PlaneErrors
-from faintfield.pipelines.formats.results.records import Method, PlaneRecord, Poses, ReconstructionRecord
+from faintfield.pipelines.formats.results.records import JOINT_METHODS, Method, PlaneRecord, Poses, ReconstructionRecord
 from faintfield.pipelines.formats.results.surface import read_result
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS
 from faintfield.pipelines.formats.units import StatedUnits, units_of
@@ -36,6 +36,10 @@ METHOD_NAMES: dict[Method, str] = {
     "joint": "PMLEM, all planes together",
     "occlusion": "PMLEM, all planes together, with occlusion",
 }
+
+
+# Methods that a prior may guide.
+_OF_PRIORS: tuple[Method, ...] = ("pmlem", *JOINT_METHODS)
 
 
 @dataclass(frozen=True)
@@ -79,9 +83,14 @@ class Plane:
         return read_frame(existing(self.path.with_name(Path(name).name))).pixels_dn if name else None
 
 
-def method_title(records: Sequence[PlaneRecord]) -> str:
-    """Return the name of the method of records, with its prior; it says if occlusion was left out."""
+def method_title(records: Sequence[PlaneRecord], *, all_priors: bool = False) -> str:
+    """Return the name of the method of records, with its prior; it says if occlusion was left out.
+
+    Total variation alone is named with `all_priors` only.
+    """
     names = {record.prior.name for record in records if record.prior} - {"tv"}
+    if all_priors and not names and records[0].method in _OF_PRIORS and records[0].prior_name == "tv":
+        names = {"tv"}
     prior = f", prior: {' and '.join(sorted(names))}" if names else ""
     left_out = dict.fromkeys(record.channel for record in records if record.occlusion is False)
     if not left_out:
@@ -121,15 +130,17 @@ def existing(path: Path) -> Path:
 def column_titles(planes: list[Plane]) -> dict[str, str]:
     """Return the title of each column: the method, with the poses or the set's folder if these differ."""
     columns = {plane.column: plane for plane in planes}
-    kinds = {(method_title(plane.records), plane.poses) for plane in columns.values()}
+    priors_differ = len({plane.records[0].prior_name for plane in planes if plane.method in _OF_PRIORS}) > 1
+    names = {column: method_title(plane.records, all_priors=priors_differ) for column, plane in columns.items()}
+    kinds = {(names[column], plane.poses) for column, plane in columns.items()}
     poses_differ = len(kinds) == len(columns) and len({plane.poses for plane in planes}) > 1
     titles = {}
     for column, plane in columns.items():
         where = column.rpartition("/")[0]
         if poses_differ and plane.poses != "stated":
-            titles[column] = f"{method_title(plane.records)}, {plane.poses} poses"
+            titles[column] = f"{names[column]}, {plane.poses} poses"
         else:
-            titles[column] = (f"{where} set: " if where else "") + method_title(plane.records)
+            titles[column] = (f"{where} set: " if where else "") + names[column]
     return titles
 
 

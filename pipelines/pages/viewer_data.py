@@ -21,6 +21,7 @@ from faintfield.pipelines.pages.report_pictures import PlaneSections
 from faintfield.pipelines.pages.report_planes import Plane, best_column, column_titles, existing
 from faintfield.pipelines.pages.report_sets import SetSection
 from faintfield.pipelines.reconstruction.depth.depth_map import robust_limits
+from faintfield.pipelines.reconstruction.planes.saturation import has_unknown
 
 # A plane of more samples is binned: a phone draws this many in a frame.
 _MAX_SAMPLES = 1_500_000
@@ -41,9 +42,8 @@ _TOP_GREY = 255
 # Median absolute difference of two samples of normal noise, in its standard deviations.
 _MEDIAN_DIFFERENCE = 0.6745 * np.sqrt(2)
 
-# Steps of a surface's depths and probabilities over nearly all of their range, and of standard deviations: depths are
-# known to a percent at best.
-_MAP_STEPS, _SIGMA_STEPS = 512, 128
+# Steps of a surface's maps over nearly all of their range: depths are known to a percent at best.
+_MAP_STEPS = 512
 
 type Kind = Literal["light", "sigma", "view", "bright", "depth", "depth_sigma", "confidence"]
 
@@ -85,7 +85,7 @@ class ViewerPicture(TypedDict):
     bytes, or else `element` is the id of an 8-bit picture on the page: `toned` if it has the tone curve of sRGB, and
     of integers if `whole`. Lengths are those of the numbers after binning. `sigma` is the index of the picture of their
     standard deviations, and `confidence` that of the probabilities that they are right, which are sure from
-    `sure_above` on.
+    `sure_above` on. Samples without a number are not known, or else `saturated`.
     """
 
     kind: Kind
@@ -105,6 +105,7 @@ class ViewerPicture(TypedDict):
     confidence: NotRequired[int]
     sure_above: NotRequired[float]
     toned: NotRequired[bool]
+    saturated: NotRequired[bool]
 
 
 class ViewerData(TypedDict):
@@ -251,6 +252,7 @@ class _Source(NamedTuple):
     pitch: float | None = None
     origin: tuple[float, float] = (0.0, 0.0)
     sure_above: float | None = None
+    saturated: bool = False
 
     def binned(self, coarser: int) -> tuple[NDArray[np.floating], int]:
         """Return the numbers (row, column[, colour]) in bins, and the width of these; `coarser` is added to it."""
@@ -267,9 +269,10 @@ def _plane_sources(planes: list[Plane], places: list[tuple[float, str]]) -> list
     for plane in planes:
         title, place, record = titles[plane.column], places.index(plane.place), plane.records[0]
         at = (plane.label, place, plane.units.light_per_pixel, record.pitch_mm, record.origin_mm)
-        sources.append(_Source(plane.pixels, "light", title, *at))
+        saturated = has_unknown(plane.records)
+        sources.append(_Source(plane.pixels, "light", title, *at, saturated=saturated))
         if record.sigma_file:
-            sources.append(_Source(partial(_sigma_of, plane), "sigma", f"σ of {title}", *at))
+            sources.append(_Source(partial(_sigma_of, plane), "sigma", f"σ of {title}", *at, saturated=saturated))
     return sources
 
 
@@ -310,7 +313,11 @@ def _surface_sources(
     sources = []
     for kind, name, label, unit in entries:
         sure_above = surface.sure_above if kind == "depth" else None
-        sources.append(_Source(partial(read, name), kind, title, label, None, unit, sure_above=sure_above))
+        saturated = kind in ("light", "sigma") and has_unknown(surface.channels)
+        source = _Source(
+            partial(read, name), kind, title, label, None, unit, sure_above=sure_above, saturated=saturated
+        )
+        sources.append(source)
         if kind not in scales:
             black, white = limits(kind, name)
             scales[kind] = {"black": black, "white": white, "name": label}
@@ -323,8 +330,7 @@ def _map_picture(source: _Source, coarser: int) -> ViewerPicture:
     numbers, bins = source.binned(coarser)
     low, high = robust_limits(numbers)
     finite = numbers[np.isfinite(numbers)]
-    steps = _SIGMA_STEPS if source.kind in ("sigma", "depth_sigma") else _MAP_STEPS
-    step = max((high - low) / steps, float(np.ptp(finite)) / _TOP_LEVEL if finite.size else 0.0)
+    step = max((high - low) / _MAP_STEPS, float(np.ptp(finite)) / _TOP_LEVEL if finite.size else 0.0)
     picture = _packed_picture(source, numbers, step, bins)
     if source.sure_above is not None:
         picture["sure_above"] = source.sure_above
@@ -404,6 +410,8 @@ def _packed_picture(source: _Source, numbers: NDArray[np.floating], step: float,
         bins=bins,
         src=smaller_uri(packed.png),
     )
+    if source.saturated:
+        picture["saturated"] = True
     if source.pitch is not None:
         # The first bin's centre lies half a bin less half a sample from that of the first sample
         x, y = (start + source.pitch * (bins - 1) / 2 for start in source.origin)

@@ -204,11 +204,14 @@ def _warn(elemental_set: ElementalSet, records: list[PlaneRecord]) -> None:
             f"pmlem stopped before its certificate on {len(missed)} of {len(bounds)} planes: up to {max(missed):.1%} "
             f"from the optimum instead of {bounds[0].tolerance:.0%}; allow more --passes"
         )
-    without = [record.prior.left_out for record in records if record.prior and record.prior.left_out]
-    if without:
-        inform(
-            f"the prior is left out of {len(without)} of {len(records)} planes, total variation's stay: {without[0]}"
-        )
+    # A plane in colour has several records, and planes of several methods have one name
+    whys: dict[tuple[Method, str], str] = {}
+    for record in records:
+        if record.prior and record.prior.left_out:
+            whys[record.method, record.file] = record.prior.left_out
+    if whys:
+        made, why = len({(record.method, record.file) for record in records}), next(iter(whys.values()))
+        inform(f"the prior is left out of {len(whys)} of {made} planes, total variation's stay: {why}")
     if text := saturation_text(records):
         inform(text)
     black = [record for record in records if record.mean_e <= _BLACK_E * light_per_e(elemental_set)]

@@ -34,7 +34,7 @@ def measure_sensor(folder: Path, out: Path | None = None) -> NoiseRecord:
         sensor = calibrate_sensor(frames)
         record = noise_record(sensor)
         with working("drawing the page"):
-            page = noise_page(title, record, sensor.phases)
+            page = noise_page(title, record, sensor)
         record = write_noise(out, record, noise_maps(sensor), page)
     _inform_of(record)
     inform(f"{out / NOISE_FILE}")

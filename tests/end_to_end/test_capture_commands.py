@@ -17,7 +17,7 @@ from tests.end_to_end.rigs import write_small_rig
 from tests.faults.capturing import events
 
 # Kind and frames of each step of the rig.toml that `init` writes, on a grid of 2 x 2, with a frame for each exposure.
-STEPS = [*[("charuco", 4)] * 6, ("bright", 4), ("dark_scene", 4), ("noise_reference", 4), ("dark", 4), ("flat", 3)]
+STEPS = [*[("charuco", 4)] * 6, ("bright", 4), ("dark_scene", 4), ("noise_reference", 4), ("dark", 4), ("flat", 4)]
 FRAMES = sum(count for _, count in STEPS)
 
 
@@ -107,10 +107,10 @@ def test_check_moves_nothing_and_counts_frames(shell: Shell) -> None:
         result = shell.result("check", shell.rig)
         assert not move.called
         assert not home.called
-    assert result["frames"] == 511
-    assert result["disk_bytes"] == 511 * (2 * 64 * 48 + 512)
+    assert result["frames"] == 521
+    assert result["disk_bytes"] == 521 * (2 * 64 * 48 + 512)
     assert 300.0 < result["duration_s"] < 1200.0
-    assert "511 frames in 11 steps" in shell.words
+    assert "521 frames in 11 steps" in shell.words
 
 
 def test_check_remembers_settings_of_stage(shell: Shell) -> None:
@@ -191,12 +191,12 @@ def test_capture_resumes_after_ctrl_c(small: Shell) -> None:
     with mock.patch.object(SimulatedLab, "expose", interrupted):
         assert small.run("capture", small.rig, small.session, "--yes") == 1
     assert signal.getsignal(signal.SIGINT) is before
-    assert "CaptureStopped: stopped with 7 of 43 frames taken; run the same command to go on" in small.words
+    assert "CaptureStopped: stopped with 7 of 44 frames taken; run the same command to go on" in small.words
     verdict = small.result("verify", small.session)["session"]
-    assert (verdict["present"], len(verdict["missing"]), verdict["sealed"]) == (7, 36, False)
-    assert "36 still to be taken" in small.words
-    assert small.result("capture", small.rig, small.session, "--yes")["taken"] == 36
-    assert "7 of 43 frames are there; going on" in small.words
+    assert (verdict["present"], len(verdict["missing"]), verdict["sealed"]) == (7, 37, False)
+    assert "37 still to be taken" in small.words
+    assert small.result("capture", small.rig, small.session, "--yes")["taken"] == 37
+    assert "7 of 44 frames are there; going on" in small.words
     assert small.result("capture", small.rig, small.session, "--yes")["taken"] == 0
     assert small.result("verify", small.session)["session"]["sealed"] is True
 

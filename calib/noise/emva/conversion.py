@@ -309,7 +309,8 @@ def _linearity(fit: NoiseFit, moments: Moments, saturation: Saturation) -> Estim
     if value is None and error_of({}) is not None:
         return Estimate(None, why=_POOR_RESPONSE)
     if value is None:
-        return Estimate(None, why="fewer than 3 levels are within 5 to 95 % of saturation; record more light levels")
+        end = "the brightest level, saturation not being reached" if saturation.level_dn is None else "saturation"
+        return Estimate(None, why=f"fewer than 3 levels are within 5 to 95 % of {end}; record more light levels")
     names, covariance = list(fit.bend.values), fit.bend.covariance
     bends = np.array([*fit.bend.values.values()])
     draws = np.random.default_rng(1288).multivariate_normal(bends, covariance, _DRAWS, method="svd")

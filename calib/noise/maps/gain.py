@@ -243,4 +243,4 @@ def _why(information: float, response: Response, share_se: float, scatter_se: fl
     if not np.isfinite(share_se) or _MIN_SIGMA * share_se < 1:
         return why
     more = (_MIN_SIGMA * share_se) ** 2
-    return f"{why}, or those that make the response ({response.prnu:.1%}) with {more:.1f} times as many flats"
+    return f"{why}, or those that make the response ({response.prnu:.1%}) with {more:.3g} times as many flats"

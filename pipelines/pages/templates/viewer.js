@@ -5,6 +5,8 @@ const viewer = (() => {
   const data = JSON.parse(document.getElementById("viewer-data").textContent);
   const { pictures, scales, places } = data;
   const UNKNOWN = 65535, BINS = 160, MOST = 64, FILM_MS = 600, GRAB_PX = 14, TOUCH_PX = 26;
+  // Pictures narrower than this have so many lines of label, in so small a font
+  const SMALL_PX = 240, SMALL_LINES = 3, SMALL_FONT_PX = 11;
   const make = (tag, props = {}, ...children) => {
     const one = document.createElement(tag);
     for (const [key, value] of Object.entries(props)) if (key in one) one[key] = value; else one.setAttribute(key, value);
@@ -73,15 +75,15 @@ const viewer = (() => {
     // Hatching as in the previews of maps (depth_map.py) and of light (image_files.py): where nothing is known, and
     // through what is not sure
     const period = Math.max(6, Math.round(width / 53));
-    const [stripe, dark, bright] = scales[one.kind].colours ? [period / 6, 128, 158] : [period / 4, 120, 235];
+    const [stripe, dark, bright] = scales[one.kind].colours ? [period / 6, [128, 128, 128], [158, 158, 158]] : [period / 4, [125, 0, 95], [240, 60, 205]];
     const hatch = i => (i % width + Math.floor(i / width)) % period < stripe ? dark : bright;
     const unknown = i => { for (let c = 0; c < colours; c++) if (levels[i * colours + c] === UNKNOWN) return true; return false; };
     for (let i = 0; i < pixels.length; i++) {
       const known = !unknown(i);
-      if (!known) pixels[i] = bytesOf([hatch(i), hatch(i), hatch(i)]);
+      if (!known) pixels[i] = bytesOf(hatch(i));
       else if (colours === 1) pixels[i] = inks[grey[levels[i]]];
       else pixels[i] = 0xff000000 | grey[levels[3 * i + 2]] << 16 | grey[levels[3 * i + 1]] << 8 | grey[levels[3 * i]];
-      if (known && doubt?.levels && !sure(one, doubt, i)) for (let c = 0; c < 3; c++) bytes[4 * i + c] = 0.3 * bytes[4 * i + c] + 0.7 * hatch(i);
+      if (known && doubt?.levels && !sure(one, doubt, i)) for (let c = 0; c < 3; c++) bytes[4 * i + c] = 0.3 * bytes[4 * i + c] + 0.7 * hatch(i)[c];
     }
     context.putImageData(image, 0, 0);
     one.key = key;
@@ -93,12 +95,12 @@ const viewer = (() => {
   function valueAt(one, u, v) {
     const [column, row] = [Math.floor(u * one.width), Math.floor(v * one.width)];
     if (!one.levels || column < 0 || row < 0 || column >= one.width || row >= one.height) return null;
-    const at = (row * one.width + column) * one.colours;
+    const at = (row * one.width + column) * one.colours, unknown = one.saturated ? "saturated" : "not known";
     const levels = [...one.levels.subarray(at, at + one.colours)], known = levels.some(level => level !== UNKNOWN);
     const sigma = one.sigma === undefined ? null : pictures[one.sigma], off = [];
     const sigmas = known && sigma?.levels ? [...sigma.levels.subarray(at / one.colours * sigma.colours, (at / one.colours + 1) * sigma.colours)].map(level => level === UNKNOWN ? NaN : number(sigma, level)) : [];
     const values = levels.map((level, index) => {
-      if (level === UNKNOWN) return "not known";
+      if (level === UNKNOWN) return unknown;
       // Grey levels of a view stand for the integers that they were made of; beyond black and white nothing is known
       if (one.whole) return (level === 0 ? "\u2264 " : level === 255 ? "\u2265 " : "") + minus(Math.round(number(one, level)));
       const deviation = sigmas[index] ?? NaN;
@@ -107,10 +109,11 @@ const viewer = (() => {
     const halves = levels.filter(level => level !== UNKNOWN).map(level => (number(one, level + 1) - number(one, level - 1)) / 4);
     const rounded = one.whole && one.step <= 1 && !one.toned ? 0 : Math.max(0, ...halves);
     if (sigmas.some(deviation => deviation > 0)) off.push("\u00b1 is \u03c3");
+    if (sigma?.step && sigmas.some(deviation => sigma.step > 0.1 * deviation)) off.push("\u03c3 rounded by up to " + minus(Number((sigma.step / 2).toPrecision(1))));
     if (known && rounded > 0 && !sigmas.some(deviation => rounded < 0.1 * deviation)) off.push("rounded by up to " + minus(Number(rounded.toPrecision(1))));
     const doubt = one.confidence === undefined ? null : pictures[one.confidence];
     if (known && doubt?.levels) off.push((sure(one, doubt, at) ? "sure" : "not sure") + ": right within 2 % with a probability of " + number(doubt, doubt.levels[at]).toFixed(2));
-    const value = (one.colours === 3 ? "R " + values[0] + ", G " + values[1] + ", B " + values[2] : values[0]) + " " + one.unit;
+    const value = !known ? unknown : (one.colours === 3 ? "R " + values[0] + ", G " + values[1] + ", B " + values[2] : values[0]) + " " + one.unit;
     const [x, y] = one.pitch ? [one.origin[0] + column * one.pitch, one.origin[1] + row * one.pitch] : [];
     const many = one.bins > 1 ? "mean of " + one.bins + " \u00d7 " + one.bins + " samples, first " : "";
     return { value, off: off.length ? " (" + off.join("; ") + ")" : "", x, y, at: many + "column " + column * one.bins + ", row " + row * one.bins,
@@ -137,16 +140,18 @@ const viewer = (() => {
     const [width, height] = [stage.clientWidth, stage.clientHeight];
     if (state.layout === "wipe") return [A, B].map(side => ({ one: picture(side), side, x: 0, y: 0, w: width, h: height }));
     const shown = state.layout === "pair" ? [picture(A), picture(B)] : all();
-    const [columns, rows] = grid(shown.length), gap = 4;
+    const [columns, rows] = grid(shown.length), gap = 4, above = labelsAbove(columns);
     const [w, h] = [(width - gap * (columns - 1)) / columns, (height - gap * (rows - 1)) / rows];
-    return shown.map((one, index) => ({ one, side: state.layout === "pair" ? index : null, w, h,
-      x: (index % columns) * (w + gap), y: Math.floor(index / columns) * (h + gap) }));
+    return shown.map((one, index) => ({ one, side: state.layout === "pair" ? index : null, w, h: h - above,
+      x: (index % columns) * (w + gap), y: Math.floor(index / columns) * (h + gap) + above }));
   }
   function grid(count) {
     const narrow = stage.clientWidth < 600;
     const across = state.layout === "pair" ? (narrow ? 1 : 2) : narrow ? 2 : Math.min(count, count <= 4 ? 2 : 3);
     return [across, Math.ceil(count / across)];
   }
+  /** Height of the labels above small pictures, which they would hide; larger ones have them within. */
+  const labelsAbove = columns => state.layout !== "wipe" && stage.clientWidth / columns < SMALL_PX ? SMALL_LINES * (SMALL_FONT_PX + 4) + 5 : 0;
   /** Pixels of the stage per width of a picture, in a cell. */
   const magnified = cell => Math.min(cell.w, cell.h / aspect()) * state.zoom;
   const toStage = (cell, u, v) => [cell.x + cell.w / 2 + (u - state.u) * magnified(cell), cell.y + cell.h / 2 + (v - state.v) * magnified(cell)];
@@ -161,18 +166,21 @@ const viewer = (() => {
   }
   function fit() {
     const [columns, rows] = grid(state.layout === "wipe" ? 1 : state.layout === "pair" ? 2 : all().length);
+    const above = rows * labelsAbove(columns);
     const tall = state.layout === "wipe" ? aspect() * stage.clientWidth : rows * aspect() * stage.clientWidth / columns;
-    stage.style.height = Math.round(Math.min(tall, Math.max(state.layout === "wipe" ? 0.72 * innerHeight : 1.3 * innerHeight, 240))) + "px";
+    stage.style.height = Math.round(above + Math.min(tall, Math.max(state.layout === "wipe" ? 0.72 * innerHeight : 1.3 * innerHeight, 240))) + "px";
   }
 
   // ---- Drawing -------------------------------------------------------------------------------------------------
-  function label(text, x, y, right, most, size) {
+  function label(text, x, y, right, most, size, above) {
     context.font = "600 " + size + "px system-ui, sans-serif";
     const lines = [""];
     for (const word of text.split(" ")) {
       const longer = lines.at(-1) + (lines.at(-1) ? " " : "") + word;
       if (lines.at(-1) && context.measureText(longer).width > most) lines.push(word); else lines[lines.length - 1] = longer;
     }
+    if (above && lines.length > SMALL_LINES) { lines.length = SMALL_LINES; lines[SMALL_LINES - 1] += "\u2026"; }
+    if (above) y -= (size + 4) * lines.length + 5;
     const width = Math.max(...lines.map(line => context.measureText(line).width));
     const left = right ? x - width - 12 : x;
     context.fillStyle = "rgba(0, 0, 0, .72)";
@@ -267,8 +275,8 @@ const viewer = (() => {
       drawCell(cell, right ? at : cell.x, wiped && !right ? at : cell.x + cell.w);
       const told = state.cursor && state.layout === "all" ? valueAt(cell.one, ...state.cursor) : null;
       const side = cell.side === null ? "" : "AB"[cell.side] + ": ";
-      const small = cell.w < 240, inset = small ? 3 : 8, words = state.layout === "all" && cell.one.place !== null ? cell.one.title : name(cell.one);
-      label(side + (told ? told.value + ": " : "") + words, right ? width - 8 : cell.x + inset, cell.y + inset, right, wiped ? Math.max(right ? width - at : at, 120) - 30 : cell.w - 24, small ? 11 : 13);
+      const small = cell.w < SMALL_PX, inset = small ? 3 : 8, above = small && !wiped, words = state.layout === "all" && cell.one.place !== null ? cell.one.title : name(cell.one);
+      label(side + (told ? told.value + ": " : "") + words, right ? width - 8 : cell.x + inset, above ? cell.y : cell.y + inset, right, wiped ? Math.max(right ? width - at : at, 120) - 30 : cell.w - 24, small ? SMALL_FONT_PX : 13, above);
       // Planes at one depth have one scale, and small pictures no room for it in each
       if (!small || cell === lastWithScale) drawBar(cell, right);
     }
@@ -395,6 +403,7 @@ const viewer = (() => {
     const ofKind = found => found.filter(one => one.kind === kind && one.levels);
     const shown = () => { const chosen = ofKind([A, B].map(picture)); return chosen.length ? chosen : ofKind(all()).slice(0, 2); };
     const plot = make("canvas", { role: "img", "aria-label": "Histogram of " + scale.name });
+    const inkOf = one => one === picture(B) ? "--accent" : "--second";
     const range = end => make("input", { type: "range", step: "any", id: "v-" + end + "-" + kind, "aria-label": (end === "black" ? "Black" : "White") + " of the " + scale.name + (unit && ", " + unit), oninput: event => set(end, Number(event.target.value)) });
     const typed = end => make("input", { type: "number", step: "any", id: "v-" + end + "-number-" + kind, onchange: event => { if (event.target.value) set(end, Number(event.target.value)); } });
     const ends = { black: [range("black"), typed("black")], white: [range("white"), typed("white")] };
@@ -405,8 +414,11 @@ const viewer = (() => {
       update();
       draw();
     }
+    const keys = make("span");
     function update() {
       const found = shown();
+      const both = picture(A) !== picture(B) && [A, B].every(side => picture(side).kind === kind);
+      keys.replaceChildren(...(both ? [A, B] : []).map(side => make("span", { className: "v-keyed", style: "color: var(" + inkOf(picture(side)) + ")" }, "AB"[side])));
       if (!found.length) return;
       const low = Math.min(...found.map(one => quantile(one, 0.001))), high = Math.max(...found.map(one => quantile(one, 0.999)));
       axis = [Math.min(low - 0.05 * (high - low), scale.black), Math.max(high + 0.15 * (high - low), scale.white)];
@@ -440,7 +452,7 @@ const viewer = (() => {
         heights.forEach((count, bin) => { const y = height * (1 - 0.95 * Math.log1p(count) / top); pen.lineTo(across(from + bin * wide), y); pen.lineTo(across(from + (bin + 1) * wide), y); });
         pen.lineTo(width, height);
         pen.lineWidth = 1.5 * devicePixelRatio;
-        pen.strokeStyle = style.getPropertyValue(one === picture(B) ? "--accent" : "--second");
+        pen.strokeStyle = style.getPropertyValue(inkOf(one));
         pen.globalAlpha = 0.22;
         pen.fillStyle = pen.strokeStyle;
         if (index === 0) pen.fill();
@@ -456,7 +468,7 @@ const viewer = (() => {
       draw();
     }, "Scale of the " + scale.name + " by what is shown: 0.2 % black, 0.2 % white");
     const back = button("As opened", () => { Object.assign(scale, opened[kind]); update(); draw(); });
-    const box = make("fieldset", {}, make("legend", {}, (scale.colours ? "Colour scale of the " : "Grey scale of the ") + scale.name + (unit && ", " + unit) + " (histogram: logarithm of counts)"),
+    const box = make("fieldset", {}, make("legend", {}, (scale.colours ? "Colour scale of the " : "Grey scale of the ") + scale.name + (unit && ", " + unit) + " (histogram: logarithm of counts)", keys),
       make("div", { className: "v-histogram" }, plot, ends.black[0], ends.white[0]),
       make("div", { className: "v-numbers" }, make("label", {}, "black ", ends.black[1]), make("label", {}, "white ", ends.white[1]), auto, back));
     return { kind, box, update, auto };
@@ -532,7 +544,7 @@ const viewer = (() => {
     make("div", { className: "v-row" }, make("label", {}, "Left, A", choices[A]), group("Swap", button("\u21c4", swap, "Swap A and B")), make("label", {}, "Right, B", choices[B])),
     make("div", { className: "v-row v-tools" }, group("Layout", ...Object.values(layouts)),
       group("Zoom", button("\u2212", () => zoomBy(1 / 1.5), "Zoom out"), button("+", () => zoomBy(1.5), "Zoom in"), button("1 : 1", oneToOne, "One sample per pixel"), button("Whole", whole, "Whole picture"), button("Reset", reset, "All as opened")),
-      make("label", { className: "v-slide" }, "Wipe ", wipe), ...(steps ? [make("div", { className: "v-slide" }, play, depth, depthWords)] : [])),
+      make("label", { className: "v-slide" }, "Wipe ", wipe), ...(steps ? [make("div", { className: "v-slide v-film" }, play, depth, depthWords)] : [])),
     stage, make("div", { className: "v-told" }, ...outs), scalesBox,
     make("details", {}, make("summary", {}, "Keys and hands"), make("ul", { className: "v-keys", id: "v-keys" }, ...help.map(key))), live);
   root.hidden = false;

@@ -33,8 +33,9 @@ _UNSURE_ALPHA = 0.3
 # Widths in inches of the picture and of the map in it, and the height of what is not the map.
 _PICTURE_WIDTH_IN, _MAP_WIDTH_IN, _MARGIN_IN = 8.6, 7.2, 0.6
 
-# Size of letters, to be read where a page shows the picture at half its size.
-_FONT_PT = 15
+# Size of letters, to be read where a page shows the picture at half its size, and their colour, to be read on white and
+# on dark pages.
+_FONT_PT, _INK = 15, "#777777"
 
 # Quantiles of the known values between which a map is drawn if nothing else limits it.
 _QUANTILES = (0.01, 0.99)
@@ -162,10 +163,11 @@ def map_picture(
     below, above = bool((values < low).any()), bool((values > high).any())
     extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get((below, above), "neither")
     bar = figure.colorbar(shown, extend=extend, fraction=0.05, pad=0.02)
-    bar.set_label(label, size=_FONT_PT)
-    bar.ax.tick_params(labelsize=_FONT_PT)
+    bar.set_label(label, size=_FONT_PT, color=_INK)
+    bar.ax.tick_params(labelsize=_FONT_PT, colors=_INK)
+    bar.outline.set_edgecolor(_INK)
     content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=110, metadata={"Software": None})
+    figure.savefig(content, format="png", dpi=110, transparent=True, metadata={"Software": None})
     return content.getvalue()
 
 

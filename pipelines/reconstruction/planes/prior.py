@@ -53,8 +53,8 @@ def _contradiction(objective: Objective, samples: Image, evidences: Sequence[Evi
     if found is None:
         return None
     return (
-        f"the views differ from the plane by more than noise where it has detail ({found.detail:.3f} times the "
-        f"variance, {found.smooth:.3f} where it is smooth), as by errors of poses and optics, or objects that hide "
+        f"the views differ from the plane by more than noise where it has detail ({found.detail:.3g} times the "
+        f"variance, {found.smooth:.3g} where it is smooth), as by errors of poses and optics, or objects that hide "
         "others, which a prior may take for detail"
     )
 

@@ -66,11 +66,17 @@ def saturation_text(records: Sequence[PlaneRecord | SurfaceChannel]) -> str | No
     if not saturated:
         return None
     unknown = max(record.unknown_share or 0.0 for record in records)
-    samples = f"; up to {_percent(unknown)} of the samples are seen mostly by such pixels: NaN, hatched in the pictures"
+    seen = "are seen mostly by such pixels: NaN, hatched magenta in the pictures"
+    samples = f"; up to {_percent(unknown)} of the samples {seen}" if unknown else ""
     return (
-        f"{_percent(saturated)} of the pixels are saturated and do not count{samples if unknown else ''}; "
+        f"{_percent(saturated)} of the pixels are saturated and do not count{samples}; "
         "use a shorter exposure, or several"
     )
+
+
+def has_unknown(records: Sequence[PlaneRecord | SurfaceChannel]) -> bool:
+    """Tell if some samples are seen mostly by saturated pixels, in any colour."""
+    return any(record.unknown_share for record in records)
 
 
 def _percent(share: float) -> str:

@@ -13,9 +13,9 @@ import tifffile
 from numpy.typing import NDArray
 
 from faintfield.pipelines.formats.image_files import Spacing, write_plane
-from faintfield.pipelines.formats.results.records import Method, PlaneRecord
-from faintfield.pipelines.pages.report_pictures import PlaneSections
-from faintfield.pipelines.pages.report_planes import Plane
+from faintfield.pipelines.formats.results.records import Certificate, Method, PlaneRecord, PriorRecord
+from faintfield.pipelines.pages.report_pictures import PlaneSections, plane_sections
+from faintfield.pipelines.pages.report_planes import Plane, column_titles
 from faintfield.pipelines.pages.viewer_data import (
     UNKNOWN_LEVEL,
     Fineness,
@@ -110,6 +110,38 @@ def test_plane_is_read_with_its_standard_deviation(tmp_path: Path) -> None:
     (known,) = [picture for picture in pictures if "sigma" in picture]
     assert (known["kind"], known["title"]) == ("light", "PMLEM")
     assert pictures[known["sigma"]]["title"] == "σ of PMLEM"
+
+
+def test_samples_without_number_are_saturated_by_record(tmp_path: Path) -> None:
+    plane = _plane(tmp_path, "pmlem", 500.0, np.full((4, 6), np.nan, np.float32))
+    record = msgspec.structs.replace(plane.records[0], saturated_share=0.1, unknown_share=0.2)
+    assert _pictures([replace(plane, records=[record])])[0]["saturated"]
+    assert "saturated" not in _pictures([plane])[0]
+
+
+def test_priors_are_named_where_they_differ(tmp_path: Path) -> None:
+    light = np.eye(6, 8, dtype=np.float32)
+    alone, joint = (_plane(tmp_path, method, 500.0, light) for method in ("pmlem", "occlusion"))
+    by_tv, by_auto = (
+        [msgspec.structs.replace(plane.records[0], prior=PriorRecord(name=name))]
+        for plane, name in ((alone, "tv"), (joint, "auto"))
+    )
+    both = column_titles([replace(alone, records=by_tv), replace(joint, records=by_auto)])
+    assert list(both.values()) == ["PMLEM, prior: tv", "PMLEM, all planes together, with occlusion, prior: auto"]
+    assert list(column_titles([replace(alone, records=by_tv)]).values()) == ["PMLEM"]
+
+
+def test_certificates_of_a_plane_are_by_colour(tmp_path: Path) -> None:
+    plane = _plane(tmp_path, "pmlem", 500.0, np.eye(6, 8, dtype=np.float32))
+    channels = ("red", "green", "blue")
+    records = [
+        msgspec.structs.replace(plane.records[0], channel=channel, certificate=Certificate(value=value, reached=True))
+        for channel, value in zip(channels, (0.01, 0.02, 0.03), strict=True)
+    ]
+    shown = plane_sections([replace(plane, records=records)], [])
+    ((label, bounds),) = shown.certificates
+    assert (label, shown.channels) == ("500 mm", list(channels))
+    assert [bounds[channel].value for channel in channels] == [0.01, 0.02, 0.03]
 
 
 def test_joint_planes_stand_beside_best_found_alone(tmp_path: Path) -> None:

@@ -213,6 +213,14 @@ def test_each_colour_begins_with_sum_of_others(
         assert evidence.other_colours[evidence.coverage > 0].min() > 0
 
 
+def test_planes_left_out_are_counted_once_in_colour(
+    colour_set: Path, tmp_path: Path, done: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(prior_module, "patch_candidates", lambda evidence: {"tv": evidence.pilot})
+    ended = done("reconstruct", colour_set, *NEAR, *QUICK, *PATCHES, "--out", tmp_path)
+    assert "the prior is left out of 1 of 1 planes, total variation's stay" in ended.stderr
+
+
 @pytest.mark.deep
 def test_joint_planes_begin_with_other_colours(
     colour_set: Path, tmp_path: Path, done: Command, monkeypatch: pytest.MonkeyPatch

@@ -60,7 +60,8 @@ def test_samples_above_saturation_are_unknown(
     assert np.mean(unknown[truth > 1.2 * saturation_e]) > 0.95
     assert np.mean(unknown[visible & (truth < 0.8 * saturation_e)]) < 0.05
     assert "% of the pixels are saturated and do not count" in ended.stderr
-    assert "seen mostly by such pixels: NaN, hatched in the pictures; use a shorter exposure" in ended.stderr
+    assert "seen mostly by such pixels: NaN, hatched magenta in the pictures; use a shorter exposure" in ended.stderr
+    assert "% of the pixels are saturated and do not count" in (out / "report.html").read_text()
     record = read_record(out)["planes"][0]
     assert record["saturated_share"] == pytest.approx(0.1, abs=0.02)
     assert record["unknown_share"] == pytest.approx(unknown.mean())
