@@ -18,6 +18,9 @@ _FILMS = (".webp", ".png")
 # Quality of maps as WebP, on a scale to 100: those of noise would take a tenth of the page without losses.
 _MAP_QUALITY = 55
 
+# Deviance up to which views differ from a prediction by little more than noise.
+_NOISE_ALONE = 1.1
+
 # A gain over planes that counts, in standard errors.
 _SIGNIFICANT = 3.0
 
@@ -109,11 +112,11 @@ def _facts(surface: SurfaceRecord) -> list[Fact]:
     if surface.held_out is None:
         return [sure, Fact(name, "–", "not known: with so few views none is left out to compare with")]
     deviance = surface.held_out.surface
-    times = "no more than" if deviance <= 1 else f"{figure(deviance**0.5, 2)} times"
-    return [
-        sure,
-        Fact(name, figure(deviance), f"views that were left out differ from its prediction by {times} their noise"),
-    ]
+    times = "by their noise alone" if deviance <= _NOISE_ALONE else f"by {figure(deviance**0.5, 2)} times their noise"
+    means = f"views that were left out differ from its prediction {times}"
+    if (unexplained := surface.held_out.unexplained_share) is not None:
+        means += f", and it explains {max(100 - 100 * unexplained, 0):.0f} % of what changes from view to view"
+    return [sure, Fact(name, figure(deviance), means)]
 
 
 def _figures(folder: Path, surface: SurfaceRecord) -> list[Figure]:
