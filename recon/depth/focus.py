@@ -96,6 +96,11 @@ def places_of_focus(depths: DepthEstimate, planes: int) -> list[NDArray[np.bool_
     return [place for place in places if np.count_nonzero(place) >= fewest]
 
 
+def sure_of_lit(confidence: Image, lit_share: float) -> float:
+    """Return the share of the samples with light whose depth is sure."""
+    return min(float(np.mean(confidence >= SURE)) / max(lit_share, 1e-9), 1.0)
+
+
 def likeliest_depth_mm(planes: Sequence[Agreement], depths_mm: Sequence[float], place: NDArray[np.bool_]) -> float:
     """Return the depth at which the views agree best on all samples of a place (row, column), by a parabola.
 

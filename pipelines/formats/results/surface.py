@@ -114,7 +114,8 @@ class SurfaceFacts(Struct, frozen=True, kw_only=True):
     `searched` are the nearest and farthest depth that were considered, in `unit`; `range_found` says that they were
     found in the views. `depths` were compared, first in bins of `bins_px` detector pixels. Depth and picture were
     estimated in turn in `rounds`. `sure_above` is the probability from which on a depth counts as sure, and
-    `share_of_sure` the shares of the sure samples at the depths that stand out, as of `BestFocusRecord`.
+    `share_of_sure` the shares of the sure samples at the depths that stand out, as of `BestFocusRecord`;
+    `sure_of_lit` is the share of the samples with light whose depth is sure.
     """
 
     unit: Literal["mm", "px", "relative"]
@@ -126,6 +127,7 @@ class SurfaceFacts(Struct, frozen=True, kw_only=True):
     sure_above: Share
     held_out: HeldOutRecord | None = None
     share_of_sure: list[float] | UnsetType = UNSET
+    sure_of_lit: Share | UnsetType = UNSET
     channels: Annotated[list[SurfaceChannel], Meta(min_length=1)]
     wall_time_s: float
 

@@ -13,7 +13,7 @@ from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, rounde
 from faintfield.pipelines.reconstruction.depth.comparison import BinnedViews, binned_views, check_places
 from faintfield.pipelines.reconstruction.depth.shared_range import overlap
 from faintfield.recon.depth.agreement import Agreement, DepthEstimate, Significance, depth_map
-from faintfield.recon.depth.focus import MIN_SAMPLES, SURE, likeliest_depth_mm, places_of_focus
+from faintfield.recon.depth.focus import MIN_SAMPLES, SURE, likeliest_depth_mm, places_of_focus, sure_of_lit
 from faintfield.recon.errors import NothingInFocus
 
 # Depths of a search, and searches, each in the range in which the last found anything.
@@ -76,6 +76,7 @@ def best_focus(elemental_set: ElementalSet, out: Path, range_mm: tuple[float, fl
         depths_per_search=_DEPTHS,
         bins_px=bins_px,
         share_of_sure=[float(place.sum() / sure.sum()) for place in by_depth.values()],
+        sure_of_lit=sure_of_lit(found.confidence, found.lit_share),
         p_value=significance.p_value if significance else UNSET,
         z_shuffled=significance.z if significance else UNSET,
         shuffles=significance.shuffles if significance else UNSET,
