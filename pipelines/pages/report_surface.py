@@ -130,7 +130,11 @@ def _figures(folder: Path, surface: SurfaceRecord) -> list[Figure]:
         (surface.picture, "Picture.", "One from all views, as the reference camera would see it"),
         (surface.depth, f"{quantity.capitalize()}, {unit}.", known),
         (surface.depth_confidence, "How sure.", right),
-        (surface.visibility, "Seen by.", "Number of views in which nothing hides the sample"),
+        (
+            surface.visibility,
+            "Seen by.",
+            "Pixels that show the sample, by their weights: about one for each view in which nothing hides it",
+        ),
         (surface.picture_proposal, "Proposal.", "What the prior proposed"),
         (surface.picture_moved, "Moved, σ.", "Picture less proposal, in standard deviations of the noise"),
     ]

@@ -31,9 +31,9 @@ from faintfield.pipelines.formats.results.records import (
 
 SURFACE_FILE = "surface.json"
 
-# Largest share of what changes from view to view that a surface may leave unexplained: with right poses and depths
-# simulated ones leave at most 0.52 at any light, with wrong ones at least 0.75 (docs/surface.md). The share is known if
-# the changes raise the deviance by at least the second number.
+# Largest share of what changes from view to view that a surface may leave unexplained: simulated ones with right poses
+# and range leave at most 0.44 at any light, with poses off by 3 mm and 15 mrad at least 0.76, outside the range more
+# than 1 (docs/surface.md). The share is known if the changes raise the deviance by at least the second number.
 MAX_UNEXPLAINED, _MIN_CHANGES = 2 / 3, 0.2
 
 # Mean deviance of a surface above which nothing vouches for it, without neighbours to compare with.
@@ -137,7 +137,7 @@ class SurfaceRecord(SurfaceFacts, frozen=True, kw_only=True):
 
     Files of light, of depth in `unit` (NaN where it is not known), and of their standard deviations; `picture_proposal`
     is what the prior proposed, `picture_moved` how far the data moved the picture from it. `depth_confidence` is the
-    probability that the depth is right within 2 %, `visibility` the number of views that see a sample, `points` the
+    probability that the depth is right within 2 %, `visibility` the pixels that see a sample, `points` the
     samples of known depth as a point cloud, None in px, and `film` the picture from viewpoints between the nodes.
     `known_share` and `sure_share` are shares of the samples, `median` is that of the known depths.
     """

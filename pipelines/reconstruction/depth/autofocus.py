@@ -67,6 +67,15 @@ def best_focus(elemental_set: ElementalSet, out: Path, range_mm: tuple[float, fl
         raise _nothing(elemental_set, ranges[0])
     searched_mm = _searched_depths(ranges[-1])
     by_depth = _merged(planes, searched_mm, found, places)
+    arrangement = elemental_set.settings.arrangement
+    if arrangement is not None and arrangement.aligned is None and max(by_depth) >= far_mm:
+        del by_depth[max(by_depth)]
+        inform(
+            "warning: the views agree at infinity, where pictures that are aligned on a plane show this plane; its "
+            "depth is left out: import the pictures again with --disparity-px"
+        )
+        if not by_depth:
+            raise _nothing(elemental_set, ranges[0])
     depths = sorted({rounded_depth(elemental_set, depth) for depth in by_depth})
     between = elemental_set.depths_text(near_mm, far_mm, join=" and ")
     inform(f"planes of best focus between {between}: {elemental_set.depths_text(*depths)}")

@@ -179,8 +179,9 @@ def _light(
 
 
 def _visibility(operator: SurfaceOperator, layout: ChannelLayout) -> NDArray[np.floating]:
-    """Return the number of views that see each sample: pixels count alike, whatever their response.
+    """Return the sum of the weights of all pixels that see each sample, whatever their response.
 
+    It is about one for each view that sees the sample, and more where the pixels of a view lie closer than the samples.
     A view has fewer pixels than samples in a colour of a mosaic.
     """
     response = operator.response()
