@@ -142,7 +142,7 @@ def _origin(directory: Path, path: Path, method: str, record: ReconstructionReco
 
 def _describe_search(search: BestFocusRecord, units: StatedUnits) -> str:
     """Return in words how depths were found, and how often shuffled views agreed as well."""
-    where = f"Depths found by comparing the views between {format_depths(units, *search.searched_mm[0], join=' and ')}"
+    where = f"Depths found by comparing the views between {units.range_text(*search.searched_mm[0]).replace('-', '−')}"
     if search.p_value is UNSET or search.shuffles is UNSET or search.z_shuffled is UNSET:
         return f"{where}."
     as_well = round(search.p_value * (search.shuffles + 1)) - 1

@@ -166,8 +166,8 @@ def _rows(surface: SurfaceRecord) -> list[tuple[str, str, str]]:
     median = f"{figure(surface.median)}{unit}" if surface.median is not None else "–"
     return [
         (f"{quantity.capitalize()} searched", f"{first} to {last}{unit}", compared),
-        (f"Median {quantity}", median, f"of all samples whose {quantity} is known"),
-        ("Known", f"{100 * surface.known_share:.0f} %", f"of the picture has a {quantity}"),
+        (f"Median {quantity}", median, f"of all samples whose {quantity} is known, sure or not"),
+        ("Known", f"{100 * surface.known_share:.0f} %", f"of the picture has a {quantity}, sure or not"),
     ]
 
 

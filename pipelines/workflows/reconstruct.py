@@ -81,7 +81,7 @@ def surface_and_report(elemental_set: ElementalSet, out: Path, request: SurfaceR
             locks.enter_context(exclusive(folder))
         record = reconstruct_surface(elemental_set, out, request, pages=(page_in / REPORT_FILE, out / REPORT_FILE))
         report = _write_report(page_in)
-    sure = f"{record.known_share:.0%} of its depths known, {record.sure_share:.0%} sure"
+    sure = f"{record.sure_share:.0%} of its depths sure"
     inform(f"a surface in {time.monotonic() - started:.1f} s, {sure}: {report}")
     used: tuple[Mode, ...] = ("surface",)
     alone = not files_below(page_in, RECONSTRUCTION_FILE)  # planes on the same page recommend

@@ -77,7 +77,7 @@ def best_focus(elemental_set: ElementalSet, out: Path, range_mm: tuple[float, fl
         if not by_depth:
             raise _nothing(elemental_set, ranges[0])
     depths = sorted({rounded_depth(elemental_set, depth) for depth in by_depth})
-    between = elemental_set.depths_text(near_mm, far_mm, join=" and ")
+    between = elemental_set.range_text(near_mm, far_mm)
     inform(f"planes of best focus between {between}: {elemental_set.depths_text(*depths)}")
     return BestFocusRecord(
         depth_mm=depths,
@@ -232,7 +232,7 @@ def _refined(
 
 def _nothing(elemental_set: ElementalSet, range_mm: tuple[float, float]) -> NothingInFocus:
     return NothingInFocus(
-        f"between {elemental_set.depths_text(*range_mm, join=' and ')} there is no depth at which the views agree on "
+        f"between {elemental_set.range_text(*range_mm)} there is no depth at which the views agree on "
         f"at least {MIN_SAMPLES} bins of pixels that stand out of the noise; give another range by --sweep "
         "FIRST:LAST:COUNT, more light, or --depth"
     )
