@@ -93,6 +93,10 @@ class Units(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
     tone: Literal["srgb"] | UnsetType = UNSET
 
 
+# A range of depths whose far end is at least so many times its near end reaches to infinity.
+_INFINITY = 9_900.0
+
+
 class StatedUnits(Units, frozen=True, forbid_unknown_fields=False, omit_defaults=False):
     """The `units` of a record: those of its set, and whether its exposure is known.
 
@@ -157,6 +161,12 @@ class StatedUnits(Units, frozen=True, forbid_unknown_fields=False, omit_defaults
         """Return depths in words: "500, 700 mm", "disparities -3.25, 0.5 px", "depth 1.234"."""
         numbers = self.numbers_text(values, join)
         return numbers if self.depth == "mm" else f"{self.quantities if len(values) > 1 else self.quantity} {numbers}"
+
+    def range_text(self, near: float, far: float) -> str:
+        """Return a range of depths in words: "180 mm and infinity", "400 and 900 mm"."""
+        if self.depth != "disparity_px" and far >= _INFINITY * near:
+            return f"{self.depths_text([float(f'{near:.3g}')])} and infinity"
+        return self.depths_text([near, far], " and ")
 
 
 def units_of(record: object) -> StatedUnits:

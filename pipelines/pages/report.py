@@ -36,7 +36,7 @@ from faintfield.pipelines.pages.report_planes import error_sections, method_titl
 from faintfield.pipelines.pages.report_sets import SetSection, set_sections
 from faintfield.pipelines.pages.report_surface import depth_sections, surface_sections
 from faintfield.pipelines.pages.viewer_data import viewer_of
-from faintfield.pipelines.reconstruction.depth.scene_structure import recommendation
+from faintfield.pipelines.reconstruction.depth.scene_structure import Mode, StatedShares, recommendation
 from faintfield.pipelines.reconstruction.planes.saturation import saturation_text
 
 # Origins of poses in words.
@@ -145,7 +145,7 @@ def _origin(directory: Path, path: Path, method: str, record: ReconstructionReco
 
 def _describe_search(search: BestFocusRecord, units: StatedUnits) -> str:
     """Return in words how depths were found, and how often shuffled views agreed as well."""
-    where = f"Depths found by comparing the views between {format_depths(units, *search.searched_mm[0], join=' and ')}"
+    where = f"Depths found by comparing the views between {units.range_text(*search.searched_mm[0]).replace('-', '−')}"
     if search.p_value is UNSET or search.shuffles is UNSET or search.z_shuffled is UNSET:
         return f"{where}."
     as_well = round(search.p_value * (search.shuffles + 1)) - 1
@@ -159,13 +159,16 @@ def _describe_search(search: BestFocusRecord, units: StatedUnits) -> str:
 def _recommendation(results: dict[Path, ReconstructionRecord], surfaces: dict[Path, SurfaceFileRecord]) -> str | None:
     """Return a sentence on the mode that suits the scene, by the first search for its depths that tells one.
 
-    A surface that does not explain its views recommends nothing.
+    A surface that does not explain its views recommends nothing, and no mode is recommended that the page shows.
     """
-    searches = [
-        found.share_of_sure for result in results.values() for found in (result.depth_map, result.best_focus) if found
+    searches: list[StatedShares] = [
+        found for result in results.values() for found in (result.depth_map, result.best_focus) if found
     ]
-    of_surfaces = [record.surface.share_of_sure for record in surfaces.values() if record.surface.warning is None]
-    return next((advice for shares in [*searches, *of_surfaces] if (advice := recommendation(shares))), None)
+    searches += [record.surface for record in surfaces.values() if record.surface.warning is None]
+    used: list[Mode] = ["surface"] if surfaces else []
+    if any(plane.method == "occlusion" for result in results.values() for plane in result.planes):
+        used.append("occlusion")
+    return next((advice for record in searches if (advice := recommendation(record, used))), None)
 
 
 def _title(directory: Path, results: dict[Path, ReconstructionRecord], surfaces: dict[Path, SurfaceFileRecord]) -> str:

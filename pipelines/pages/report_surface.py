@@ -18,6 +18,9 @@ _FILMS = (".webp", ".png")
 # Quality of maps as WebP, on a scale to 100: those of noise would take a tenth of the page without losses.
 _MAP_QUALITY = 55
 
+# Deviance up to which views differ from a prediction by little more than noise.
+_NOISE_ALONE = 1.1
+
 # A gain over planes that counts, in standard errors.
 _SIGNIFICANT = 3.0
 
@@ -109,11 +112,11 @@ def _facts(surface: SurfaceRecord) -> list[Fact]:
     if surface.held_out is None:
         return [sure, Fact(name, "–", "not known: with so few views none is left out to compare with")]
     deviance = surface.held_out.surface
-    times = "no more than" if deviance <= 1 else f"{figure(deviance**0.5, 2)} times"
-    return [
-        sure,
-        Fact(name, figure(deviance), f"views that were left out differ from its prediction by {times} their noise"),
-    ]
+    times = "by their noise alone" if deviance <= _NOISE_ALONE else f"by {figure(deviance**0.5, 2)} times their noise"
+    means = f"views that were left out differ from its prediction {times}"
+    if (unexplained := surface.held_out.unexplained_share) is not None:
+        means += f", and it explains {max(100 - 100 * unexplained, 0):.0f} % of what changes from view to view"
+    return [sure, Fact(name, figure(deviance), means)]
 
 
 def _figures(folder: Path, surface: SurfaceRecord) -> list[Figure]:
@@ -127,7 +130,11 @@ def _figures(folder: Path, surface: SurfaceRecord) -> list[Figure]:
         (surface.picture, "Picture.", "One from all views, as the reference camera would see it"),
         (surface.depth, f"{quantity.capitalize()}, {unit}.", known),
         (surface.depth_confidence, "How sure.", right),
-        (surface.visibility, "Seen by.", "Number of views in which nothing hides the sample"),
+        (
+            surface.visibility,
+            "Seen by.",
+            "Pixels that show the sample, by their weights: about one for each view in which nothing hides it",
+        ),
         (surface.picture_proposal, "Proposal.", "What the prior proposed"),
         (surface.picture_moved, "Moved, σ.", "Picture less proposal, in standard deviations of the noise"),
     ]
@@ -159,8 +166,8 @@ def _rows(surface: SurfaceRecord) -> list[tuple[str, str, str]]:
     median = f"{figure(surface.median)}{unit}" if surface.median is not None else "–"
     return [
         (f"{quantity.capitalize()} searched", f"{first} to {last}{unit}", compared),
-        (f"Median {quantity}", median, f"of all samples whose {quantity} is known"),
-        ("Known", f"{100 * surface.known_share:.0f} %", f"of the picture has a {quantity}"),
+        (f"Median {quantity}", median, f"of all samples whose {quantity} is known, sure or not"),
+        ("Known", f"{100 * surface.known_share:.0f} %", f"of the picture has a {quantity}, sure or not"),
     ]
 
 

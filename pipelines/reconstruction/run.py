@@ -34,7 +34,7 @@ from faintfield.pipelines.formats.units import StatedUnits
 from faintfield.pipelines.reconstruction.accuracy import assess, write_depth_errors
 from faintfield.pipelines.reconstruction.channels import SHARE_OF_DISK
 from faintfield.pipelines.reconstruction.depth.depth_map import kept_depth_map, write_depth_map
-from faintfield.pipelines.reconstruction.depth.scene_structure import recommendation
+from faintfield.pipelines.reconstruction.depth.scene_structure import Mode, recommendation
 from faintfield.pipelines.reconstruction.depth.search import check_overlap, check_views, depths_of_set
 from faintfield.pipelines.reconstruction.operators import default_pitch_px, plane_grid
 from faintfield.pipelines.reconstruction.overview import inspect_set, write_overview
@@ -114,10 +114,12 @@ def reconstruct_set(elemental_set: ElementalSet, out: Path, request: Request, ru
             remove(folder / STACK_FILE)  # of an earlier sweep
         shutil.rmtree(folder / PARTS, ignore_errors=True)  # also those of another call that was interrupted
     _warn(elemental_set, records)
-    shares = depth_map.share_of_sure if depth_map else found.share_of_sure if found else UNSET
+    searched = depth_map or found
+    used: tuple[Mode, ...] = ("occlusion",) if "occlusion" in folders else ()
+    advice = recommendation(searched, used) if searched else None
     return Outcome(
         out=str(out), planes=records, focus=focus, best_focus=found, depth_map=depth_map, metrics=metrics,
-        units=elemental_set.units, recommendation=recommendation(shares) or UNSET,
+        units=elemental_set.units, recommendation=advice or UNSET,
     )  # fmt: skip
 
 

@@ -10,12 +10,12 @@ from msgspec import UNSET
 from faintfield.pipelines.arguments import SceneKind
 from faintfield.pipelines.console import inform, working
 from faintfield.pipelines.errors import OutputExists, WrongUsage
-from faintfield.pipelines.formats.files import check_results_folder, exclusive
-from faintfield.pipelines.formats.results.records import REPORT_FILE
+from faintfield.pipelines.formats.files import check_results_folder, exclusive, files_below
+from faintfield.pipelines.formats.results.records import RECONSTRUCTION_FILE, REPORT_FILE
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, check_exists, load_set
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, load_session, with_measured_geometry
 from faintfield.pipelines.reconstruction.channels import keeping_frames
-from faintfield.pipelines.reconstruction.depth.scene_structure import recommendation
+from faintfield.pipelines.reconstruction.depth.scene_structure import Mode, recommendation
 from faintfield.pipelines.reconstruction.options import OF_PLANES, Options
 from faintfield.pipelines.reconstruction.planes.sweep import Runner, run_serially
 from faintfield.pipelines.reconstruction.planes.workers import make_runner
@@ -81,9 +81,11 @@ def surface_and_report(elemental_set: ElementalSet, out: Path, request: SurfaceR
             locks.enter_context(exclusive(folder))
         record = reconstruct_surface(elemental_set, out, request, pages=(page_in / REPORT_FILE, out / REPORT_FILE))
         report = _write_report(page_in)
-    sure = f"{record.known_share:.0%} of its depths known, {record.sure_share:.0%} sure"
+    sure = f"{record.sure_share:.0%} of its depths sure"
     inform(f"a surface in {time.monotonic() - started:.1f} s, {sure}: {report}")
-    advice = recommendation(record.share_of_sure) if record.warning is None else None
+    used: tuple[Mode, ...] = ("surface",)
+    alone = not files_below(page_in, RECONSTRUCTION_FILE)  # planes on the same page recommend
+    advice = recommendation(record, used) if alone and record.warning is None else None
     if last := record.warning or record.remark or advice:
         inform(last)
     return Outcome(

@@ -62,10 +62,13 @@ class DepthEstimate:
         The plane, interpolated by a parabola, even where nothing is known; and the probability that the depth is right
         within a step or 2 % of the depth, from the likelihood of the views alone: zero where no light stands out of the
         noise, and where the depth is the first or last of the sweep.
+    lit_share : float
+        Share of the samples whose light stands out of the noise.
     """
 
     index: Image
     confidence: Image
+    lit_share: float
 
 
 def bins_for(operator: SceneOperator, images: ElementalImages) -> int:
@@ -123,8 +126,9 @@ def depth_map(planes: list[Agreement], depths_mm: Image) -> DepthEstimate:
     # The depth may lie beyond the sweep, unless that ends less than half a step of 1/depth before infinity
     before, last = 1 / depths_mm[-2:]
     within = (best > 0) & ((best < len(planes) - 1) | (last < 0.5 * (before - last)))
-    confidence[~(within & comparable & _lit(planes, best))] = 0
-    return DepthEstimate(_refined(evidence, best).astype(np.float32), confidence.astype(np.float32))
+    lit = _lit(planes, best)
+    confidence[~(within & comparable & lit)] = 0
+    return DepthEstimate(_refined(evidence, best).astype(np.float32), confidence.astype(np.float32), float(lit.mean()))
 
 
 def _evidence(planes: list[Agreement]) -> tuple[Image, NDArray[np.bool_]]:

@@ -66,16 +66,14 @@ def sharp_depths_mm(depths_mm: Sequence[float], curve: Sequence[FocusMeasure]) -
     """Return the depths at which a focus curve peaks, each refined by a parabola through its neighbours.
 
     A peak stands out by a tenth of the curve's range and by five standard deviations of the noise: the median over the
-    depths, because sharp detail adds to it where it is.
+    depths, because sharp detail adds to it where it is. An end of the curve is no peak: it may rise beyond.
     """
-    if len(curve) < 3:
-        return []
     order = np.argsort(depths_mm)
     depth = np.asarray(depths_mm, float)[order]
     detail = np.array([point.detail_e2 for point in curve])[order]
     noise_e2 = float(np.median([point.sigma_e2 for point in curve]))
     threshold = max(_MIN_PROMINENCE * float(np.ptp(detail)), _MIN_SIGMAS * noise_e2)
-    peaks = [index for index in range(len(detail)) if prominence(detail, index) > threshold]
+    peaks = [index for index in range(1, len(detail) - 1) if prominence(detail, index) > threshold]
     return [_vertex(depth, detail, peak) for peak in peaks]
 
 
@@ -94,6 +92,11 @@ def places_of_focus(depths: DepthEstimate, planes: int) -> list[NDArray[np.bool_
     peaks = [peak for peak in range(planes) if prominence(counts, peak) > _MIN_PROMINENCE * counts.max()]
     places = [sure & (np.abs(depths.index - peak) <= _REACH) for peak in peaks]
     return [place for place in places if np.count_nonzero(place) >= fewest]
+
+
+def sure_of_lit(confidence: Image, lit_share: float) -> float:
+    """Return the share of the samples with light whose depth is sure."""
+    return min(float(np.mean(confidence >= SURE)) / max(lit_share, 1e-9), 1.0)
 
 
 def likeliest_depth_mm(planes: Sequence[Agreement], depths_mm: Sequence[float], place: NDArray[np.bool_]) -> float:
@@ -130,9 +133,7 @@ def _detail(plane: Image) -> Image:
 
 
 def _vertex(depth: Image, curve: Image, peak: int) -> float:
-    """Return the maximum of the parabola through a peak and its neighbours; at an end of the curve, the end."""
-    if not 0 < peak < len(depth) - 1:
-        return float(depth[peak])
+    """Return the maximum of the parabola through a peak and its neighbours."""
     a, b, _ = np.polyfit(depth[peak - 1 : peak + 2] - depth[peak], curve[peak - 1 : peak + 2], 2)
     return float(depth[peak] - b / (2 * a)) if a < 0 else float(depth[peak])
 

@@ -72,12 +72,15 @@ class SurfaceEstimate:
         Rounds of depth and light that the result needed.
     prediction : Prediction, optional
         Of views that were left out; None if there are too few views to leave some out.
+    lit_share : float
+        Share of the samples whose light stands out of the noise.
     """
 
     inverse_depth: NDArray[np.float64]
     confidence: NDArray[np.float32]
     rounds: int
     prediction: Prediction | None
+    lit_share: float
 
 
 def estimate_surface(views: PinholeViews, inverse_depths: NDArray[np.float64]) -> SurfaceEstimate:
@@ -108,9 +111,10 @@ def estimate_surface(views: PinholeViews, inverse_depths: NDArray[np.float64]) -
     index, costs = next_depths(final, final.explained(candidates[best]))
     sure = confidence(index, costs, inverse_depths, explained_share(final, index))
     depths = np.interp(index, np.arange(len(inverse_depths)), inverse_depths)
-    doubtful = (index <= 1) | (index >= len(inverse_depths) - 2) | ~lit_samples(views, depths)
+    lit = lit_samples(views, depths)
+    doubtful = (index <= 1) | (index >= len(inverse_depths) - 2) | ~lit
     sure[doubtful] = np.minimum(sure[doubtful], _DOUBTFUL)
-    return SurfaceEstimate(depths, sure, best + 1, prediction)
+    return SurfaceEstimate(depths, sure, best + 1, prediction, float(lit.mean()))
 
 
 def _errors(evidence: DepthEvidence, known: Explained, views: NDArray[np.intp]) -> NDArray[np.float32]:

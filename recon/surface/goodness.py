@@ -107,7 +107,7 @@ def squared_errors(evidence: DepthEvidence, expected: Image, views: NDArray[np.i
         blurred_mean(np.where(there, picture, 0), there.astype(np.float32), _LEVEL_SCALE)
         for picture, there in zip(light_e, known, strict=True)
     ]
-    variance = np.maximum(np.stack(levels_e), 0) + np.float32(evidence.views.variance_e2)
+    variance = evidence.views.pixel_variance(np.stack(levels_e))
     errors = np.where(known, light_e - expected, 0)
     return np.asarray(np.square(errors) / np.maximum(variance, np.float32(1e-6)), np.float32)
 

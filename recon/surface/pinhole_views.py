@@ -35,6 +35,8 @@ class PinholeViews:
         The samples of the surface at unit depth.
     nodes : int array (view, 2)
         Row and column of each view in the grid of nodes.
+    response, noise_share : float32 array (row, column) or float
+        The response that the light was divided by, and the share of a pixel's variance that resampling has left.
     """
 
     light_e: NDArray[np.float32]
@@ -44,6 +46,13 @@ class PinholeViews:
     centre_px: tuple[float, float]
     grid: PlaneGrid
     nodes: NDArray[np.intp]
+    response: NDArray[np.float32] | float = 1.0
+    noise_share: NDArray[np.float32] | float = 1.0
+
+    def pixel_variance(self, light_e: Image) -> NDArray[np.float32]:
+        """Return the variance of pixels of the given light ([view,] row, column)."""
+        counted = (np.maximum(light_e, 0) + np.float32(self.variance_e2) / self.response) / self.response
+        return np.asarray(counted * self.noise_share, np.float32)
 
     def rays(self) -> NDArray[np.float32]:
         """Return the direction of each pixel (row, column, 2), x, y at unit depth."""
@@ -71,9 +80,15 @@ class PinholeViews:
         light = np.stack([binned(picture, bins) for picture in self.light_e]) * np.float32(bins**2)
         light[light < _SURELY_UNKNOWN] = UNKNOWN
         (fx, fy), (cx, cy) = self.focal_px, self.centre_px
+        response, share = (
+            binned(np.broadcast_to(n, self.light_e.shape[1:]), bins) for n in (self.response, self.noise_share)
+        )
         return replace(
             self,
             light_e=light,
+            response=response,
+            # Neighbours that share pixels add up to more
+            noise_share=np.asarray((1 - (1 - np.sqrt(share)) / bins) ** 2, np.float32),
             variance_e2=self.variance_e2 * bins**2,
             focal_px=(fx / bins, fy / bins),
             centre_px=((cx + 0.5) / bins - 0.5, (cy + 0.5) / bins - 0.5),

@@ -99,4 +99,4 @@ def found_at_once(views: PinholeViews) -> SurfaceEstimate:
     """Return one depth everywhere, with one probability."""
     shape = views.grid.shape
     depths, confidence = np.full(shape, 1 / FOUND_MM), np.full(shape, FOUND_CONFIDENCE, np.float32)
-    return SurfaceEstimate(depths, confidence, rounds=2, prediction=None)
+    return SurfaceEstimate(depths, confidence, rounds=2, prediction=None, lit_share=1.0)

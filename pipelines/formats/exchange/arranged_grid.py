@@ -239,7 +239,7 @@ def _print_table(grid: ImageGrid, record: Arrangement, inspection: GridInspectio
         order = f"not as in the names: {options}" if options else "as in the names: right and down"
         lines["order"] = f"{order} ({sources[record.told_by]})"
         least, largest = record.disparity_range_px
-        lines["disparities"] = f"{least:.2f} … {largest:.2f} px from node to node"
+        lines["disparities"] = f"{least:.2f} … {largest:.2f} px from node to node, with a margin"
         plane = "on a plane in the scene" if least <= 0 else "on a plane nearer than all that is seen"
         lines["aligned"] = {None: "not known", False: "no", True: plane}[record.aligned]
         if record.pitch_ratio != 1.0:

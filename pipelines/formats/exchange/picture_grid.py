@@ -86,7 +86,13 @@ def import_pictures(src: Path, out: Path, options: GridOptions) -> ImportedGrid:
             size_px=(width, height),
             aligned=bool(disparity_px),
         )
+        stated = disparity_px is not None
         pitch_mm, fx_px, at_infinity_px, in_mm = _scale(arrangement, float(width), pitch_mm, fx_px, disparity_px or 0.0)
+        if in_mm and arrangement.aligned is None and arrangement.disparity_range_px is not None and not stated:
+            inform(
+                "warning: the pictures do not tell whether they are aligned on a plane in the scene; depths in mm hold "
+                "only if they are not: give --disparity-px, 0 if they are not aligned"
+            )
         lens = Lens((width, height), fx_px, fx_px, (width - 1) / 2, (height - 1) / 2)
         write_imported_set(
             out,

@@ -217,7 +217,8 @@ class BestFocusRecord(Struct, frozen=True):
     """Search by `--depth-mm auto` for depths of best focus.
 
     `p_value` is the share of `shuffles`, views exchanged between their places, whose views agree at least as well, and
-    `z_shuffled` by how many of their standard deviations the stated places are better.
+    `z_shuffled` by how many of their standard deviations the stated places are better. `sure_of_lit` is the share of
+    the samples with light whose depth is sure.
     """
 
     depth_mm: list[float]
@@ -225,6 +226,7 @@ class BestFocusRecord(Struct, frozen=True):
     depths_per_search: int
     bins_px: int
     share_of_sure: list[float]
+    sure_of_lit: float | UnsetType = UNSET
     p_value: float | UnsetType = UNSET
     z_shuffled: float | UnsetType = UNSET
     shuffles: int | UnsetType = UNSET
@@ -245,6 +247,7 @@ class DepthMapRecord(Struct, frozen=True):
     sure_share: float
     median: float | None = None
     share_of_sure: list[float] | UnsetType = UNSET
+    sure_of_lit: float | UnsetType = UNSET
 
     @property
     def files(self) -> list[str]:

@@ -31,9 +31,13 @@ from faintfield.pipelines.formats.results.records import (
 
 SURFACE_FILE = "surface.json"
 
-# Mean deviance beyond which a surface does not explain its views: simulated ones with right poses and depths stay
-# below 7 up to an SNR of 1000 (docs/surface.md).
-MAX_DEVIANCE = 10.0
+# Largest share of what changes from view to view that a surface may leave unexplained: simulated ones with right poses
+# and range leave at most 0.44 at any light, with poses off by 3 mm and 15 mrad at least 0.76, outside the range more
+# than 1 (docs/surface.md). The share is known if the changes raise the deviance by at least the second number.
+MAX_UNEXPLAINED, _MIN_CHANGES = 2 / 3, 0.2
+
+# Mean deviance of a surface above which nothing vouches for it, without neighbours to compare with.
+_MAX_DEVIANCE = 10.0
 
 # Share of sure depths below which 0 % is shown.
 _MIN_SURE_SHARE = 0.005
@@ -66,7 +70,7 @@ class HeldOutRecord(Struct, frozen=True, kw_only=True):
 
     `surface`, `planes` and `neighbours` are the mean deviances per pixel of the prediction by the surface; by the same
     depths on a few planes; and by the mean of each view's neighbours, blurred. Smaller is better; a perfect prediction
-    has about 1. `standard_error` is that of the difference between `planes` and `surface`.
+    has 1. `standard_error` is that of the difference between `planes` and `surface`.
     """
 
     views: list[Count]
@@ -75,6 +79,17 @@ class HeldOutRecord(Struct, frozen=True, kw_only=True):
     planes: float | None = None
     standard_error: float | UnsetType = UNSET
     neighbours: float | None = None
+
+    @property
+    def unexplained_share(self) -> float | None:
+        """Share of what changes from view to view, beyond noise, that the surface does not explain; None in the dark.
+
+        A view differs from its neighbours by what changes. The share does not depend on the light; in bright light the
+        errors of any model exceed the noise.
+        """
+        if self.neighbours is None or self.neighbours < 1 + _MIN_CHANGES:
+            return None
+        return max(self.surface - 1, 0) / (self.neighbours - 1)
 
 
 class SurfaceChannel(Struct, frozen=True, kw_only=True):
@@ -99,7 +114,8 @@ class SurfaceFacts(Struct, frozen=True, kw_only=True):
     `searched` are the nearest and farthest depth that were considered, in `unit`; `range_found` says that they were
     found in the views. `depths` were compared, first in bins of `bins_px` detector pixels. Depth and picture were
     estimated in turn in `rounds`. `sure_above` is the probability from which on a depth counts as sure, and
-    `share_of_sure` the shares of the sure samples at the depths that stand out, as of `BestFocusRecord`.
+    `share_of_sure` the shares of the sure samples at the depths that stand out, as of `BestFocusRecord`;
+    `sure_of_lit` is the share of the samples with light whose depth is sure.
     """
 
     unit: Literal["mm", "px", "relative"]
@@ -111,6 +127,7 @@ class SurfaceFacts(Struct, frozen=True, kw_only=True):
     sure_above: Share
     held_out: HeldOutRecord | None = None
     share_of_sure: list[float] | UnsetType = UNSET
+    sure_of_lit: Share | UnsetType = UNSET
     channels: Annotated[list[SurfaceChannel], Meta(min_length=1)]
     wall_time_s: float
 
@@ -120,7 +137,7 @@ class SurfaceRecord(SurfaceFacts, frozen=True, kw_only=True):
 
     Files of light, of depth in `unit` (NaN where it is not known), and of their standard deviations; `picture_proposal`
     is what the prior proposed, `picture_moved` how far the data moved the picture from it. `depth_confidence` is the
-    probability that the depth is right within 2 %, `visibility` the number of views that see a sample, `points` the
+    probability that the depth is right within 2 %, `visibility` the pixels that see a sample, `points` the
     samples of known depth as a point cloud, None in px, and `film` the picture from viewpoints between the nodes.
     `known_share` and `sure_share` are shares of the samples, `median` is that of the known depths.
     """
@@ -146,17 +163,23 @@ class SurfaceRecord(SurfaceFacts, frozen=True, kw_only=True):
         if self.held_out is None:
             return None
         deviance, neighbours = self.held_out.surface, self.held_out.neighbours
-        if deviance > MAX_DEVIANCE:
-            what = (
-                f"This surface does not explain its views: those that were left out differ from its prediction by "
-                f"{deviance**0.5:.2g} times their noise (mean deviance {deviance:.4g}, 1 is perfect). Trust neither "
-                "its picture nor its depths"
-            )
-        elif neighbours is not None and deviance > neighbours:
+        unexplained = self.held_out.unexplained_share
+        if neighbours is not None and deviance > neighbours:
             what = (
                 f"The views do not show the depths of this surface: those that were left out are predicted better by "
                 f"their neighbours, without any depth (mean deviance {deviance:.4g} against {neighbours:.4g}). Do not "
                 "trust them"
+            )
+        elif unexplained is not None and unexplained > MAX_UNEXPLAINED:
+            what = (
+                f"This surface does not explain its views: in those that were left out, its prediction misses "
+                f"{unexplained:.0%} of what changes from view to view (mean deviance {deviance:.4g}, their neighbours' "
+                f"{neighbours:.4g}, 1 is perfect). Trust neither its picture nor its depths"
+            )
+        elif neighbours is None and deviance > _MAX_DEVIANCE:
+            what = (
+                f"Nothing vouches for this surface: the views that were left out differ from its prediction by "
+                f"{deviance**0.5:.2g} times their noise, and have no neighbours to compare with"
             )
         else:
             return None

@@ -175,6 +175,10 @@ class ElementalSet:
         """Return several depths in words, in the unit of the set: "500, 700 mm", "disparities -3.25, 0.5 px"."""
         return self.units.depths_text([self.stated_depth(depth) for depth in depths_mm], join)
 
+    def range_text(self, near_mm: float, far_mm: float) -> str:
+        """Return a range of depths in words, in the unit of the set: "180 mm and infinity"."""
+        return self.units.range_text(self.stated_depth(near_mm), self.stated_depth(far_mm))
+
     def inverse_depth_of_disparity(self) -> tuple[float, float]:
         """Return 1/depth in 1/mm of the disparity zero, and by how much it grows with each px of disparity."""
         steps, shift_px = self._steps_and_shifts()

@@ -13,7 +13,7 @@ from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, rounde
 from faintfield.pipelines.reconstruction.depth.comparison import BinnedViews, binned_views, check_places
 from faintfield.pipelines.reconstruction.depth.shared_range import overlap
 from faintfield.recon.depth.agreement import Agreement, DepthEstimate, Significance, depth_map
-from faintfield.recon.depth.focus import MIN_SAMPLES, SURE, likeliest_depth_mm, places_of_focus
+from faintfield.recon.depth.focus import MIN_SAMPLES, SURE, likeliest_depth_mm, places_of_focus, sure_of_lit
 from faintfield.recon.errors import NothingInFocus
 
 # Depths of a search, and searches, each in the range in which the last found anything.
@@ -67,8 +67,17 @@ def best_focus(elemental_set: ElementalSet, out: Path, range_mm: tuple[float, fl
         raise _nothing(elemental_set, ranges[0])
     searched_mm = _searched_depths(ranges[-1])
     by_depth = _merged(planes, searched_mm, found, places)
+    arrangement = elemental_set.settings.arrangement
+    if arrangement is not None and arrangement.aligned is None and max(by_depth) >= far_mm:
+        del by_depth[max(by_depth)]
+        inform(
+            "warning: the views agree at infinity, where pictures that are aligned on a plane show this plane; its "
+            "depth is left out: import the pictures again with --disparity-px"
+        )
+        if not by_depth:
+            raise _nothing(elemental_set, ranges[0])
     depths = sorted({rounded_depth(elemental_set, depth) for depth in by_depth})
-    between = elemental_set.depths_text(near_mm, far_mm, join=" and ")
+    between = elemental_set.range_text(near_mm, far_mm)
     inform(f"planes of best focus between {between}: {elemental_set.depths_text(*depths)}")
     return BestFocusRecord(
         depth_mm=depths,
@@ -76,6 +85,7 @@ def best_focus(elemental_set: ElementalSet, out: Path, range_mm: tuple[float, fl
         depths_per_search=_DEPTHS,
         bins_px=bins_px,
         share_of_sure=[float(place.sum() / sure.sum()) for place in by_depth.values()],
+        sure_of_lit=sure_of_lit(found.confidence, found.lit_share),
         p_value=significance.p_value if significance else UNSET,
         z_shuffled=significance.z if significance else UNSET,
         shuffles=significance.shuffles if significance else UNSET,
@@ -222,7 +232,7 @@ def _refined(
 
 def _nothing(elemental_set: ElementalSet, range_mm: tuple[float, float]) -> NothingInFocus:
     return NothingInFocus(
-        f"between {elemental_set.depths_text(*range_mm, join=' and ')} there is no depth at which the views agree on "
+        f"between {elemental_set.range_text(*range_mm)} there is no depth at which the views agree on "
         f"at least {MIN_SAMPLES} bins of pixels that stand out of the noise; give another range by --sweep "
         "FIRST:LAST:COUNT, more light, or --depth"
     )

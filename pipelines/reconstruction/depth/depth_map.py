@@ -17,6 +17,7 @@ from faintfield.pipelines.formats.results.records import DEPTH_MAP_FILE, DepthMa
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, unit_of_maps
 from faintfield.pipelines.reconstruction.depth.scene_structure import shares_of_depths
 from faintfield.pipelines.reconstruction.depth.search import DepthSearch, in_unit
+from faintfield.recon.depth.focus import sure_of_lit
 from faintfield.recon.surface.confidence import SURE
 
 # The file of the depths by their unit.
@@ -107,6 +108,7 @@ def _maps(
         sure_share=float(known.mean()),
         median=float(np.median(values[known])) if known.any() else None,
         share_of_sure=shares_of_depths(search),
+        sure_of_lit=sure_of_lit(confidence, search.estimate.lit_share),
     )
     values = np.where(known, values, np.nan)
     label = "disparity (px)" if unit == "px" else f"depth ({unit})"

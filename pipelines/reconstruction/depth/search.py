@@ -97,6 +97,8 @@ def luminance(elemental_set: ElementalSet, bins: int) -> PinholeViews:
         ((camera.cx_px + 0.5) / bins - 0.5, (camera.cy_px + 0.5) / bins - 0.5),
         between_pixels(plane_grid(elemental_set, 1.0).binned(bins)),
         _nodes(elemental_set),
+        _mean_response(responses, undistorted),
+        _noise_share(undistorted),
     )
 
 
@@ -143,6 +145,23 @@ def _resampled(
     values = cv2.remap(np.where(unknown, 0, light), *places, cv2.INTER_LINEAR)
     known = cv2.remap((~unknown).astype(np.float32), *places, cv2.INTER_LINEAR)
     return np.where(known > 0.999, values, UNKNOWN).astype(np.float32)
+
+
+def _mean_response(
+    responses: list[NDArray[np.float32]], places: tuple[NDArray[np.float32], NDArray[np.float32]] | None
+) -> NDArray[np.float32]:
+    """Return the mean response of the lattices (row, column), 1 where none has one."""
+    mean = np.asarray(np.mean(responses, axis=0), np.float32)
+    mean = np.where(mean > 0, mean, np.float32(1))
+    return mean if places is None else cv2.remap(mean, *places, cv2.INTER_LINEAR, borderValue=1.0).astype(np.float32)
+
+
+def _noise_share(places: tuple[NDArray[np.float32], NDArray[np.float32]] | None) -> NDArray[np.float32] | float:
+    """Return the share of independent noise's variance (row, column) left between bins: the sum of squared weights."""
+    if places is None:
+        return 1.0
+    right, down = (place - np.floor(place) for place in places)
+    return np.asarray((right**2 + (1 - right) ** 2) * (down**2 + (1 - down) ** 2), np.float32)
 
 
 def check_views(elemental_set: ElementalSet, purpose: str) -> None:

@@ -59,7 +59,7 @@ class SurfaceMaps:
     `grid` are the samples' directions, x/z and y/z. The picture, its `picture_sigma` and `picture_proposal` are in the
     unit of light of the set, `picture_moved` in standard deviations of the noise. `depth` and `depth_sigma` are in the
     unit of the record, NaN where the depth is not known, and `depth_confidence` is the probability that it is right
-    within 2 %. `visibility` counts the views that see each sample. The film is rendered from `inverse_depth`, 1/mm
+    within 2 %. `visibility` counts the pixels that see each sample. The film is rendered from `inverse_depth`, 1/mm
     everywhere, and `aperture_mm`, see `parallax.aperture_of`.
     """
 
@@ -148,7 +148,7 @@ def _named_maps(
     yield record.depth_confidence, confidence, map_picture(confidence, f"probability of the {what}", 0.0, 1.0)
     visibility = maps.visibility.astype(np.float32)
     most = max(float(np.nanmax(visibility, initial=1.0)), 1.0)
-    yield record.visibility, visibility, map_picture(visibility, "views that see it", 0.0, most)
+    yield record.visibility, visibility, map_picture(visibility, "pixels that see it", 0.0, most)
 
 
 def _colour_map(values: NDArray[np.floating], label: str) -> bytes:

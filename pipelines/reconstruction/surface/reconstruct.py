@@ -49,6 +49,7 @@ from faintfield.pipelines.reconstruction.planes.saturation import PixelSelection
 from faintfield.pipelines.reconstruction.surface.files import SurfaceMaps, write_surface
 from faintfield.pipelines.reconstruction.surface.parallax import aperture_of
 from faintfield.pipelines.reconstruction.surface.request import SurfaceRequest
+from faintfield.recon.depth.focus import sure_of_lit
 from faintfield.recon.operator.surface_operator import SurfaceOperator
 from faintfield.recon.prior.collaborative import refined
 from faintfield.recon.solver.data_fit import SceneProblem
@@ -119,6 +120,7 @@ def reconstruct_surface(
         sure_above=SURE,
         held_out=held_out,
         share_of_sure=shares_of_depths(search),
+        sure_of_lit=sure_of_lit(search.estimate.confidence, search.estimate.lit_share),
         channels=[in_units(elemental_set, _channel(name, light)) for name, light in lights.items()],
         wall_time_s=time.monotonic() - started,
     )
@@ -177,8 +179,9 @@ def _light(
 
 
 def _visibility(operator: SurfaceOperator, layout: ChannelLayout) -> NDArray[np.floating]:
-    """Return the number of views that see each sample: pixels count alike, whatever their response.
+    """Return the sum of the weights of all pixels that see each sample, whatever their response.
 
+    It is about one for each view that sees the sample, and more where the pixels of a view lie closer than the samples.
     A view has fewer pixels than samples in a colour of a mosaic.
     """
     response = operator.response()

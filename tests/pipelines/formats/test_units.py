@@ -79,6 +79,12 @@ def test_key_of_a_user_is_kept() -> None:
     assert json.loads(json_of(odd))["inputs"] == {"mean_e": "0" * 64}
 
 
+def test_range_to_infinity_is_said_in_words() -> None:
+    assert StatedUnits().range_text(179.677, 1.79677e6) == "180 mm and infinity"
+    assert StatedUnits().range_text(400, 900) == "400 and 900 mm"
+    assert StatedUnits(depth="disparity_px").range_text(-3.5, 0.8) == "disparities -3.5 and 0.8 px"
+
+
 def test_negative_depth_is_read_as_disparity_only() -> None:
     content = (GOLDEN / "plane_pmlem.json").read_bytes().replace(b'"depth_mm": 500.0', b'"depth_mm": -500.0')
     with pytest.raises(msgspec.ValidationError, match="a depth is below"):

@@ -343,10 +343,14 @@ def test_what_is_not_there_is_not_shown(surface: Path, done: Command) -> None:
 
 @pytest.mark.parametrize(
     ("deviance", "neighbours", "says"),
-    [(2045.3, 3000.0, "differ from its prediction by 45 times their noise"), (0.9, 0.8, "better by their neighbours")],
+    [
+        (2045.3, 3000.0, "misses 68% of what changes from view to view"),
+        (0.9, 0.8, "better by their neighbours"),
+        (2045.3, None, "45 times their noise, and have no neighbours"),
+    ],
 )
 def test_unexplained_surface_says_so_first(
-    deviance: float, neighbours: float, says: str, surface: Path, done: Command
+    deviance: float, neighbours: float | None, says: str, surface: Path, done: Command
 ) -> None:
     record = read_record(surface, "surface.json")
     record["surface"]["held_out"] |= {"surface": deviance, "planes": 1.01 * deviance, "neighbours": neighbours}
@@ -359,6 +363,18 @@ def test_unexplained_surface_says_so_first(
     assert "sharp everywhere" not in page
     assert "explain what other cameras see" not in section
     assert "fits it" not in page
+
+
+@pytest.mark.parametrize(("deviance", "neighbours"), [(1.16, 1.31), (14.8, 318), (968.8, 2140)])
+def test_bright_light_alone_warns_of_nothing(deviance: float, neighbours: float, surface: Path, done: Command) -> None:
+    """In bright light the error of a right surface is many times the noise, and a small share of the changes."""
+    record = read_record(surface, "surface.json")
+    record["surface"]["held_out"] |= {"surface": deviance, "planes": 1.3 * deviance, "neighbours": neighbours}
+    write_by_hand(surface / "surface.json", record)
+    _section(surface, done)
+    page = (surface / "report.html").read_text()
+    assert 'class="banner"' not in page
+    assert f"explains {100 - 100 * (deviance - 1) / (neighbours - 1):.0f} % of what changes" in page
 
 
 def test_overlarge_picture_is_refused(surface: Path, faintfield: Command, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -34,10 +34,10 @@ def test_parabola_has_focus_at_its_vertex() -> None:
     assert sharp_depths_mm(depths[order].tolist(), curve(heights[order])) == pytest.approx([481.0])
 
 
-def test_peak_at_an_end_lies_there() -> None:
+def test_end_of_curve_is_no_peak() -> None:
     assert sharp_depths_mm([400.0, 500.0], curve(np.array([1.0, 2.0]))) == []
-    assert sharp_depths_mm([400.0, 500.0, 600.0], curve(np.array([1.0, 2.0, 5.0]))) == [600.0]
-    assert sharp_depths_mm([400.0, 500.0, 600.0], curve(np.array([5.0, 2.0, 1.0]))) == [400.0]
+    assert sharp_depths_mm([400.0, 500.0, 600.0], curve(np.array([1.0, 2.0, 5.0]))) == []
+    assert sharp_depths_mm([400.0, 500.0, 600.0], curve(np.array([5.0, 2.0, 1.0]))) == []
 
 
 @pytest.mark.parametrize(("height", "sigma_e2", "peaks"), [(1, 0.19, 2), (1, 0.21, 1), (0.6, 1e-6, 2), (0.4, 1e-6, 1)])

@@ -127,6 +127,17 @@ def test_deviance_of_the_truth_is_one(scale: float) -> None:
     assert result == pytest.approx(mean, abs=0.04)  # 4σ of 24 000 pixels
 
 
+def test_deviance_counts_response_and_resampling() -> None:
+    """Light between pixels, divided by a response: the truth still has a deviance of one."""
+    generator, truth, response = np.random.default_rng(5), 30.0, np.linspace(0.4, 1, SHAPE[1], dtype=np.float32)
+    counted = generator.normal(truth * response, np.sqrt(truth * response + 9), (25, SHAPE[0], SHAPE[1])) / response
+    between = 0.7 * counted + 0.3 * np.roll(counted, 1, axis=1)
+    views = replace(surface_scene.views_of(between), variance_e2=9.0, noise_share=0.7**2 + 0.3**2)
+    views = replace(views, response=np.broadcast_to(response, SHAPE))
+    result = squared_errors(_evidence(views), np.full((len(LEFT_OUT), *SHAPE), truth, np.float32), LEFT_OUT).mean()
+    assert result == pytest.approx(1, abs=0.04)  # 4σ of 24 000 pixels
+
+
 def test_only_pixels_between_samples_are_compared() -> None:
     """The outermost samples see no pixel beyond them: to expect one black there would decide all comparisons."""
     light = surface_scene.drawn_views(LEVEL_E).light_e.copy()

@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from faintfield.pipelines.formats.sets.elemental_file import Arrangement
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.depth.autofocus import best_focus, searched_range_mm
 from faintfield.pipelines.reconstruction.depth.comparison import BinnedViews, _shuffles, binned_views, check_places
@@ -53,6 +55,15 @@ def test_depths_up_to_infinity_are_found(scene: Path, tmp_path: Path) -> None:
     assert (focus.p_value, focus.shuffles) == (0.002, 499)
     assert focus.z_shuffled is not None
     _check_disparities(-1000 / np.array(focus.depth_mm))  # 100 px of focal length, nodes 10 mm apart
+
+
+def test_infinity_is_left_out_where_alignment_is_unknown(scene: Path, tmp_path: Path) -> None:
+    """Disparities of zero are those of infinity or of the plane on which the pictures are aligned."""
+    elemental_set = load_set(scene)
+    arrangement = Arrangement(disparity_range_px=(-4.4, 0.1), aligned=None)
+    settings = msgspec.structs.replace(elemental_set.settings, arrangement=arrangement)
+    depths = best_focus(replace(elemental_set, settings=settings), tmp_path).depth_mm
+    np.testing.assert_allclose(-1000 / np.array(depths), [-4.0, -2.5], atol=0.1)
 
 
 def test_depths_stand_apart_in_spite_of_misfit(tmp_path: Path) -> None:

@@ -85,6 +85,19 @@ def test_point_lands_where_pinhole_camera_sees_it(ray: tuple[float, float], bins
     np.testing.assert_allclose(views.pixel_from_surface[0] @ [*ray, 1, 0], [*expected, 1], rtol=1e-5)
 
 
+def test_variance_counts_response_and_resampling(make_set: SetMaker) -> None:
+    """The noise of light that the lens darkens and distorts: as drawn, on average over the picture."""
+    generator, response = np.random.default_rng(3), np.linspace(0.4, 1, 64, dtype=np.float32) * np.ones((48, 1))
+    frames = [np.rint(100 + 2 * (generator.poisson(80 * response) + generator.normal(0, 3, (48, 64)))) for _ in "1234"]
+    noise = {"offset_dn": 100.0, "gain_dn_per_e": 2.0, "read_noise_e": 3.0}
+    camera = LENS | {"distortion": [-0.25], "flat": "flat.tiff"}
+    folder = make_set([frame.astype(np.uint16) for frame in frames], noise=noise, camera=camera)
+    tifffile.imwrite(folder / "flat.tiff", response.astype(np.float32))
+    views = luminance(load_set(folder), 1)
+    squares = np.square(views.light_e - 80) / views.pixel_variance(np.full((48, 64), 80.0))
+    assert squares[views.light_e != UNKNOWN].mean() == pytest.approx(1, abs=0.06)  # 4σ of 12 000 pixels
+
+
 def test_beyond_picture_and_beside_unknown_is_unknown(make_set: SetMaker) -> None:
     folder = make_set([np.full((48, 64), 900, np.uint16)], camera=LENS | {"distortion": [0.3]})
     light = luminance(load_set(folder), 1).light_e[0]
