@@ -22,6 +22,10 @@ _WINDOW, _DETAIL = 6.0, 6.0
 # Log-likelihood that chance may add to both, in a window.
 _CHANCE = 100.0
 
+# Squared errors that the light of a right surface may have, as a share of the variance. With less, few depths are sure
+# in the dark; with more, wrong poses are trusted.
+_LIGHT_ERROR = 0.1
+
 # Number of planes that stand for a surface, each a share of its samples.
 _PLANES = 4
 
@@ -50,9 +54,10 @@ def explained_share(evidence: DepthEvidence, index: Image) -> NDArray[np.float32
 
     In a window, let E be by how much the detail of the light raises the log-likelihood, as far as the two halves of
     the views agree on it, and X by how much the errors of one half, predicted by the light of the other, exceed those
-    of the noise. Returned is `(E + c) / (E + X + c)`, with c for chance in both. It is small where something shines, is
-    seen through or repeats itself, because no light of one surface then fits all views. It is near 1 where little is
-    seen at all. `index` (row, column) is the surface, as fractional index of the depths.
+    of the noise and a share of it for errors of the light. Returned is `(E + c) / (E + X + c)`, with c for chance in
+    both. It is small where something shines, is seen through or repeats itself, because no light of one surface then
+    fits all views. It is near 1 where little is seen at all. `index` (row, column) is the surface, as fractional index
+    of the depths.
     """
     known = evidence.explained(index)
     views = np.sum([known.operator.sensitivity(half) for half in evidence.halves], axis=0)
@@ -61,7 +66,7 @@ def explained_share(evidence: DepthEvidence, index: Image) -> NDArray[np.float32
     excess = np.zeros_like(evidence.views.light_e)
     for half, light in zip(evidence.halves, reversed(known.lights), strict=True):
         errors = squared_errors(evidence, known.operator.forward(light, half), half)
-        excess[half] = np.where(seen_of(evidence, known, half), 0.5 * (errors - 1), 0)
+        excess[half] = np.where(seen_of(evidence, known, half), 0.5 * (errors - 1 - _LIGHT_ERROR), 0)
     misfit = np.asarray(known.operator.adjoint(excess), np.float32)
     e, x = (np.maximum(gaussian(part, _WINDOW) * np.float32(4 * np.pi * _WINDOW**2), 0) for part in (explained, misfit))
     return np.asarray((e + _CHANCE) / (e + x + _CHANCE), np.float32)
