@@ -21,7 +21,7 @@ help: ## list the tasks
 
 # Capturing needs one core and no kernel: meanwhile the other compiles them.
 demo: $(VENV)/installed ## the whole experiment, simulated; the last line is the path of its report
-	@$(MAKE) --no-print-directory $(VENV)/compiled & $(BIN)/faintfield demo $(OUT); made=$$?; wait; exit $$made
+	@$(MAKE) -s $(VENV)/compiled & $(BIN)/faintfield demo $(OUT); made=$$?; wait; exit $$made
 
 test: $(VENV)/compiled-float64 ## the quick tests, on two cores
 	@TIMEFORMAT='$(TIMEFORMAT)'; time $(PYTEST)

@@ -269,11 +269,12 @@ def _weight_curves(planes: Sequence[Plane]) -> str | None:
         held_out = np.array([score.held_out for score in curve])
         of_colour = "" if channel == "grey" else f", {channel}"
         label = f"{name}{of_colour}" if few else f"{len(planes)} planes{of_colour}"
-        look: dict[str, Any] = {"label": None if label in labels else label}
+        title = None if label in labels else label
         colour, marker = _LINES[labels.setdefault(label, len(labels)) % len(_LINES)]
         colour = colour if few else _OF_CHANNELS.get(channel, colour)
-        look |= {"marker": marker, "markersize": 4} if few else {"linewidth": 0.8}
-        axes.plot([score.weight for score in curve], held_out - held_out.min(), color=colour, **look)
+        style, width = (marker, 1.5) if few else ("", 0.8)
+        weights = [score.weight for score in curve]
+        axes.plot(weights, held_out - held_out.min(), "-", marker=style, ms=4, lw=width, color=colour, label=title)
         if record.penalty_weight is not None:
             axes.axvline(record.penalty_weight, color=colour, linewidth=1, linestyle="--")
     axes.set_xscale("log")

@@ -285,11 +285,15 @@ def test_keyboard_reads_sample_aloud(page: Tab, report: Path) -> None:
 def _page_of(numbers: NDArray[np.float32], folder: Path, **more: object) -> str:
     """Return the address of a page with the viewer alone, of one plane (row, column, colour)."""
     packed = pack(numbers, 1e-3)
-    picture: dict[str, Any] = {"kind": "light", "title": "PMLEM", "label": "500 mm", "place": 0, "unit": "e⁻ per pixel"}
-    picture |= {"low": packed.low, "step": packed.step, "bins": 1, "pitch": 0.5, "origin": (-10.0, 20.0)}
-    shown: dict[str, Any] = {"pictures": [{**picture, **more, "src": smaller_uri(packed.png)}], "places": ["500 mm"]}
-    shown |= {"scales": {"light": {"black": 0.0, "white": 2.0, "name": "planes"}}}
-    shown |= {"quantity": "depth", "length": "mm", "binned": False, "first": (0, 0)}
+    picture = {
+        **{"kind": "light", "title": "PMLEM", "label": "500 mm", "place": 0, "unit": "e⁻ per pixel"},
+        **{"low": packed.low, "step": packed.step, "bins": 1, "pitch": 0.5, "origin": (-10.0, 20.0)},
+        **{"src": smaller_uri(packed.png), **more},
+    }
+    shown = {
+        **{"pictures": [picture], "places": ["500 mm"], "quantity": "depth", "length": "mm"},
+        **{"scales": {"light": {"black": 0.0, "white": 2.0, "name": "planes"}}, "binned": False, "first": (0, 0)},
+    }
     templates = Path(pages.__path__[0]) / "templates"
     script, style = ((templates / name).read_text() for name in ("viewer.js", "viewer.css"))
     (folder / "alone.html").write_text(

@@ -134,6 +134,8 @@ def test_noise_of_bright_set_that_stays_is_told(make_set: SetMaker, tmp_path: Pa
 def test_dim_light_without_noise_is_darkened(tmp_path: Path, done: Command) -> None:
     done("simulate", tmp_path / "scene", *SMALL)
     done("darken", tmp_path / "scene" / "noise_free", tmp_path / "dark")
+    light, dark = (load_set(folder) for folder in (tmp_path / "scene" / "noise_free", tmp_path / "dark"))
+    assert len(dark.image_paths) == len(light.image_paths)
 
 
 def test_colour_stays_colour(make_set: SetMaker, tmp_path: Path, done: Command) -> None:
