@@ -90,12 +90,12 @@ def write_report(directory: Path, *, noise: Path | None = None, geometry: Path |
         values = ", ".join(figure(row.mse_texture) for row in best)
         depths = format_depths(units, *(row.depth_mm for row in best))
         facts.append(Fact("Mean square error", values, f"against the object, 0…1, at {depths}"))
-    of_planes = [plane for result in results.values() for plane in result.planes]
-    of_surfaces = [channel for record in surfaces.values() for channel in record.surface.channels]
+    solved_planes = [plane for result in results.values() for plane in result.planes]
+    channels = [channel for record in surfaces.values() for channel in record.surface.channels]
     page = template("report.html").render(
         title=_title(directory, results, surfaces),
         recommendation=_recommendation(results, surfaces),
-        saturation=saturation_text([*of_planes, *of_surfaces]),
+        saturation=saturation_text([*solved_planes, *channels]),
         units=units,
         facts=facts,
         sets=sets,
