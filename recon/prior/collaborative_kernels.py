@@ -142,7 +142,8 @@ def _filter_group(picture, pilot, variance, places, threshold, transform, patche
         _haar(group, size * size, count, False)
     if above.shape[0] > 1:
         kept, length = patches[3], size * size * count
-        kept[:length] = y[:length]
+        for k in range(length):  # not `kept[:length] = y[:length]`, which takes seconds to compile
+            kept[k] = y[k]
         left = _keep_large(kept, level, threshold, transform, count)
         _add_inverse(kept, scratch, places, transform, level, left, above[1], below[1])
     left = _shrink(y, u, level, transform, count)

@@ -51,7 +51,16 @@ def step_strip(
             elif front >= stop:
                 _load(below, front - stop, p[k], x[k], x_ahead[k])
             else:
-                p[k, :, 1:], x[k], x_ahead[k, :columns] = dual[:, front], plane[front], ahead[front]
+                _copy_row(
+                    dual[0, front],
+                    dual[1, front],
+                    plane[front],
+                    ahead[front],
+                    p[k, 0, 1:],
+                    p[k, 1, 1:],
+                    x[k],
+                    x_ahead[k],
+                )
             x_ahead[k, columns] = x_ahead[k, columns - 1]
         for step in range(count):
             row = front - 1 - step
@@ -71,12 +80,19 @@ def step_strip(
         row = front - count
         if first <= row < stop:
             k = row % kept
-            dual[:, row], plane[row], ahead[row] = p[k, :, 1:], x[k], x_ahead[k, :columns]
+            _copy_row(p[k, 0, 1:], p[k, 1, 1:], x[k], x_ahead[k], dual[0, row], dual[1, row], plane[row], ahead[row])
 
 
 @compiled
 def _load(rows, row, p, x, x_ahead):
-    p[0, 1:], p[1, 1:], x[:], x_ahead[: x.size] = rows[0, row], rows[1, row], rows[2, row], rows[3, row]
+    _copy_row(rows[0, row], rows[1, row], rows[2, row], rows[3, row], p[0, 1:], p[1, 1:], x, x_ahead)
+
+
+@compiled
+def _copy_row(down, right, plane, ahead, to_down, to_right, to_plane, to_ahead):
+    """Copy a row in work; `a[:] = b` would take seconds to compile, for the message that sizes differ."""
+    for j in range(to_plane.size):
+        to_down[j], to_right[j], to_plane[j], to_ahead[j] = down[j], right[j], plane[j], ahead[j]
 
 
 @compiled
