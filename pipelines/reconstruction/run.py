@@ -206,21 +206,22 @@ def _warn(elemental_set: ElementalSet, records: list[PlaneRecord]) -> None:
             f"pmlem stopped before its certificate on {len(missed)} of {len(bounds)} planes: up to {max(missed):.1%} "
             f"from the optimum instead of {bounds[0].tolerance:.0%}; allow more --passes"
         )
-    # A plane in colour has several records, and planes of several methods have one name
-    whys: dict[tuple[Method, str], str] = {}
-    for record in records:
-        if record.prior and record.prior.left_out:
-            whys[record.method, record.file] = record.prior.left_out
+    whys = [(record, record.prior.left_out) for record in records if record.prior and record.prior.left_out]
     if whys:
-        made, why = len({(record.method, record.file) for record in records}), next(iter(whys.values()))
-        inform(f"the prior is left out of {len(whys)} of {made} planes, total variation's stay: {why}")
+        without = _planes([record for record, _ in whys])
+        inform(f"the prior is left out of {without} of {_planes(records)} planes, total variation's stay: {whys[0][1]}")
     if text := saturation_text(records):
         inform(text)
     black = [record for record in records if record.mean_e <= _BLACK_E * light_per_e(elemental_set)]
     if black:
         first = elemental_set.units.depths_text([black[0].depth_mm])
         inform(
-            f"{len(black)} of {len(records)} planes are black ({black[0].method}, {first} for "
+            f"{_planes(black)} of {_planes(records)} planes are black ({black[0].method}, {first} for "
             "one): the views are no brighter than offset_dn and dark_current_e_per_s say of darkness; compare these "
             "with dark frames of the same exposure"
         )
+
+
+def _planes(records: list[PlaneRecord]) -> int:
+    """Return the number of planes: one in colour has several records, and planes of several methods have one name."""
+    return len({(record.method, record.file) for record in records})
