@@ -64,6 +64,11 @@ def check_frame(
     return Findings({name: round(value, 5) for name, value in values.items()}, _warnings(kind, values, limits, earlier))
 
 
+def mean_and_error(pixels: Pixels) -> tuple[float, float]:
+    """Return the mean of a frame, and its standard error if the pixels differ by noise alone."""
+    return float(pixels.mean(dtype=np.float64)), float(pixels.std(dtype=np.float64)) / math.sqrt(pixels.size)
+
+
 def _grey(pixels: Pixels) -> Pixels:
     return pixels if pixels.ndim == 2 else pixels.mean(axis=2)
 
