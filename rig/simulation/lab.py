@@ -57,6 +57,8 @@ _FLAT = 0.5
 
 # After a stop the carriage swings along both axes, as an undamped gantry does: amplitude, frequency, decay time.
 _SWING_MM, _SWING_HZ, _SWING_DECAY_S = 1.5, 7.0, 0.25
+# Nothing swings after this time in s.
+_AT_REST_S = 60.0
 
 # Lights of the lab that the rig may switch: two as bright as what a person turns on, the faint one, and a shutter.
 _BRIGHT, _FAINT, _SHUTTER = {"room", "board"}, "scene", "shutter"
@@ -135,7 +137,7 @@ class SimulatedLab:
     def rt_cam_ref(self, exposure_s: float) -> NDArray[np.float64]:
         """Return the true pose (6,) in the middle of an exposure that begins now, including the swing."""
         x_mm, y_mm = self.true_position()
-        after_s = self.still_s() + 0.5 * exposure_s
+        after_s = min(self.still_s(), _AT_REST_S) + 0.5 * exposure_s  # infinite before the first motion
         swing_mm = _SWING_MM * math.exp(-after_s / _SWING_DECAY_S) * math.cos(2.0 * math.pi * _SWING_HZ * after_s)
         right_mm, down_mm = x_mm + swing_mm - self.centre.x_mm, y_mm + swing_mm - self.centre.y_mm
         return _carriage_pose(self.settings, right_mm, down_mm)
