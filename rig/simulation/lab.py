@@ -257,17 +257,20 @@ class SimulatedCamera:
 
 
 class SimulatedLight:
-    """A `Light` of the lab. `broken` lets every request fail, `burnt_out` lets it report what it does not do."""
+    """A `Light` of the lab, with faults: it answers nothing (`broken`), or reports what it does not do.
+
+    That is a lamp which is `burnt_out`, or a shutter which is `stuck_open`.
+    """
 
     def __init__(self, name: str) -> None:
         self._name = name
         self._open = self._switched_on = False
-        self.broken = self.burnt_out = False
+        self.broken = self.burnt_out = self.stuck_open = False
 
     @property
     def shines(self) -> bool:
         """Return whether there is light, whatever the lamp reports."""
-        return self._switched_on and not self.burnt_out
+        return (self._switched_on or self.stuck_open) and not self.burnt_out
 
     def open(self) -> None:
         """Connect."""

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from itertools import count
 
-from faintfield.rig.errors import StageAlarm, StageLost, StageRejected, StageTimeout, WrongFirmware
+from faintfield.rig.errors import StageAlarm, StageError, StageLost, StageRejected, StageTimeout, WrongFirmware
 from faintfield.rig.stages import marlin_lines as marlin
 from faintfield.rig.stages.motion import timeout_s
 from faintfield.rig.stages.protocol import AnswerTime, AxisIndex, Box, Identity, Output, Point
@@ -107,7 +107,11 @@ class MarlinController:
             raise StageRejected(f"Marlin has no output {output.kind!r}; choose pin or fan, with its number")
 
     def force_off(self, output: Output) -> None:
-        """Switch an output off as usual."""
+        """Switch an output off, after making Marlin answer again; a restart, which also does it, is the last resort."""
+        try:
+            self.recover(0.0)
+        except StageError:
+            self.connect()
         self.switch_output(output, on=False)
 
     def read_output(self, output: Output) -> None:
