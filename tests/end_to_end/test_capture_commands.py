@@ -113,6 +113,31 @@ def test_check_moves_nothing_and_counts_frames(shell: Shell) -> None:
     assert "521 frames in 11 steps" in shell.words
 
 
+LIGHTS = """
+[[light]]
+name = "room"
+driver = "controller"
+output = "flood"
+[[light]]
+name = "lamp"
+driver = "command"
+on = ["/bin/true"]
+off = ["{off}"]
+"""
+
+
+def test_check_tries_lights_without_motion(shell: Shell) -> None:
+    shell.edit("# The steps,", LIGHTS.format(off="/bin/true") + "# The steps,")
+    assert shell.result("check", shell.rig)["lights"] == {
+        "room": "switched on and off, which it reports",
+        "lamp": "switched on and off; it reports nothing",
+    }
+    assert "light room: switched on and off" in shell.words
+    shell.edit('off = ["/bin/true"]', 'off = ["/bin/false"]')
+    assert shell.run("check", shell.rig) == 1
+    assert "LightError: light lamp: /bin/false ended with exit code 1; run it by hand" in shell.words
+
+
 def test_check_remembers_settings_of_stage(shell: Shell) -> None:
     stored = shell.rig.with_suffix(".stage.json")
     assert shell.result("check", shell.rig)["changed_settings"] == []

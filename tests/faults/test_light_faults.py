@@ -1,7 +1,6 @@
 """Faults and kills on the way of an unattended session whose lights the rig switches: no frame under wrong light."""
 
 import tempfile
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from faintfield.rig.errors import RigError
 from faintfield.rig.session.session import is_sealed
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from tests.faults.lit_laboratory import Killed, LitLab
-from tests.faults.stage_faults import Fault, faults_of
+from tests.faults.stage_faults import faults_of
 from tests.rig.stages.benches import CONTROLLERS, Controller
 
 FAULTS_PER_CAPTURE = 4
@@ -38,39 +37,38 @@ def coolant_is_switched(lab: LitLab) -> None:
         lab.bench.firmware.receive(b"\xa0")
 
 
-def light_faults(controller: Controller) -> dict[str, Callable[[LitLab], None]]:
-    """Return all that happens to a session, by name."""
-    own: dict[str, Callable[[LitLab], None]]
-    own = {"shutter fails": shutter_fails, "shutter slips": shutter_slips, "coolant switched": coolant_is_switched}
-    loud = [fault for fault in faults_of(controller) if fault.nature != "mechanics"]
-    return own | {fault.name: partial(_strike, fault) for fault in loud}
+def burn_out(lab: LitLab) -> None:
+    """Let the shutter stay closed, and report that it is open."""
+    lab.shutter.burnt_out = True
 
 
-def _strike(fault: Fault, lab: LitLab) -> None:
-    fault.strike(lab.bench)
+def draw_fault(lab: LitLab, generator: np.random.Generator, usual_s: float) -> str:
+    """Let something happen at a random time, and return it in words."""
+    stage_faults = [fault for fault in faults_of(lab.controller) if fault.nature != "mechanics"]
+    light_faults = (shutter_fails, shutter_slips, coolant_is_switched)
+    if (choice := generator.random()) < 0.15:
+        exposure = int(generator.integers(BRIGHT_EXPOSURES))
+        lab.on_exposure[exposure] = partial(burn_out, lab)
+        return f"burn_out at exposure {exposure}"
+    at_s = generator.uniform(0.0, usual_s)
+    if choice < 0.35:
+        name, strike = "kill", lab.kill
+    elif choice < 0.7:
+        light_fault = light_faults[generator.integers(len(light_faults))]
+        name, strike = light_fault.__name__, partial(light_fault, lab)
+    else:
+        stage_fault = stage_faults[generator.integers(len(stage_faults))]
+        name, strike = stage_fault.name, partial(stage_fault.strike, lab.bench)
+    lab.bench.clock.after(at_s, strike)
+    return f"{name} at {at_s:.3f} s"
 
 
 def capture_with_random_faults(controller: Controller, generator: np.random.Generator, usual_s: float) -> None:
     """Capture with faults at random times, as often as it takes, and judge the frames by the lights that shone."""
-    faults = light_faults(controller)
     # In memory if possible, since journals flush after each entry
     with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as folder:
         lab = LitLab(Path(folder) / "session", controller, resets_on_open=bool(generator.random() < 0.5))
-        story = []
-        for _ in range(FAULTS_PER_CAPTURE):
-            at_s = generator.uniform(0.0, usual_s)
-            choice = generator.random()
-            if choice < 0.2:
-                story.append(f"kill at {at_s:.3f} s")
-                lab.bench.clock.after(at_s, lab.kill)
-            elif choice < 0.4:
-                story.append(f"shutter burnt out at exposure {(at := int(generator.integers(BRIGHT_EXPOSURES)))}")
-                lab.on_exposure[at] = partial(setattr, lab.shutter, "burnt_out", True)
-            else:
-                name = list(faults)[generator.integers(len(faults))]
-                story.append(f"{name} at {at_s:.3f} s")
-                lab.bench.clock.after(at_s, partial(faults[name], lab))
-        words = ", ".join(story)
+        words = ", ".join(draw_fault(lab, generator, usual_s) for _ in range(FAULTS_PER_CAPTURE))
         for _ in range(FAULTS_PER_CAPTURE + 2):
             if is_sealed(lab.folder):
                 break
