@@ -189,6 +189,8 @@ class CapturePlan(Struct, frozen=True, forbid_unknown_fields=True):
         for step in self.steps:
             exposing_s = step.frames_per_node * sum(step.exposure_s) + step.frames_per_stop() * self.readout_s
             total_s += len(self.stops_of(step)) * (_ARRIVAL_S + self.settle_s + exposing_s)
+            if step.lights:  # a frame with all lights off, see `rig.capture.lighting`
+                total_s += sum(step.exposure_s) + len(step.exposure_s) * self.readout_s
         return total_s
 
 

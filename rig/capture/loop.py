@@ -114,9 +114,9 @@ class Capture:
     def _run_step(self, missing: list[PlannedFrame]) -> None:
         session, first = self._session, missing[0]
         frames = [frame for frame in missing if frame.step == first.step]
-        self._dialogue.show_status(first, "waiting for your answer")
-        duration_s = self._dialogue.pace.remaining_s(frames, 0)
         if needs_hand(session.plan.steps, first.step):
+            self._dialogue.show_status(first, "waiting for your answer")
+            duration_s = self._dialogue.pace.remaining_s(frames, 0)
             lit = session.plan.steps[first.step].lights is not None
             prompt = step_prompt(first, len(session.plan.steps), len(frames), duration_s, rig_lit=lit)
             if self._dialogue.ask_or_stop(prompt) == "skip":

@@ -25,7 +25,7 @@ from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.simulation.lab import SimulatedCamera, SimulatedLab, SimulatedLight
 from faintfield.rig.stages.protocol import Point
-from tests.faults.capturing import BOARD, SMALL_RIG, Operator
+from tests.faults.capturing import BOARD, DRIFTING, Operator
 from tests.faults.laboratory import ON_TARGET_MM
 from tests.rig.stages.benches import Controller
 
@@ -70,9 +70,9 @@ class LitLab:
         marlin = controller is SimulatedMarlin
         self.camera = SimulatedSettings(size_px=(16, 12), unlit_photons_per_s=4000.0)
         self.settings = replace(
-            SMALL_RIG,
+            DRIFTING,
             camera=self.camera,
-            grid=replace(SMALL_RIG.grid, origin_mm=Point(50.0, 50.0) if marlin else Point(-350.0, -350.0)),
+            grid=replace(DRIFTING.grid, origin_mm=Point(50.0, 50.0) if marlin else Point(-350.0, -350.0)),
             step=STEPS,
             board=(BOARD,),
             light=MARLIN_LIGHTS if marlin else GRBL_LIGHTS,
@@ -148,10 +148,10 @@ class _WatchingCamera(SimulatedCamera):
         super().__init__(laboratory.camera, self, lab)
         self._laboratory = laboratory
         self._bench = bench
-        self._number = 0
+        self._exposing: int | None = None
 
     def expose(self, exposure_s: float, number: int) -> Exposure:
-        self._number = number
+        self._exposing = number
         self._laboratory.seen[number] = set()
         self._laboratory.on_exposure.pop(self._laboratory.exposures, lambda: None)()
         self._laboratory.exposures += 1
@@ -161,13 +161,18 @@ class _WatchingCamera(SimulatedCamera):
         return self._bench.clock.now_s()
 
     def sleep_s(self, duration_s: float) -> None:
+        """Wait; the first time after an exposure began is that of the exposure, the second that of reading it."""
+        number, self._exposing = self._exposing, None
+        if number is None:
+            self._bench.clock.sleep_s(duration_s)
+            return
         for _ in range(math.ceil(duration_s / _LOOK_S)):
-            self._look()
+            self._look(number)
             self._bench.clock.sleep_s(_LOOK_S)
-        self._look()
+        self._look(number)
 
-    def _look(self) -> None:
+    def _look(self, number: int) -> None:
         firmware = self._bench.firmware
         moves = firmware.homing or firmware.mechanics.moving
         place = Point(math.inf, math.inf) if moves else self._bench.true_position()
-        self._laboratory.seen[self._number].add((frozenset(self._laboratory.lights_on()), place))
+        self._laboratory.seen[number].add((frozenset(self._laboratory.lights_on()), place))
