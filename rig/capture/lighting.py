@@ -14,8 +14,8 @@ from faintfield.rig.session.session import Session
 
 # Name of the mean of a frame among its checks.
 MEAN = "mean_dn"
-# A frame has less light than this share of the usual one if its lights were off.
-_DARK_SHARE = 0.25
+# A frame has less light than this share of the usual one if its lights were off. Boards may leave the field of view.
+_DARK_SHARE = 0.1
 # Light is sure that lies this many standard errors of a mean above the dark, and this many DN.
 _SURE, _SURE_DN = 8.0, 1.0
 
