@@ -3,16 +3,19 @@
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from faintfield.rig.capture.guide import Status
 from faintfield.rig.errors import CaptureStopped, LightError
 from faintfield.rig.session.journal import Journal
 from faintfield.rig.session.session import taken_frames
+from faintfield.rig.settings import DriftSettings
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
+from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.simulation.lab import TRUE_LIGHTS
 from tests.faults.capturing import Operator, events
 from tests.faults.lit_laboratory import STEPS, Killed, LitLab
-from tests.rig.stages.benches import firmware
+from tests.rig.stages.benches import firmware, on_homing
 
 
 @pytest.fixture
@@ -71,6 +74,21 @@ def test_lights_that_a_kill_left_on_are_set_anew(lab: LitLab) -> None:
     assert lab.lights_on() == {"room", "shutter"}
     assert lab.run() is None
     lab.assert_lights_and_positions()
+
+
+def test_recovery_between_frames_sets_lights_anew(tmp_path: Path) -> None:
+    lab = LitLab(tmp_path / "session", SimulatedMarlin)  # which reports no outputs
+    lab.settings = replace(lab.settings, drift=DriftSettings(every_nodes=2))
+
+    def restart(homing: int) -> None:
+        if homing == 1:
+            lab.bench.clock.after(0.5, lab.bench.firmware.restart)
+
+    lab.on_exposure[16] = lambda: on_homing(lab.bench, restart)  # of the drift check within the dark scene
+    assert lab.run() is None
+    lab.assert_lights_and_positions()
+    assert events(lab.folder, "suspect")
+    assert events(lab.folder, "light_failed") == []
 
 
 @pytest.mark.parametrize("exposure", [1, 11])
