@@ -231,6 +231,8 @@ class RigSettings(Struct, frozen=True, forbid_unknown_fields=True):
         names = [light.name for light in self.light]
         if twice := {name for name in names if names.count(name) > 1}:
             raise ValueError(f"two lights are named {min(twice)!r}; give each a name of its own")
+        if not names and any(step.lights is not None for step in self.step):
+            raise ValueError("a step has lights, but there is no [[light]]; describe what the rig switches")
         if unknown := {name for step in self.step for name in step.lights or ()}.difference(names):
             known = ", ".join(map(repr, names)) or "none"
             raise ValueError(f"step.lights has {min(unknown)!r}; the lights of [[light]] are: {known}")

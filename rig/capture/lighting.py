@@ -35,7 +35,7 @@ class Lighting:
         self._used = False
         self._recoveries = -1
         self._step: int | None = None
-        self._dark_dn: dict[float, float] = {}  # by exposure time in s, since the step began
+        self._dark_dn: dict[float, float] = {}  # by exposure time in s, of the last step with light
         self._error_dn = 0.0
 
     def open(self) -> None:
@@ -53,45 +53,46 @@ class Lighting:
         """Note that a failure may have switched lights, so that all are set again."""
         self._on = None
 
-    def prepare(self, frame: PlannedFrame, look: Callable[[float], Pixels | None]) -> None:
+    def prepare(self, frame: PlannedFrame, expose: Callable[[float], Pixels | None]) -> None:
         """Set the lights of a frame; before the first one of a step, look how dark a frame is without them.
 
-        `look` takes a frame that is not kept, given its exposure time in s, and returns None if it cannot be decoded.
+        `expose` takes a frame that is not kept, given its exposure time in s, and returns None if it cannot be decoded.
         """
-        wanted = self.of(frame)
-        if wanted is None or not self._rig.stage.trusted:  # a frame is refused then
+        lights = self.of(frame)
+        if lights is None or not self._rig.stage.trusted:  # a frame is refused then
             return
         if self._rig.stage.recoveries != self._recoveries:  # which switches the outputs of its controller off
             self._recoveries, self._on = self._rig.stage.recoveries, None
-        if wanted and frame.step != self._step:
+        if lights and frame.step != self._step:
             self._dark_dn.clear()
             self._set(frame, frozenset())
             self.verify(frame, frozenset())
             for exposure_s in self._session.plan.steps[frame.step].exposure_s:
-                if (pixels := look(exposure_s)) is not None:
+                if (pixels := expose(exposure_s)) is not None:
                     self._dark_dn[exposure_s], self._error_dn = mean_and_error(pixels)
-            self._session.journal.event("dark_level", frame=frame.number, mean_dn=list(self._dark_dn.values()))
+            exposures_s, means_dn = [*self._dark_dn], [*self._dark_dn.values()]
+            self._session.journal.event("dark_level", frame=frame.number, exposure_s=exposures_s, mean_dn=means_dn)
         self._step = frame.step
-        self._set(frame, wanted)
+        self._set(frame, lights)
 
-    def verify(self, frame: PlannedFrame, wanted: frozenset[str] | None = None) -> None:
-        """Raise `LightError` if a light reports another state than a frame, or else `wanted`, has it in."""
-        wanted = self.of(frame) if wanted is None else wanted
-        if wanted is None:
+    def verify(self, frame: PlannedFrame, lights: frozenset[str] | None = None) -> None:
+        """Raise `LightError` if a light reports another state than a frame, or else `lights`, has it in."""
+        lights = self.of(frame) if lights is None else lights
+        if lights is None:
             return
         for name, light in self._rig.lights.items():
             on = light.is_on()
-            if on is not None and on != (name in wanted):
+            if on is not None and on != (name in lights):
                 states = f"reports that it is {_state(on)}, and has to be {_state(not on)} for {frame.name}"
                 raise LightError(f"light {name}: {states}; look what switches it besides the capture")
 
     def judge(self, frame: PlannedFrame, pixels: Pixels, earlier: Sequence[Mapping[str, float]]) -> dict[str, float]:
-        """Return the mean of a frame; raise `LightError` if it shows that the lights are not those wanted.
+        """Return the mean of a frame; raise `LightError` if it shows that other lights are on.
 
         `earlier` are the values of earlier frames of the same step and exposure.
         """
-        wanted = self.of(frame)
-        if wanted is None:
+        lights = self.of(frame)
+        if lights is None:
             return {}
         mean_dn, _ = mean_and_error(pixels)
         before_dn = [values[MEAN] for values in earlier if MEAN in values]
@@ -99,7 +100,7 @@ class Lighting:
         dark_dn = self._dark_dn.get(frame.exposure_s)
         if frame.kind in DARK_KINDS:
             self._require_dark(frame, mean_dn, dark_dn if usual_dn is None else usual_dn)
-        elif wanted and dark_dn is not None:
+        elif lights and dark_dn is not None:
             self._require_light(frame, mean_dn - dark_dn, 0.0 if usual_dn is None else usual_dn - dark_dn)
         return {MEAN: round(mean_dn, 5)}
 
@@ -142,19 +143,19 @@ class Lighting:
             with suppress(RigError):
                 light.close()
 
-    def _set(self, frame: PlannedFrame, wanted: frozenset[str]) -> None:
-        if wanted == self._on:
+    def _set(self, frame: PlannedFrame, lights: frozenset[str]) -> None:
+        if lights == self._on:
             return
         known, self._on, self._used = self._on, None, True
         steady_s = {light.name: light.steady_s for light in self._session.rig.light}
-        ended = self._rig.lights.keys() if known is None else known - wanted
-        begun = wanted if known is None else wanted - known
+        ended = self._rig.lights.keys() if known is None else known - lights
+        begun = lights if known is None else lights - known
         for names, on in ((ended, False), (begun, True)):
             for name in sorted(names):
                 self._rig.lights[name].switch(on)
-        self._rig.clock.sleep_s(max(steady_s[name] for name in ended | begun))
-        self._session.journal.event("lights", frame=frame.number, on=sorted(wanted))
-        self._on = wanted
+        self._rig.clock.sleep_s(max((steady_s[name] for name in ended | begun), default=0.0))
+        self._session.journal.event("lights", frame=frame.number, on=sorted(lights))
+        self._on = lights
 
 
 def _state(on: bool) -> str:

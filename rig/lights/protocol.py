@@ -1,4 +1,4 @@
-"""What a driver of a light does."""
+"""The protocol of a light, which capture and drivers share."""
 
 from typing import Protocol
 

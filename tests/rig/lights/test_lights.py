@@ -211,7 +211,11 @@ def test_impossible_light_is_refused(table: dict[str, object], words: str) -> No
 def test_steps_name_lights_of_the_rig() -> None:
     room = convert({"name": "room", "driver": "simulated"}, LightSettings)
     step = StepSettings("bright", 0.1, lights=("room", "rom"))
-    for lights, words in (((room,), r"step\.lights has 'rom'; .* are: 'room'"), ((room, room), "two lights .* 'room'")):
+    for lights, words in (
+        ((room,), r"step\.lights has 'rom'; .* are: 'room'"),
+        ((room, room), "two lights .* 'room'"),
+        ((), r"there is no \[\[light\]\]"),
+    ):
         with pytest.raises(ValueError, match=words):
             RigSettings(SMALL_RIG.stage, SMALL_RIG.camera, SMALL_RIG.grid, (step,), light=lights)
 
