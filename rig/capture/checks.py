@@ -25,7 +25,8 @@ class Findings(Struct, frozen=True):
     """Measured values of a frame by name, and warnings, one line each, with the limit and a remedy.
 
     The names are `median_dn`, `contrast_dn`, `saturated_share`, `sharpness`, `board_corners` and `leak_dn`; and for the
-    dark scene `snr`, `darkest_dn` and `stray_dn`, see `_scene_values`.
+    dark scene `snr`, `darkest_dn` and `stray_dn`, see `_scene_values`. Where the rig switches the lights there is
+    `mean_dn`, too.
     """
 
     values: dict[str, float]

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 
 from faintfield.rig.cameras.protocol import Pixels
-from faintfield.rig.capture.checks import DARK_KINDS, LIT_KINDS, mean_and_error
+from faintfield.rig.capture.checks import DARK_KINDS, LIT_KINDS, Findings, mean_and_error
 from faintfield.rig.devices import Rig
 from faintfield.rig.errors import LightError, RigError
 from faintfield.rig.plan import PlannedFrame
@@ -18,6 +18,8 @@ MEAN = "mean_dn"
 _DARK_SHARE = 0.1
 # Light is sure that lies this many standard errors of a mean above the dark, and this many DN.
 _SURE, _SURE_DN = 8.0, 1.0
+# Fewer standard errors can be noise.
+_FAINT = 3.0
 
 
 class Lighting:
@@ -86,14 +88,15 @@ class Lighting:
                 states = f"reports that it is {_state(on)}, and has to be {_state(not on)} for {frame.name}"
                 raise LightError(f"light {name}: {states}; look what switches it besides the capture")
 
-    def judge(self, frame: PlannedFrame, pixels: Pixels, earlier: Sequence[Mapping[str, float]]) -> dict[str, float]:
-        """Return the mean of a frame; raise `LightError` if it shows that other lights are on.
+    def judge(self, frame: PlannedFrame, pixels: Pixels, earlier: Sequence[Mapping[str, float]]) -> Findings:
+        """Return the mean of a frame, and a warning; raise `LightError` if it shows that other lights are on.
 
         `earlier` are the values of earlier frames of the same step and exposure.
         """
         lights = self.of(frame)
         if lights is None:
-            return {}
+            return Findings({}, ())
+        warnings: tuple[str, ...] = ()
         mean_dn, _ = mean_and_error(pixels)
         before_dn = [values[MEAN] for values in earlier if MEAN in values]
         usual_dn = statistics.median(before_dn) if before_dn else None
@@ -102,7 +105,17 @@ class Lighting:
             self._require_dark(frame, mean_dn, dark_dn if usual_dn is None else usual_dn)
         elif lights and dark_dn is not None:
             self._require_light(frame, mean_dn - dark_dn, 0.0 if usual_dn is None else usual_dn - dark_dn)
-        return {MEAN: round(mean_dn, 5)}
+            warnings = self._warn_of_no_light(mean_dn - dark_dn) if usual_dn is None else ()
+        return Findings({MEAN: round(mean_dn, 5)}, warnings)
+
+    def _warn_of_no_light(self, light_dn: float) -> tuple[str, ...]:
+        limit_dn = _FAINT * math.sqrt(2.0) * self._error_dn
+        if light_dn >= limit_dn:
+            return ()
+        return (
+            f"the mean is {light_dn:.2f} DN above that of a frame without light, where {limit_dn:.2f} DN can be told "
+            "from noise; look whether the light shines",
+        )
 
     def _require_dark(self, frame: PlannedFrame, mean_dn: float, dark_dn: float | None) -> None:
         limit_dn = self._session.rig.checks.leak_dn

@@ -186,15 +186,13 @@ class FrameTaker:
         written = session.write(frame, intent, exposure)
         try:
             pixels = self._decode_frame(frame, written.path, exposure)
-            light = {} if pixels is None else self._lighting.judge(frame, pixels, self._earlier_checks(frame))
+            findings = self._check(frame, pixels)
         except (CameraError, LightError) as failure:
             session.reject(frame, written, str(failure))
             raise
-        findings = self._check(frame, pixels)
-        values = findings.values | light
         lights = self._lighting.of(frame)
         record = FrameRecord(
-            *(position.point, frame.exposure_s, dict(exposure.metadata), values, findings.warnings),
+            *(position.point, frame.exposure_s, dict(exposure.metadata), findings.values, findings.warnings),
             lights=None if lights is None else tuple(sorted(lights)),
         )
         self._drift.add(session.commit(frame, written, record))
@@ -211,7 +209,7 @@ class FrameTaker:
                 self._dialogue.warn(warning)
         self._pace.finish_frame(begun_s, frame.exposure_s)
         if pixels is not None:
-            self._dialogue.operator.show_frame(frame, pixels, values)
+            self._dialogue.operator.show_frame(frame, pixels, findings.values)
 
     def _decode_frame(self, frame: PlannedFrame, path: Path, exposure: Exposure) -> Pixels | None:
         """Return the pixels of a frame, None if it cannot be decoded here; its layout must be that of the session."""
@@ -237,18 +235,16 @@ class FrameTaker:
         if pixels is None:
             warning = "the file cannot be decoded here, so nothing was checked; look at it with the camera's program"
             return Findings({}, (warning,))
-        earlier = self._earlier_checks(frame)
-        return check_frame(pixels, frame.kind, self._settings.checks, self._settings.board, earlier)
-
-    def _earlier_checks(self, frame: PlannedFrame) -> list[dict[str, float]]:
-        """Return the values of earlier frames of the same step and exposure."""
-        return [
+        earlier = [
             committed.record.checks
             for committed in self._session.valid().values()
             if committed.frame != frame.number
             and self._session.frames[committed.frame].step == frame.step
             and self._session.frames[committed.frame].exposure_s == frame.exposure_s
         ]
+        light = self._lighting.judge(frame, pixels, earlier)
+        findings = check_frame(pixels, frame.kind, self._settings.checks, self._settings.board, earlier)
+        return Findings(findings.values | light.values, findings.warnings + light.warnings)
 
     def _measure_settling(self, frame: PlannedFrame) -> None:
         settings = self._settings.settle

@@ -106,6 +106,15 @@ def test_burnt_out_lamp_ends_the_capture(lab: LitLab, exposure: int) -> None:
     lab.assert_lights_and_positions()
 
 
+def test_faint_light_that_never_shone_gives_a_warning(lab: LitLab) -> None:
+    lab.on_exposure[15] = lambda: setattr(lab.shutter, "burnt_out", True)  # before the first frame of the dark scene
+    assert lab.run() is None
+    (frame,) = [committed.record for frame, committed, _ in taken_frames(lab.folder) if frame.number == 12]
+    assert any("DN can be told from noise; look whether the light shines" in warning for warning in frame.warnings)
+    lit = [committed.record for frame, committed, _ in taken_frames(lab.folder) if frame.number < 12]
+    assert not any("from noise" in warning for record in lit for warning in record.warnings)
+
+
 def test_light_in_the_dark_is_refused(lab: LitLab) -> None:
     """The shutter is stuck and reports nothing of it, while the room is lit for the dark frames."""
     for number in range(29, 32):
