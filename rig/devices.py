@@ -1,8 +1,8 @@
-"""Construct the stage and the camera that rig.toml describes, real or simulated."""
+"""Construct the stage, the camera and the lights that rig.toml describes, real or simulated."""
 
 import weakref
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import partial
 
 import msgspec
@@ -15,15 +15,19 @@ from faintfield.rig.cameras.micromanager import MicroManagerCamera
 from faintfield.rig.cameras.protocol import Camera, Decode
 from faintfield.rig.clock import Clock, WallClock
 from faintfield.rig.errors import PlanRefused
+from faintfield.rig.lights import settings as lights
+from faintfield.rig.lights.command import CommandLight
+from faintfield.rig.lights.controller import ControllerLight
+from faintfield.rig.lights.protocol import Light
 from faintfield.rig.micromanager import SharedCore
 from faintfield.rig.plan import StepKind
-from faintfield.rig.plugins import convert_options, plugin_camera, plugin_controller
+from faintfield.rig.plugins import convert_options, plugin_camera, plugin_controller, plugin_light
 from faintfield.rig.settings import RigSettings
 from faintfield.rig.simulation.controller.bench import Bench, PtyLink
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.grblhal import SimulatedGrblHal
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
-from faintfield.rig.simulation.lab import SimulatedCamera, SimulatedLab
+from faintfield.rig.simulation.lab import SimulatedCamera, SimulatedLab, SimulatedLight
 from faintfield.rig.stages.gantry import Gantry, serial_stage
 from faintfield.rig.stages.micromanager import MicroManagerController, MicroManagerStage
 from faintfield.rig.stages.protocol import SERIAL_PROTOCOLS, SIMULATED, StageSettings
@@ -34,7 +38,7 @@ SIMULATED_FIRMWARE = {"grbl": SimulatedGrbl, "grblhal": SimulatedGrblHal, "marli
 
 @dataclass(frozen=True)
 class Rig:
-    """The devices of a capture, not yet connected, and their clock.
+    """The devices of a capture, not yet connected, and their clock; `lights` are those that it switches, by name.
 
     `arrange` is called with kind and sweep at the beginning of each step; a simulated lab then does what a person does
     in a real one. A real camera may look on while a simulated stage moves: then `camera_sees_stage` is False, as it
@@ -46,10 +50,11 @@ class Rig:
     clock: Clock
     arrange: Callable[[StepKind, int], None]
     camera_sees_stage: bool = True
+    lights: Mapping[str, Light] = field(default_factory=dict)
 
 
 def open_rig(settings: RigSettings, traffic: TrafficLog | None = None, decode: Decode = lambda path: None) -> Rig:
-    """Construct the stage and the camera of a rig.toml; neither is connected yet.
+    """Construct the stage, the camera and the lights of a rig.toml; none is connected yet.
 
     `traffic` gets every byte to and from the stage; `decode` reads the pixels of a file, so that a watched folder knows
     when a file is complete. Raises `PlanRefused` if camera, stage and drift check cannot be used together.
@@ -59,14 +64,44 @@ def open_rig(settings: RigSettings, traffic: TrafficLog | None = None, decode: D
     bench = _simulated_bench(settings.stage) if settings.stage.simulated else None
     core = _shared_core(settings)
     stage = open_stage(settings.stage, traffic, bench, core)
+    lamps = {light.name: _open_light(light, stage) for light in settings.light}
     if not isinstance(settings.camera, cameras.SimulatedSettings):
         camera = _open_camera(settings.camera, core, decode)
-        return Rig(stage, camera, stage.clock, lambda kind, sweep: None, camera_sees_stage=bench is None)
+        return Rig(stage, camera, stage.clock, lambda kind, sweep: None, bench is None, lamps)
     if bench is None:
         raise PlanRefused("camera.backend = 'simulated' needs stage.protocol = 'simulated'; change one of them")
     centre = settings.grid.centre().target
-    lab = SimulatedLab(centre, bench.true_position, bench.still_s, settings.board, settings.camera)
-    return Rig(stage, SimulatedCamera(settings.camera, stage.clock, lab), stage.clock, lab.arrange)
+    lab = SimulatedLab(
+        *(centre, bench.true_position, bench.still_s, settings.board, settings.camera),
+        lights=true_lights(settings.light, lamps, bench),
+    )
+    return Rig(stage, SimulatedCamera(settings.camera, stage.clock, lab), stage.clock, lab.arrange, lights=lamps)
+
+
+def _open_light(settings: lights.LightSettings, stage: Gantry) -> Light:
+    match settings:
+        case lights.ControllerSettings():
+            return ControllerLight(settings.name, stage, settings.in_controller())
+        case lights.CommandSettings():
+            return CommandLight(settings)
+        case lights.SimulatedSettings():
+            return SimulatedLight(settings.name)
+        case lights.PluginSettings():
+            return plugin_light(settings, WallClock())
+
+
+def true_lights(
+    settings: tuple[lights.LightSettings, ...], lamps: Mapping[str, Light], bench: Bench
+) -> dict[str, Callable[[], bool]]:
+    """Return for each light of a simulated lab what tells whether it shines; it does not know those of commands."""
+    truth: dict[str, Callable[[], bool]] = {}
+    for light in settings:
+        lamp = lamps[light.name]
+        if isinstance(lamp, SimulatedLight):
+            truth[light.name] = partial(getattr, lamp, "shines")
+        elif isinstance(light, lights.ControllerSettings):
+            truth[light.name] = partial(bench.firmware.output_on, light.in_controller())
+    return truth
 
 
 def _open_camera(settings: cameras.CameraSettings, core: SharedCore | None, decode: Decode) -> Camera:

@@ -1,6 +1,7 @@
 """The exceptions of the rig, in one tree: catch `RigError` to catch them all.
 
-A `StageError` concerns the stage, a `CameraError` the camera, and a `SessionError` the files of a capture; a
+A `StageError` concerns the stage, a `CameraError` the camera, a `LightError` a light that the rig switches, and a
+`SessionError` the files of a capture; a
 `PlanRefused` is raised before anything moves, and `CaptureStopped` when the operator stops a capture. Every message is
 one line that says what is wrong, the value found, its limit, and what to do.
 """
@@ -106,6 +107,10 @@ class CameraTimeout(CameraError):
 
 class MissingExtra(CameraError):
     """The package for this kind of camera or stage is not installed."""
+
+
+class LightError(RigError):
+    """A light was not switched, or is not in the state that it was switched to."""
 
 
 class SessionError(RigError):

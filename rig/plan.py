@@ -109,13 +109,15 @@ class Stop(Struct, frozen=True, forbid_unknown_fields=True):
 class CaptureStep(Struct, frozen=True, forbid_unknown_fields=True):
     """One step of the experiment: the same exposures at every node, or at the centre node only.
 
-    At each stop there are `frames_per_node` frames of each exposure time, in the order of `exposure_s`.
+    At each stop there are `frames_per_node` frames of each exposure time, in the order of `exposure_s`. Of the lights
+    that the rig switches, `lights` are on and all others off; None leaves all to a person.
     """
 
     kind: StepKind
     exposure_s: tuple[float, ...]
     frames_per_node: int = 1
     at: Literal["grid", "centre"] = "grid"
+    lights: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
         if not self.exposure_s or not all(time_s > 0.0 for time_s in self.exposure_s) or self.frames_per_node < 1:
@@ -187,6 +189,8 @@ class CapturePlan(Struct, frozen=True, forbid_unknown_fields=True):
         for step in self.steps:
             exposing_s = step.frames_per_node * sum(step.exposure_s) + step.frames_per_stop() * self.readout_s
             total_s += len(self.stops_of(step)) * (_ARRIVAL_S + self.settle_s + exposing_s)
+            if step.lights:  # a frame with all lights off, see `rig.capture.lighting`
+                total_s += sum(step.exposure_s) + len(step.exposure_s) * self.readout_s
         return total_s
 
 

@@ -1,4 +1,4 @@
-"""Cameras and stages from other packages, found by their entry points; docs/plugins.md shows one."""
+"""Cameras, stages and lights from other packages, found by their entry points; docs/plugins.md shows one."""
 
 import difflib
 from collections.abc import Callable, Iterator, Mapping
@@ -13,13 +13,28 @@ from msgspec import Struct
 from faintfield.rig.cameras.protocol import Camera, CameraReport, Exposure, Thermometer
 from faintfield.rig.cameras.settings import BUILT_IN_BACKENDS, MosaicSettings, PluginSettings
 from faintfield.rig.clock import Clock
-from faintfield.rig.errors import CameraError, PlanRefused, PluginFailed, RigError, UnknownPlugin, in_one_line
+from faintfield.rig.errors import (
+    CameraError,
+    LightError,
+    PlanRefused,
+    PluginFailed,
+    RigError,
+    UnknownPlugin,
+    in_one_line,
+)
+from faintfield.rig.lights import settings as lights
+from faintfield.rig.lights.protocol import Light
 from faintfield.rig.stages.protocol import BUILT_IN_PROTOCOLS, WITHOUT_OPTIONS, Controller, StageSettings
 
 CAMERAS = "faintfield.cameras"
 STAGES = "faintfield.stages"
+LIGHTS = "faintfield.lights"
 # Key in rig.toml, and built-in drivers, of each group.
-_BUILT_IN = {CAMERAS: ("camera.backend", BUILT_IN_BACKENDS), STAGES: ("stage.protocol", BUILT_IN_PROTOCOLS)}
+_BUILT_IN = {
+    CAMERAS: ("camera.backend", BUILT_IN_BACKENDS),
+    STAGES: ("stage.protocol", BUILT_IN_PROTOCOLS),
+    LIGHTS: ("light.driver", lights.BUILT_IN_DRIVERS),
+}
 
 
 @dataclass(frozen=True)
@@ -55,6 +70,22 @@ class StagePlugin[T: Struct]:
     make: Callable[[T, StageSettings, Clock], Controller]
 
 
+@dataclass(frozen=True)
+class LightPlugin[T: Struct]:
+    """Factory named by an entry point of the group `faintfield.lights`.
+
+    Parameters
+    ----------
+    settings : type
+        Struct of the keys of a `[[light]]` table, besides `name`, `driver` and `steady_s`; it forbids unknown fields.
+    make : callable
+        Makes the light, closed, from its settings and the clock of its waits.
+    """
+
+    settings: type[T]
+    make: Callable[[T, Clock], Light]
+
+
 def fold_plugins(content: Any) -> Any:
     """Return the content of a rig.toml as `RigSettings` takes it: with what no built-in driver reads as `options`.
 
@@ -71,7 +102,19 @@ def fold_plugins(content: Any) -> Any:
         if name not in BUILT_IN_PROTOCOLS:
             _entry_points(STAGES, name)
         content = content | {"stage": _with_options(stage, StageSettings)}
+    if isinstance(tables := content.get("light"), list):
+        content = content | {"light": [_fold_light(table) for table in tables]}
     return content
+
+
+def _fold_light(table: Any) -> Any:
+    name = table.get("driver") if isinstance(table, dict) else None
+    if not isinstance(name, str) or name in lights.BUILT_IN_DRIVERS:
+        return table
+    _entry_points(LIGHTS, name)
+    own = {key: table[key] for key in ("name", "steady_s") if key in table}
+    options = {key: value for key, value in table.items() if key not in ("driver", *own)}
+    return {"driver": "plugin", "plugin": name, **own, "options": options}
 
 
 def _with_options(table: dict[str, Any], kind: type[Struct]) -> dict[str, Any]:
@@ -123,6 +166,46 @@ class PluginCamera:
 
     def _as_camera_errors(self) -> AbstractContextManager[None]:
         return _raise_as(CameraError, f"the plug-in {self._name!r} failed", "tell its authors", passing=RigError)
+
+
+def plugin_light(settings: lights.PluginSettings, clock: Clock) -> Light:
+    """Return the light that a plug-in makes; raises as `plugin_camera` does."""
+    name = settings.plugin
+    plugin = _load(LIGHTS, name, LightPlugin)
+    options = convert_options(settings.options, plugin.settings, f"[[light]] {settings.name} with driver = {name!r}")
+    with _raise_as(PluginFailed, f"the plug-in {name!r} failed", "correct its settings, or tell its authors"):
+        return PluginLight(name, plugin.make(options, clock))
+
+
+class PluginLight:
+    """A light of another package, the plug-in `name`, whose failures all become `LightError`."""
+
+    def __init__(self, name: str, light: Light) -> None:
+        self._name = name
+        self._light = light
+
+    def open(self) -> None:
+        """Connect to the light."""
+        with self._as_light_errors():
+            self._light.open()
+
+    def switch(self, on: bool, /) -> None:
+        """Switch the light."""
+        with self._as_light_errors():
+            self._light.switch(on)
+
+    def is_on(self) -> bool | None:
+        """Return whether the light is on, None if it is not read back."""
+        with self._as_light_errors():
+            return self._light.is_on()
+
+    def close(self) -> None:
+        """Disconnect."""
+        with self._as_light_errors():
+            self._light.close()
+
+    def _as_light_errors(self) -> AbstractContextManager[None]:
+        return _raise_as(LightError, f"the plug-in {self._name!r} failed", "tell its authors", passing=RigError)
 
 
 def plugin_controller(settings: StageSettings, clock: Clock) -> Controller:

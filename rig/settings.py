@@ -7,6 +7,7 @@ import numpy as np
 from msgspec import Struct
 
 from faintfield.rig.cameras.settings import CameraSettings, GPhoto2Settings, Mosaic
+from faintfield.rig.lights.settings import LightSettings
 from faintfield.rig.plan import CaptureStep, Grid, StepKind, check_frame_count
 from faintfield.rig.stages.protocol import StageSettings
 
@@ -169,6 +170,9 @@ class StepSettings(Struct, frozen=True, forbid_unknown_fields=True):
     photons_per_s : float, optional
         Measured light of a flat step in photons per pixel and second, mean over the detector; it gives the quantum
         efficiency.
+    lights : tuple of str, optional
+        Names of the lights that are on, while all others are off; by default a person sees to the light, and the rig
+        switches nothing.
     """
 
     kind: StepKind
@@ -176,6 +180,7 @@ class StepSettings(Struct, frozen=True, forbid_unknown_fields=True):
     frames_per_node: int = 1
     at: str | None = None
     photons_per_s: float | None = None
+    lights: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
         if self.at not in (None, "grid", "centre"):
@@ -189,7 +194,9 @@ class StepSettings(Struct, frozen=True, forbid_unknown_fields=True):
         """Return the step of the plan."""
         exposures = self.exposure_s if isinstance(self.exposure_s, tuple) else (self.exposure_s,)
         centred = self.at == "centre" or (self.at is None and self.kind in ("dark", "flat"))
-        return CaptureStep(self.kind, exposures, self.frames_per_node, "centre" if centred else "grid")
+        return CaptureStep(
+            self.kind, exposures, self.frames_per_node, "centre" if centred else "grid", lights=self.lights
+        )
 
 
 class SceneSettings(Struct, frozen=True, forbid_unknown_fields=True):
@@ -214,12 +221,21 @@ class RigSettings(Struct, frozen=True, forbid_unknown_fields=True):
     drift: DriftSettings = DriftSettings()
     scene: SceneSettings = SceneSettings()
     board: tuple[BoardSettings, ...] = ()
+    light: tuple[LightSettings, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.step:
             raise ValueError("there is no [[step]]; say what to capture")
         if not self.board and any(step.kind == "charuco" for step in self.step):
             raise ValueError("there is a charuco step but no [[board]]; describe the printed boards")
+        names = [light.name for light in self.light]
+        if twice := {name for name in names if names.count(name) > 1}:
+            raise ValueError(f"two lights are named {min(twice)!r}; give each a name of its own")
+        if not names and any(step.lights is not None for step in self.step):
+            raise ValueError("a step has lights, but there is no [[light]]; describe what the rig switches")
+        if unknown := {name for step in self.step for name in step.lights or ()}.difference(names):
+            known = ", ".join(map(repr, names)) or "none"
+            raise ValueError(f"step.lights has {min(unknown)!r}; the lights of [[light]] are: {known}")
         nodes = self.grid.rows * self.grid.columns
         check_frame_count(sum(step.frames_per_stop() * (nodes if step.at == "grid" else 1) for step in self.steps()))
 

@@ -38,6 +38,7 @@ _BARS = " ▁▂▃▄▅▆▇█"
 # The measured values of a frame in words.
 _VALUES = {
     "median_dn": "median {:.5g} DN",
+    "mean_dn": "mean {:.5g} DN",
     "contrast_dn": "contrast {:.5g} DN",
     "saturated_share": "saturated {:.2%}",
     "sharpness": "sharpness {:.3g}",

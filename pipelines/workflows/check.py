@@ -30,13 +30,14 @@ class RigCheck(msgspec.Struct, frozen=True):
     changed_settings: list[str]
     changed_since_session: list[str]
     warnings: list[str]
+    lights: dict[str, str] = {}
 
 
 def check_rig(rig: Path, remember: bool, session: Path | None) -> RigCheck:
     """Ask stage, camera and disk whether a capture is possible, and print the answers."""
     settings = read_rig(rig)
     since = [] if session is None else _changes_since(session, settings)
-    found = survey(open_rig(settings), settings)
+    found = survey(open_rig(settings), settings, lights=True)
     stored = read_stage_settings(rig)
     changed = [] if stored is None else _changed_settings(stored, found.stage.settings)
     require_room(rig, found.plan.wanted_room_bytes())
@@ -58,6 +59,7 @@ def check_rig(rig: Path, remember: bool, session: Path | None) -> RigCheck:
         changed_settings=changed,
         changed_since_session=since,
         warnings=list(found.stage.warnings),
+        lights=found.lights,
     )
 
 
@@ -79,7 +81,7 @@ def _changes_since(session: Path, settings: RigSettings) -> list[str]:
 
 
 def _survey_lines(rig: Survey, stage: StageSettings, rig_file: Path) -> list[str]:
-    """Return a line each about stage, camera, plan and the disk of the rig.toml."""
+    """Return a line each about stage, camera, lights, plan and the disk of the rig.toml."""
     plan, travel = rig.plan, rig.stage.travel_mm
     duration = format_capture_duration(rig.duration_s, stage)
     size_mb, need_mb = plan.disk_bytes() / 1e6, plan.wanted_room_bytes() / 1e6
@@ -87,6 +89,7 @@ def _survey_lines(rig: Survey, stage: StageSettings, rig_file: Path) -> list[str
     return [
         f"stage: {rig.stage.firmware}, travel {travel}; all {len(plan.path())} points of the path are allowed",
         f"camera: {rig.camera.name}; all exposure times are offered",
+        *(f"light {name}: {outcome}" for name, outcome in rig.lights.items()),
         f"plan: {plan.frame_count()} frames in {len(plan.steps)} steps, {duration}",
         f"disk: {size_mb:.0f} MB of frames; {need_mb:.0f} MB are wanted, {free_mb:.0f} MB are free",
     ]

@@ -25,7 +25,8 @@ class Findings(Struct, frozen=True):
     """Measured values of a frame by name, and warnings, one line each, with the limit and a remedy.
 
     The names are `median_dn`, `contrast_dn`, `saturated_share`, `sharpness`, `board_corners` and `leak_dn`; and for the
-    dark scene `snr`, `darkest_dn` and `stray_dn`, see `_scene_values`.
+    dark scene `snr`, `darkest_dn` and `stray_dn`, see `_scene_values`. Where the rig switches the lights there is
+    `mean_dn`, too.
     """
 
     values: dict[str, float]
@@ -62,6 +63,11 @@ def check_frame(
     if kind == "dark_scene":
         values |= _scene_values(grey, earlier)
     return Findings({name: round(value, 5) for name, value in values.items()}, _warnings(kind, values, limits, earlier))
+
+
+def mean_and_error(pixels: Pixels) -> tuple[float, float]:
+    """Return the mean of a frame, and its standard error if the pixels differ by noise alone."""
+    return float(pixels.mean(dtype=np.float64)), float(pixels.std(dtype=np.float64)) / math.sqrt(pixels.size)
 
 
 def _grey(pixels: Pixels) -> Pixels:

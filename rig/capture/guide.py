@@ -1,7 +1,7 @@
 """Guide the operator through a capture: what to do before each step, questions, answers, warnings, remaining time."""
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from statistics import median
 from typing import TYPE_CHECKING, Literal, NoReturn, Protocol
 
@@ -10,7 +10,7 @@ from msgspec import Struct
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.clock import Clock
 from faintfield.rig.errors import CaptureStopped
-from faintfield.rig.plan import PlannedFrame, StepKind
+from faintfield.rig.plan import CaptureStep, PlannedFrame, StepKind
 from faintfield.rig.session.session import Session
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.motion import one_sided_path, path_duration_s
@@ -50,6 +50,12 @@ _TO_DO_AGAIN: dict[StepKind, tuple[str, ...]] = {
     ),
     "flat": ("Change the light on the diffuser, so that the frames become clearly brighter or darker.",),
 }
+# The same where the rig switches the lights: what is left to be done by hand.
+_TO_DO_BUT_LIGHTS: dict[StepKind, tuple[str, ...]] = {
+    "charuco": _TO_DO["charuco"][:1],
+    "flat": ("Put a diffuser right before the lens.",),
+}
+_OBJECTS = "Take boards and diffuser away, and put the objects in place. From here on, move nothing."
 _CHECK: dict[StepKind, str] = {
     "charuco": "Check that many corners are found and that no frame is saturated.",
     "bright": "Check focus and that no frame is saturated.",
@@ -72,7 +78,7 @@ TITLES: dict[StepKind, str] = {
 class Prompt(Struct, frozen=True):
     """A question to the operator, whose usual answer comes first; a capture without a person gives `unattended`.
 
-    The journal knows it by its key: `home`, `step`, `paused`, `stage`, `camera`, `drift` or `skipped`.
+    The journal knows it by its key: `home`, `step`, `paused`, `stage`, `camera`, `light`, `drift` or `skipped`.
     """
 
     key: str
@@ -117,9 +123,24 @@ class OperatorInterface(Protocol):
         """Show the frame just taken."""
 
 
-def step_prompt(frame: PlannedFrame, steps: int, frames: int, duration_s: float) -> Prompt:
-    """Return the prompt before a step, whose first of `frames` frames is `frame`; they take `duration_s`."""
+def needs_hand(steps: Sequence[CaptureStep], number: int) -> bool:
+    """Return whether something has to be done by hand before a step.
+
+    A person sees to the lights unless the rig does, puts boards and diffusers in place, and takes them away.
+    """
+    by_hand: set[StepKind] = {"charuco", "flat"}
+    step = steps[number]
+    return step.lights is None or step.kind in by_hand or (number > 0 and steps[number - 1].kind in by_hand)
+
+
+def step_prompt(frame: PlannedFrame, steps: int, frames: int, duration_s: float, *, rig_lit: bool = False) -> Prompt:
+    """Return the prompt before a step, whose first of `frames` frames is `frame`; they take `duration_s`.
+
+    With `rig_lit` the rig switches the lights, so that the prompt says nothing about them.
+    """
     to_do = _TO_DO_AGAIN.get(frame.kind, _TO_DO[frame.kind]) if frame.sweep else _TO_DO[frame.kind]
+    if rig_lit and not (frame.sweep and frame.kind == "charuco"):
+        to_do = _TO_DO_BUT_LIGHTS.get(frame.kind, (_OBJECTS,))
     motion = f"Then {frames} frames follow, {format_duration(duration_s)}. The stage moves by itself: keep clear of it."
     return Prompt(
         key="step",

@@ -1,18 +1,40 @@
 """Run a capture: take every missing frame of a session, step by step, and handle requests and failures."""
 
+from contextlib import suppress
+
 import msgspec
 
 from faintfield.rig.cameras.protocol import Decode
-from faintfield.rig.capture.guide import MAX_UNATTENDED_TRIES, Answer, Dialogue, OperatorInterface, Prompt, step_prompt
+from faintfield.rig.capture.guide import (
+    MAX_UNATTENDED_TRIES,
+    Answer,
+    Dialogue,
+    OperatorInterface,
+    Prompt,
+    needs_hand,
+    step_prompt,
+)
+from faintfield.rig.capture.lighting import Lighting
 from faintfield.rig.capture.survey import check_plan
 from faintfield.rig.capture.take import DriftChecks, FrameTaker
 from faintfield.rig.devices import Rig
-from faintfield.rig.errors import CameraError, DriftUnknown, NotHomed, PlanRefused, PositionDrifted, StageError
+from faintfield.rig.errors import (
+    CameraError,
+    DriftUnknown,
+    LightError,
+    NotHomed,
+    PlanRefused,
+    PositionDrifted,
+    RigError,
+    StageError,
+)
 from faintfield.rig.plan import PlannedFrame
 from faintfield.rig.session.homings import begin_group, unchecked_frames
 from faintfield.rig.session.journal import Suspect
 from faintfield.rig.session.session import Session
 from faintfield.rig.stages.drift import recover
+
+_DEVICES = {CameraError: "camera", LightError: "light"}
 
 
 class Capture:
@@ -26,7 +48,8 @@ class Capture:
         self._rig = rig
         self._dialogue = Dialogue(session, rig, operator)
         self._drift = DriftChecks(self._dialogue)
-        self._taker = FrameTaker(self._dialogue, self._drift, decode)
+        self._lighting = Lighting(session, rig)
+        self._taker = FrameTaker(self._dialogue, self._drift, self._lighting, decode)
         self._failures = self._untimed_checks = 0
         self._homings_in_journal = 0
         self._unrecovered: Exception | None = None
@@ -44,16 +67,29 @@ class Capture:
                 self._run_step(missing)
             if self._drift.watch is not None:  # a capture that was killed may have left nothing but the last check
                 self._mark_unchecked("the capture ended")
+            self._switch_lights_off()
             self._session.seal()
             self._dialogue.show_status(self._session.frames[-1], "complete")
+        except BaseException:
+            with suppress(RigError):  # that a journal cannot be written to is not why the capture ends
+                self._switch_lights_off()
+            raise
         finally:
-            self._rig.camera.close()
-            self._rig.stage.close()
+            try:
+                self._lighting.close()
+            finally:
+                self._rig.camera.close()
+                self._rig.stage.close()
+
+    def _switch_lights_off(self) -> None:
+        for failure in self._lighting.switch_off():
+            self._dialogue.warn(failure)
 
     def _connect(self) -> None:
         rig, session = self._rig, self._session
         rig.stage.connect()
         rig.camera.open()
+        self._lighting.open()
         report, identity = rig.camera.report(), rig.stage.identify()
         session.journal.event(
             "connected", camera=msgspec.to_builtins(report), stage=msgspec.to_builtins(identity, str_keys=True)
@@ -78,14 +114,15 @@ class Capture:
     def _run_step(self, missing: list[PlannedFrame]) -> None:
         session, first = self._session, missing[0]
         frames = [frame for frame in missing if frame.step == first.step]
-        self._dialogue.show_status(first, "waiting for your answer")
-        duration_s = self._dialogue.pace.remaining_s(frames, 0)
-        prompt = step_prompt(first, len(session.plan.steps), len(frames), duration_s)
-        answer = self._dialogue.ask_or_stop(prompt)
-        if answer == "skip":
-            for frame in frames:
-                session.skip(frame)
-            return
+        if needs_hand(session.plan.steps, first.step):
+            self._dialogue.show_status(first, "waiting for your answer")
+            duration_s = self._dialogue.pace.remaining_s(frames, 0)
+            lit = session.plan.steps[first.step].lights is not None
+            prompt = step_prompt(first, len(session.plan.steps), len(frames), duration_s, rig_lit=lit)
+            if self._dialogue.ask_or_stop(prompt) == "skip":
+                for frame in frames:
+                    session.skip(frame)
+                return
         self._rig.arrange(first.kind, first.sweep)
         for frame, following in zip(frames, [*frames[1:], None], strict=True):
             if frame not in session.skipped():
@@ -125,7 +162,7 @@ class Capture:
                         self._mark_unchecked("the stage was homed")
                     begin_group(self._session.journal)
                 self._taker.take(frame)
-            except (StageError, NotHomed, CameraError) as failure:
+            except (StageError, NotHomed, CameraError, LightError) as failure:
                 if self._handle_failure(frame, failure) == "skip":
                     self._session.skip(frame)
                     return
@@ -154,7 +191,7 @@ class Capture:
         """Record a failure and ask what to do; prepare another try, or re-raise it if the answer is to stop."""
         if isinstance(failure, NotHomed) and self._unrecovered is not None:
             failure = self._unrecovered
-        device = "camera" if isinstance(failure, CameraError) else "stage"
+        device = next((name for kind, name in _DEVICES.items() if isinstance(failure, kind)), "stage")
         self._failures += 1
         self._dialogue.pace.here = None
         self._record_failure(f"{device}_failed", frame, failure)
@@ -175,10 +212,12 @@ class Capture:
         try:
             if device == "stage":
                 recover(self._rig.stage, self._may_home, self._drift.watch)
+            elif device == "light":
+                self._lighting.open()
             else:
                 self._rig.camera.close()
                 self._rig.camera.open()
-        except (StageError, CameraError, NotHomed, PlanRefused) as failure:
+        except (StageError, CameraError, LightError, NotHomed, PlanRefused) as failure:
             self._unrecovered = failure
             self._record_failure("recovery_failed", frame, failure, device=device)
             self._dialogue.warn(f"{frame.name}: the {device} was not recovered: {failure}")

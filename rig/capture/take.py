@@ -12,8 +12,9 @@ from faintfield.rig.cameras.protocol import Decode, Exposure, Pixels
 from faintfield.rig.cameras.settings import CoolingSettings
 from faintfield.rig.capture.checks import LIT_KINDS, Findings, Settling, board_warnings, check_frame, measure_settling
 from faintfield.rig.capture.guide import MAX_UNATTENDED_TRIES, Answer, Dialogue, Prompt
+from faintfield.rig.capture.lighting import Lighting
 from faintfield.rig.capture.survey import read_temperature
-from faintfield.rig.errors import CameraError, CameraTimeout, DriftUnknown, PositionDrifted
+from faintfield.rig.errors import CameraError, CameraTimeout, DriftUnknown, LightError, PositionDrifted, RigError
 from faintfield.rig.plan import PlannedFrame
 from faintfield.rig.session.journal import CommittedFrame, FrameRecord
 from faintfield.rig.stages.drift import DriftWatch
@@ -90,8 +91,8 @@ class FrameTaker:
     file. `last` is the frame taken last.
     """
 
-    def __init__(self, dialogue: Dialogue, drift: DriftChecks, decode: Decode) -> None:
-        self._dialogue, self._drift, self._decode = dialogue, drift, decode
+    def __init__(self, dialogue: Dialogue, drift: DriftChecks, lighting: Lighting, decode: Decode) -> None:
+        self._dialogue, self._drift, self._lighting, self._decode = dialogue, drift, lighting, decode
         self._session, self._rig, self._pace = dialogue.session, dialogue.rig, dialogue.pace
         self._settings = self._session.rig
         self._cooled_step: int | None = None
@@ -105,19 +106,24 @@ class FrameTaker:
     def take(self, frame: PlannedFrame) -> None:
         """Move to the node of a frame and take it; before the first frame of a step, wait for the sensor to be cool.
 
-        Raises `StageError`, `NotHomed`, `CameraError` or `SessionUnwritable`, after which the frame is still missing.
+        Raises `StageError`, `NotHomed`, `CameraError`, `LightError` or `SessionUnwritable`, after which the frame is
+        still missing.
         """
         settings = self._settings.camera
         if settings.settle_temperature_c is not None and frame.step != self._cooled_step:
             self._wait_for_temperature(frame, settings, settings.settle_temperature_c)
         self._cooled_step = frame.step
-        self._dialogue.show_status(frame, "moving")
-        self._go_to(frame)
-        self._dialogue.show_status(frame, "exposing")
         try:
+            self._lighting.prepare(frame, self._look)
+            self._dialogue.show_status(frame, "moving")
+            self._go_to(frame)
+            self._dialogue.show_status(frame, "exposing")
             self._expose(frame)
         except CameraError:
             self._cooled_step = None  # a camera that failed was perhaps switched off
+            raise
+        except RigError:
+            self._lighting.forget()
             raise
 
     def _wait_for_temperature(self, frame: PlannedFrame, settings: CoolingSettings, target_c: float) -> None:
@@ -173,17 +179,22 @@ class FrameTaker:
         begun_s = rig.clock.now_s()
         intent = session.intend(frame)
         position = rig.stage.verify_at(*frame.stop.target)
+        self._lighting.verify(frame)
         exposure = rig.camera.expose(frame.exposure_s, intent)
         rig.stage.verify_at(*frame.stop.target)
+        self._lighting.verify(frame)
         written = session.write(frame, intent, exposure)
         try:
             pixels = self._decode_frame(frame, written.path, exposure)
-        except CameraError as failure:
+            findings = self._check(frame, pixels)
+        except (CameraError, LightError) as failure:
             session.reject(frame, written, str(failure))
             raise
-        findings = self._check(frame, pixels)
-        metadata = dict(exposure.metadata)
-        record = FrameRecord(position.point, frame.exposure_s, metadata, findings.values, findings.warnings)
+        lights = self._lighting.of(frame)
+        record = FrameRecord(
+            *(position.point, frame.exposure_s, dict(exposure.metadata), findings.values, findings.warnings),
+            lights=None if lights is None else tuple(sorted(lights)),
+        )
         self._drift.add(session.commit(frame, written, record))
         self.last = frame
         if findings.warnings:
@@ -231,7 +242,9 @@ class FrameTaker:
             and self._session.frames[committed.frame].step == frame.step
             and self._session.frames[committed.frame].exposure_s == frame.exposure_s
         ]
-        return check_frame(pixels, frame.kind, self._settings.checks, self._settings.board, earlier)
+        light = self._lighting.judge(frame, pixels, earlier)
+        findings = check_frame(pixels, frame.kind, self._settings.checks, self._settings.board, earlier)
+        return Findings(findings.values | light.values, findings.warnings + light.warnings)
 
     def _measure_settling(self, frame: PlannedFrame) -> None:
         settings = self._settings.settle
@@ -256,6 +269,13 @@ class FrameTaker:
             self._pace.rest_s[kind] = settings.longest_s if rest_s is None else rest_s
 
     def _take_unkept(self, exposure_s: float) -> Pixels:
+        pixels = self._look(exposure_s)
+        if pixels is None:
+            raise CameraError("frames cannot be decoded, so settling is not measured; set settle.measure = false")
+        return pixels
+
+    def _look(self, exposure_s: float) -> Pixels | None:
+        """Return a frame that is not kept, None if it cannot be decoded here."""
         exposure = self._rig.camera.expose(exposure_s, next(self._unkept_numbers))
         if exposure.content is None:
             assert exposure.pixels is not None
@@ -263,10 +283,7 @@ class FrameTaker:
         with TemporaryDirectory(prefix="faintfield-") as folder:
             path = Path(folder) / f"frame{exposure.suffix}"
             path.write_bytes(exposure.content)
-            pixels = self._decode(path)
-        if pixels is None:
-            raise CameraError("frames cannot be decoded, so settling is not measured; set settle.measure = false")
-        return pixels
+            return self._decode(path)
 
 
 def _layout(pixels: Pixels | None) -> str | None:

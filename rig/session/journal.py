@@ -49,8 +49,8 @@ _MAX_PENDING_TRAFFIC = 2000
 class FrameRecord(Struct, frozen=True):
     """Entry of the journal about a frame, without its file.
 
-    It has the position that the stage reported before the exposure, metadata from the camera, and the values and
-    warnings of `rig.capture.checks.Findings`.
+    It has the position that the stage reported before the exposure, metadata from the camera, the values and warnings
+    of `rig.capture.checks.Findings`, and the names of the lights that were on; None where a person saw to the light.
     """
 
     position_mm: Point
@@ -58,6 +58,7 @@ class FrameRecord(Struct, frozen=True):
     camera: Metadata = {}
     checks: dict[str, float] = {}
     warnings: tuple[str, ...] = ()
+    lights: tuple[str, ...] | None = None
 
     @property
     def temperature_c(self) -> float | None:

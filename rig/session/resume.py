@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -48,6 +49,10 @@ _OPEN_KEYS = {
     "camera.quiet_s",
     "camera.file_times",
     "camera.settle_limit_s",
+    "light.on",
+    "light.off",
+    "light.state",
+    "light.limit_s",
 }
 
 # What the port says besides: frames of a real and of a simulated stage are not of one session.
@@ -68,7 +73,8 @@ class SettingChange(Struct, frozen=True):
     @property
     def frozen(self) -> bool:
         """Return whether a session keeps the value that it was begun with."""
-        return self.key.partition(".")[0] not in _OPEN_TABLES and self.key not in _OPEN_KEYS
+        key = re.sub(r"\[\d+\]", "", self.key)
+        return key.partition(".")[0] not in _OPEN_TABLES and key not in _OPEN_KEYS
 
     def __str__(self) -> str:
         """Return the change in words."""
@@ -114,17 +120,19 @@ def present_settings(folder: Path) -> RigSettings:
 
 def _settings_of(frozen: FrozenPlan, journal: Journal) -> RigSettings:
     """Return the settings of the plan, with the changes that the journal records."""
-    content: dict[str, dict[str, Any]] = msgspec.to_builtins(frozen.rig)
+    content: dict[str, Any] = msgspec.to_builtins(frozen.rig)
     try:
         for change in journal.details(CHANGED, SettingChange):
-            table, _, key = change.key.partition(".")
-            if change.frozen or key not in content[table]:
+            place, _, key = change.key.partition(".")
+            name, _, index = place.rstrip("]").partition("[")
+            table = content[name][int(index)] if index else content[name]
+            if change.frozen or key not in table:
                 raise ValueError(f"{change.key!r:.60} does not change in a session")
             if wild := find_wild_number(change.new, change.key):
                 raise ValueError(f"{wild} is too large")
-            content[table][key] = change.new
+            table[key] = change.new
         return msgspec.convert(content, RigSettings)
-    except (msgspec.MsgspecError, ValueError) as failure:
+    except (msgspec.MsgspecError, ValueError, LookupError) as failure:
         raise SessionCorrupt(f"{journal.path}: {failure}; restore the journal from a copy") from failure
 
 

@@ -1,8 +1,8 @@
 """The simulated lab and its camera: renders what the camera sees in each step, from the true position of the stage."""
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from faintfield.rig.cameras.protocol import CameraReport, Exposure
 from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.clock import Clock
-from faintfield.rig.errors import CameraError
+from faintfield.rig.errors import CameraError, LightError
 from faintfield.rig.plan import StepKind
 from faintfield.rig.settings import BoardSettings
 from faintfield.rig.simulation.boards import standing_board
@@ -57,13 +57,20 @@ _FLAT = 0.5
 
 # After a stop the carriage swings along both axes, as an undamped gantry does: amplitude, frequency, decay time.
 _SWING_MM, _SWING_HZ, _SWING_DECAY_S = 1.5, 7.0, 0.25
+# Nothing swings after this time in s.
+_AT_REST_S = 60.0
+
+# Lights of the lab that the rig may switch: two as bright as what a person turns on, the faint one, and a shutter.
+_BRIGHT, _FAINT, _SHUTTER = {"room", "board"}, "scene", "shutter"
 
 
 @dataclass(eq=False)
 class SimulatedLab:
     """Scene, light and sensor around a simulated stage, whose position of the reference pose is `centre`.
 
-    The callables return the true position of the carriages, and the time since they stopped.
+    The callables return the true position of the carriages, and the time since they stopped. `lights` tell for each
+    light that the rig switches whether it is on; a person sees to the light only if there is none but the shutter, and
+    otherwise leaves the objects where they are.
     """
 
     centre: Point
@@ -71,6 +78,7 @@ class SimulatedLab:
     still_s: Callable[[], float]
     boards: tuple[BoardSettings, ...]
     settings: SimulatedSettings
+    lights: Mapping[str, Callable[[], bool]] = field(default_factory=dict)
     _planes: tuple[TexturedPlane, ...] = ()
     _photons_per_s: float = 0.0
     _flat: bool = False
@@ -90,11 +98,28 @@ class SimulatedLab:
         if kind == "charuco":
             optics = self.experiment.optics
             self._planes = tuple(standing_board(board, sweep, at, optics) for at, board in enumerate(self.boards))
-        elif kind in ("bright", "dark_scene"):
+        elif kind in ("bright", "dark_scene") or (self._switches_lamps and kind != "flat"):
             self._planes = self.experiment.planes
         lit, unlit = self.settings.lit_photons_per_s, self.settings.unlit_photons_per_s
         self._photons_per_s = unlit if kind == "dark_scene" else lit
         self._flat = kind == "flat"
+
+    @property
+    def _switches_lamps(self) -> bool:
+        return bool(self.lights.keys() & {*_BRIGHT, _FAINT})
+
+    def lights_on(self) -> tuple[str, ...]:
+        """Return the names of the lights that are on."""
+        return tuple(name for name in sorted(self.lights) if self.lights[name]())
+
+    def photons_per_s(self) -> float:
+        """Return the photons on a pixel that sees a white object now."""
+        on = set(self.lights_on())
+        if _SHUTTER in self.lights and _SHUTTER not in on:
+            return 0.0
+        if not self._switches_lamps:
+            return self._photons_per_s
+        return len(on & _BRIGHT) * self.settings.lit_photons_per_s + (_FAINT in on) * self.settings.unlit_photons_per_s
 
     def expose(self, exposure_s: float, number: int) -> NDArray[np.uint16]:
         """Return a frame (row, column) in DN, taken now; its noise depends only on its number and the seed."""
@@ -107,12 +132,12 @@ class SimulatedLab:
             if light.ndim == 3 and self.settings.mosaic is not None:
                 light = through_mosaic(light, self.settings.mosaic)
         generator = np.random.default_rng([self.settings.seed, number])
-        return self.experiment.sensor.expose(light * self._photons_per_s * exposure_s, exposure_s, generator)
+        return self.experiment.sensor.expose(light * self.photons_per_s() * exposure_s, exposure_s, generator)
 
     def rt_cam_ref(self, exposure_s: float) -> NDArray[np.float64]:
         """Return the true pose (6,) in the middle of an exposure that begins now, including the swing."""
         x_mm, y_mm = self.true_position()
-        after_s = self.still_s() + 0.5 * exposure_s
+        after_s = min(self.still_s(), _AT_REST_S) + 0.5 * exposure_s  # infinite before the first motion
         swing_mm = _SWING_MM * math.exp(-after_s / _SWING_DECAY_S) * math.cos(2.0 * math.pi * _SWING_HZ * after_s)
         right_mm, down_mm = x_mm + swing_mm - self.centre.x_mm, y_mm + swing_mm - self.centre.y_mm
         return _carriage_pose(self.settings, right_mm, down_mm)
@@ -166,8 +191,8 @@ class Cooling:
         return self._set_point_c + (self._start_c - self._set_point_c) * math.exp(-after_s / self._time_s) + ripple_k
 
 
-# Key of the true pose in a frame's metadata.
-TRUE_POSE = "true_rt_cam_ref"
+# Keys of the true pose in a frame's metadata, and of the lights that were on, separated by commas.
+TRUE_POSE, TRUE_LIGHTS = "true_rt_cam_ref", "true_lights"
 
 # Time to read a frame.
 _READOUT_S = 0.05
@@ -204,13 +229,17 @@ class SimulatedCamera:
         """Render the scene from the camera's pose at the beginning of the exposure."""
         self._require_open()
         temperature_c = self.temperature_c()
-        truth = [float(value) for value in self._lab.rt_cam_ref(exposure_s)]
+        truth: dict[str, str | list[float]] = {TRUE_POSE: [float(value) for value in self._lab.rt_cam_ref(exposure_s)]}
+        before = self._lab.lights_on()
         pixels = self._lab.expose(exposure_s, number)
-        self._clock.sleep_s(exposure_s + _READOUT_S)
+        self._clock.sleep_s(exposure_s)
+        if self._lab.lights:
+            truth[TRUE_LIGHTS] = " then ".join(",".join(on) for on in dict.fromkeys((before, self._lab.lights_on())))
+        self._clock.sleep_s(_READOUT_S)
         return Exposure(
             ".tiff",
             pixels=pixels,
-            metadata={"camera": "simulated camera", "temperature_c": temperature_c, TRUE_POSE: truth},
+            metadata={"camera": "simulated camera", "temperature_c": temperature_c, **truth},
         )
 
     def temperature_c(self) -> float:
@@ -225,3 +254,43 @@ class SimulatedCamera:
     def _require_open(self) -> None:
         if not self._open:
             raise CameraError("the camera is not connected; open it first")
+
+
+class SimulatedLight:
+    """A `Light` of the lab, with faults: it answers nothing (`broken`), or reports what it does not do.
+
+    That is a lamp which is `burnt_out`, or a shutter which is `stuck_open`.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._open = self._switched_on = False
+        self.broken = self.burnt_out = self.stuck_open = False
+
+    @property
+    def shines(self) -> bool:
+        """Return whether there is light, whatever the lamp reports."""
+        return (self._switched_on or self.stuck_open) and not self.burnt_out
+
+    def open(self) -> None:
+        """Connect."""
+        self._open = True
+
+    def switch(self, on: bool, /) -> None:
+        """Switch the light."""
+        self._require_answer()
+        self._switched_on = on
+
+    def is_on(self) -> bool:
+        """Return whether the light was switched on."""
+        self._require_answer()
+        return self._switched_on
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._open = False
+
+    def _require_answer(self) -> None:
+        if not self._open or self.broken:
+            state = "does not answer; check its cable" if self._open else "is not open; open it first"
+            raise LightError(f"light {self._name}: {state}")

@@ -11,11 +11,22 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from faintfield.rig.clock import Clock
-from faintfield.rig.errors import NotHomed, OutsideTravel, PositionLost, StageError, StageLost
+from faintfield.rig.errors import NotHomed, OutsideTravel, PlanRefused, PositionLost, StageError, StageLost
 from faintfield.rig.stages.grbl import GrblController
 from faintfield.rig.stages.marlin import MarlinController
 from faintfield.rig.stages.motion import StageWorkspace, duration_s, one_sided_path, path_duration_s
-from faintfield.rig.stages.protocol import AxisIndex, Box, Controller, Homing, Identity, Point, Position, StageSettings
+from faintfield.rig.stages.protocol import (
+    AxisIndex,
+    Box,
+    Controller,
+    Homing,
+    Identity,
+    Output,
+    OutputController,
+    Point,
+    Position,
+    StageSettings,
+)
 from faintfield.rig.stages.transport import LineTransport, Port, TrafficLog
 
 # Longest jog without homing, in mm: enough to see which way an axis moves, too short to do damage.
@@ -34,6 +45,8 @@ class Gantry:
         Whether reported positions can be trusted.
     homings : int
         Number of homings: positions before and after a homing may differ by what the switches do.
+    recoveries : int
+        Number of connections and recoveries, any of which may have switched the outputs off.
     """
 
     def __init__(self, controller: Controller, settings: StageSettings, clock: Clock) -> None:
@@ -43,11 +56,12 @@ class Gantry:
         self._identity: Identity | None = None
         self.trusted = self._failed = False
         self._here: Point | None = None
-        self.homings = 0
+        self.homings = self.recoveries = 0
 
     def connect(self) -> None:
         """Open the port, wait for the controller and read its settings, without moving; a failure closes the port."""
         self._distrust()
+        self.recoveries += 1
         try:
             self._controller.connect()
             self._identity = self._controller.identify()
@@ -152,6 +166,31 @@ class Gantry:
         with self._tracking_trust():
             return self._controller.switches()
 
+    def switch_output(self, output: Output, *, on: bool) -> None:
+        """Switch an output of the controller; raises `PlanRefused` if it has none.
+
+        After a failure, an output can only be switched off, and the stage is stopped before.
+        """
+        controller = self._output_controller()
+        with self._tracking_trust():
+            if self._failed and not on:
+                self.trusted &= self._controller.abort()
+                controller.force_off(output)
+            else:
+                controller.switch_output(output, on=on)
+
+    def read_output(self, output: Output) -> bool | None:
+        """Return whether an output is on, as the controller reports it; None if it does not."""
+        controller = self._output_controller()
+        with self._tracking_trust():
+            return controller.read_output(output)
+
+    def unlock(self) -> None:
+        """Clear the lock of a controller that was not homed, as it switches no output; nothing moves."""
+        controller = self._output_controller()
+        with self._tracking_trust():
+            controller.unlock()
+
     def hold(self) -> None:
         """Stop at once; the position is kept if the controller decelerates without losing steps."""
         self._here = None
@@ -161,6 +200,7 @@ class Gantry:
     def recover(self) -> None:
         """Make the controller accept commands again after an error, without moving, and read its settings again."""
         self._here = None
+        self.recoveries += 1
         with self._tracking_trust():
             self.trusted &= self._controller.recover(self.settings.reconnect_s)
             self._identity = self._controller.identify()
@@ -178,6 +218,13 @@ class Gantry:
         finally:  # a plug-in may raise anything
             self._identity, self._failed = None, False
             self._controller.close()
+
+    def _output_controller(self) -> OutputController:
+        if not isinstance(self._controller, OutputController):
+            raise PlanRefused(
+                f"protocol = {self.settings.protocol!r} has no outputs for lights; switch them with driver = 'command'"
+            )
+        return self._controller
 
     def _require_trust(self, target: Point) -> None:
         if not self.trusted:

@@ -5,16 +5,17 @@ cancelled without losing the position, and the parser's state does not change. W
 coordinates, whatever work offset is stored in the controller.
 """
 
+import math
 import re
 from collections.abc import Sequence
 from contextlib import suppress
 from operator import truediv
 
-from faintfield.rig.errors import StageError, StageTimeout, WrongFirmware
+from faintfield.rig.errors import StageError, StageRejected, StageTimeout, WrongFirmware
 from faintfield.rig.stages import grbl_alarms as failures
 from faintfield.rig.stages import grbl_lines as grbl
 from faintfield.rig.stages.motion import timeout_s
-from faintfield.rig.stages.protocol import AnswerTime, AxisIndex, Identity, Point
+from faintfield.rig.stages.protocol import AnswerTime, AxisIndex, Identity, Output, OutputKind, Point
 from faintfield.rig.stages.transport import LineTransport, Ok, motion_words, read_twice, restart_failure
 
 # GRBL's real-time characters.
@@ -33,6 +34,11 @@ _RECOVERY_S = 2.0
 _UNCHANGED_REPORTS = 2
 # GRBL reports the work offset in at least every 30th report.
 _MAX_REPORTS_TO_OFFSET = 40
+# It reports the outputs in at least every 20th report, or in the one after it if the work offset is due as well.
+_MAX_REPORTS_TO_OUTPUTS = 22
+# Command that switches an output on, and its letters in reports.
+_OUTPUTS: dict[OutputKind, tuple[str, str]] = {"flood": ("M8", "F"), "mist": ("M7", "M"), "spindle": ("M3 S", "SC")}
+_SPINDLE_LEVEL = 1000.0
 
 
 class GrblController:
@@ -46,6 +52,10 @@ class GrblController:
         self._braking_s = self._next_poll_s = 0.0
         self._offset_mm: tuple[float, ...] | None = None
         self._alarm: int | None = None
+        self._outputs: frozenset[str] | None = None  # as last reported
+        self._outputs_due = self._outputs_unreported = False
+        self._reported_s = 0.0
+        self._coolants: set[OutputKind] = set()  # as commanded: M9 switches both off
         self._count_lost = False  # since the stage was homed
         self._homing = False  # by the last command
 
@@ -53,6 +63,7 @@ class GrblController:
         """Open the connection, waiting up to `wait_s` for its port, and wait for the banner, as most boards restart."""
         self._offset_mm = self._alarm = None
         self._count_lost, self._homing = True, False
+        self._forget_outputs()
         self._line.open(wait_s)
         if self._await_banner(_BOOT_S):
             return
@@ -111,6 +122,53 @@ class GrblController:
         """Return the axes whose limit input is active."""
         pins = self._poll().pins
         return frozenset(index for index in (0, 1) if self._axes[index] in pins)
+
+    def switch_output(self, output: Output, *, on: bool) -> None:
+        """Switch flood, mist or the spindle; M9 ends both coolants, so that the other one is switched on again."""
+        if output.kind not in _OUTPUTS:
+            raise StageRejected(f"GRBL has no output {output.kind!r}; choose from {', '.join(_OUTPUTS)}")
+        command = _OUTPUTS[output.kind][0]
+        try:
+            if output.kind == "spindle":
+                level = _SPINDLE_LEVEL if output.level is None else output.level
+                self._command(f"{command}{level:g}" if on else "M5")
+            elif on:
+                self._command(command)
+                self._coolants.add(output.kind)
+            else:
+                self._command("M9")
+                self._coolants.discard(output.kind)
+                for other in self._coolants:
+                    self._command(_OUTPUTS[other][0])
+        except StageRejected as failure:
+            state = f"the firmware does not switch {output.kind}: {failure}"
+            raise StageRejected(
+                f"{state}; GRBL needs to be built with ENABLE_M7 for mist: choose another output"
+            ) from None
+        self._reported_s = -math.inf  # a report from before is not asked
+
+    def force_off(self, output: Output) -> None:
+        """Reset GRBL, which obeys nothing else in an alarm: all outputs go off, and a stage at rest loses no step."""
+        if not self._reset(_RESET_S) and self.read_output(output) is not False:
+            raise StageTimeout(f"no answer to a reset within {_RESET_S:g} s; switch {output.kind} off by hand")
+
+    def read_output(self, output: Output) -> bool | None:
+        """Return whether a report of this moment has the output among those that are on.
+
+        GRBL reports the outputs in the next report after a change, or in the one after it if the work offset is due.
+        """
+        for _ in range(1 if self._outputs_unreported else _MAX_REPORTS_TO_OUTPUTS):
+            if self._clock.now_s() - self._reported_s >= _POLL_INTERVAL_S or self._outputs is None or self._outputs_due:
+                self._poll()
+            if self._outputs is not None and not self._outputs_due:
+                return not self._outputs.isdisjoint(_OUTPUTS[output.kind][1])
+        self._outputs_unreported = True
+        return None
+
+    def unlock(self) -> None:
+        """Clear the lock ($X)."""
+        if self._poll().state == "Alarm":
+            self._command("$X")
 
     def stop(self) -> bool:
         """Cancel the jog: GRBL slows down within its acceleration and keeps its count."""
@@ -269,6 +327,7 @@ class GrblController:
 
     def _reset(self, within_s: float) -> bool:
         self._line.send(_RESET)
+        self._forget_outputs()
         return self._await_banner(within_s)
 
     def _receive(self, deadline_s: float) -> grbl.Message | None:
@@ -286,13 +345,23 @@ class GrblController:
         return message
 
     def _note(self, message: grbl.Message) -> None:
-        if isinstance(message, grbl.Report) and message.offset is not None:
-            self._offset_mm = message.offset
+        if isinstance(message, grbl.Report):
+            self._offset_mm = self._offset_mm if message.offset is None else message.offset
+            self._reported_s = self._clock.now_s()
+            self._outputs_due = message.outputs is None and not message.is_brief
+            self._outputs = self._outputs if message.outputs is None else message.outputs
+            self._outputs_unreported = self._outputs_unreported and message.outputs is None
         elif isinstance(message, grbl.Banner):
             self._count_lost = True
+            self._forget_outputs()
         elif isinstance(message, grbl.Alarm):
             self._alarm = message.code
+            self._forget_outputs()
             self._count_lost = self._count_lost or message.code != failures.SOFT_LIMIT_ALARM
+
+    def _forget_outputs(self) -> None:
+        self._outputs = None
+        self._coolants.clear()
 
     def _await_banner(self, within_s: float) -> bool:
         for text in self._line.lines_until(self._clock.now_s() + within_s):

@@ -60,6 +60,8 @@ class Report(Struct, frozen=True):
     `substate` is the number after the state; `Hold:0` means that the stage has come to rest. `position` (mm) is in
     machine coordinates if `is_machine`, otherwise in work coordinates. `offset` (mm), which only some reports carry, is
     to be added to the latter. `pins` are the letters of the active inputs; that of an axis stands for its limit switch.
+    `outputs` are the letters of those that are on: S and C for the spindle, F for flood, M for mist; None if the report
+    does not tell, as most do not. Of these, one that `is_brief` says that they have not changed since the last report.
     """
 
     state: str
@@ -68,6 +70,8 @@ class Report(Struct, frozen=True):
     is_machine: bool
     offset: tuple[float, ...] | None
     pins: str
+    outputs: frozenset[str] | None = None
+    is_brief: bool = False
 
     @property
     def emergency_stop(self) -> bool:
@@ -93,6 +97,9 @@ def _report(match: re.Match[str]) -> Report:
     state, substate, frame, position, fields = match.groups()
     offset = re.search(rf"\|WCO:({_VECTOR})(?=\||$)", fields)
     pins = re.search(r"\|Pn:([A-Z]+)(?=\||$)", fields)
+    # GRBL: only together with the overrides, if any is on; grblHAL: at any change, without letters if all are off
+    outputs = re.search(r"\|A:([SCFMET]*)(?=\||$)", fields)
+    tells_outputs = outputs is not None or re.search(r"\|Ov:\d+,\d+,\d+(?=\||$)", fields)
     return Report(
         state=state,
         substate=None if substate is None else int(substate),
@@ -100,6 +107,8 @@ def _report(match: re.Match[str]) -> Report:
         is_machine=frame == "M",
         offset=None if offset is None else tuple(map(float, offset[1].split(","))),
         pins="" if pins is None else pins[1],
+        outputs=frozenset("" if outputs is None else outputs[1]) if tells_outputs else None,
+        is_brief=re.fullmatch(r"(?:\|(?:Bf:\d+,\d+|Ln:\d+|FS?:[\d.]+(?:,[\d.]+)*|Pn:[A-Z]+))*", fields) is not None,
     )
 
 

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from contextlib import suppress
 from itertools import count
 
-from faintfield.rig.errors import StageAlarm, StageLost, StageRejected, StageTimeout, WrongFirmware
+from faintfield.rig.errors import StageAlarm, StageError, StageLost, StageRejected, StageTimeout, WrongFirmware
 from faintfield.rig.stages import marlin_lines as marlin
 from faintfield.rig.stages.motion import timeout_s
-from faintfield.rig.stages.protocol import AnswerTime, AxisIndex, Box, Identity, Point
+from faintfield.rig.stages.protocol import AnswerTime, AxisIndex, Box, Identity, Output, Point
 from faintfield.rig.stages.transport import LineTransport, Ok, motion_words, read_twice, restart_failure
 
 # Waits in s: for the first line after the port was opened and the boot loader has run; for the answer to a command; for
@@ -30,6 +30,8 @@ _DISCARD_S = 0.1
 # Attempts: to send a line, and to start counting lines.
 _MAX_SENDINGS = 6
 _MAX_STARTS = 3
+# Value that switches a pin or a fan fully on.
+_FULL_LEVEL = 255.0
 
 
 class MarlinController:
@@ -93,6 +95,30 @@ class MarlinController:
         switches = [message for message in self._command("M119") if isinstance(message, marlin.Switch)]
         closed = {switch.name[0].upper() for switch in switches if switch.closed}
         return frozenset(index for index in (0, 1) if self._axes[index] in closed)
+
+    def switch_output(self, output: Output, *, on: bool) -> None:
+        """Switch a pin (M42) or a fan (M106, M107)."""
+        level = _FULL_LEVEL if output.level is None else output.level
+        if output.kind == "pin":
+            self._command(f"M42 P{output.number} S{level if on else 0.0:g}")
+        elif output.kind == "fan":
+            self._command(f"M106 P{output.number} S{level:g}" if on else f"M107 P{output.number}")
+        else:
+            raise StageRejected(f"Marlin has no output {output.kind!r}; choose pin or fan, with its number")
+
+    def force_off(self, output: Output) -> None:
+        """Switch an output off, after making Marlin answer again; a restart, which also does it, is the last resort."""
+        try:
+            self.recover(0.0)
+        except StageError:
+            self.connect()
+        self.switch_output(output, on=False)
+
+    def read_output(self, output: Output) -> None:
+        """Return None: Marlin does not report its outputs."""
+
+    def unlock(self) -> None:
+        """Do nothing: Marlin has no lock."""
 
     def stop(self) -> bool:
         """Stop dead: Marlin does not slow down, so steps may be lost."""

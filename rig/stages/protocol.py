@@ -5,7 +5,7 @@ not shifted or flipped, so a position in a log can be compared with the controll
 """
 
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple, Protocol, Self
+from typing import Any, Literal, NamedTuple, Protocol, Self, runtime_checkable
 
 from msgspec import Struct
 
@@ -169,6 +169,42 @@ class Controller(Protocol):
 
     def close(self) -> None:
         """Close the connection."""
+
+
+type OutputKind = Literal["flood", "mist", "spindle", "pin", "fan"]
+
+
+class Output(Struct, frozen=True):
+    """An output of a controller besides its motors, to which a lamp is connected.
+
+    Parameters
+    ----------
+    kind, number : str, int
+        `flood`, `mist` or `spindle` of GRBL; `pin` or `fan` of Marlin, with its number.
+    level : float, optional
+        Value (S) that switches a spindle, pin or fan on; by default 1000 for the spindle, and 255.
+    """
+
+    kind: OutputKind
+    number: int = 0
+    level: float | None = None
+
+
+@runtime_checkable
+class OutputController(Protocol):
+    """A `Controller` that can switch outputs; a restart, and with GRBL an alarm, a door or a reset, switch them off."""
+
+    def switch_output(self, output: Output, *, on: bool) -> None:
+        """Switch an output while the stage is at rest; raises `StageRejected` if the firmware does not have it."""
+
+    def force_off(self, output: Output) -> None:
+        """Switch an output off after a failure, when the stage was stopped; others may go off as well."""
+
+    def read_output(self, output: Output) -> bool | None:
+        """Return whether an output is on, as the controller reports it; None if it does not."""
+
+    def unlock(self) -> None:
+        """Clear the lock of a controller that was not homed, since it switches no output; nothing moves."""
 
 
 type ProtocolName = Literal["grbl", "marlin", "simulated"]

@@ -12,7 +12,7 @@ import pytest
 from faintfield.pipelines import cli
 from faintfield.rig.session.journal import Journal
 from faintfield.rig.session.session import taken_frames
-from faintfield.rig.simulation.lab import SimulatedLab
+from faintfield.rig.simulation.lab import TRUE_LIGHTS, SimulatedLab
 from tests.end_to_end.rigs import write_small_rig
 from tests.faults.capturing import events
 
@@ -111,6 +111,60 @@ def test_check_moves_nothing_and_counts_frames(shell: Shell) -> None:
     assert result["disk_bytes"] == 521 * (2 * 64 * 48 + 512)
     assert 300.0 < result["duration_s"] < 1200.0
     assert "521 frames in 11 steps" in shell.words
+
+
+LIGHTS = """
+[[light]]
+name = "room"
+driver = "controller"
+output = "flood"
+[[light]]
+name = "lamp"
+driver = "command"
+on = ["/bin/true"]
+off = ["{off}"]
+"""
+
+
+def test_check_tries_lights_without_motion(shell: Shell) -> None:
+    shell.edit("# The steps,", LIGHTS.format(off="/bin/true") + "# The steps,")
+    assert shell.result("check", shell.rig)["lights"] == {
+        "room": "switched on and off, which it reports",
+        "lamp": "switched on and off; it reports nothing",
+    }
+    assert "light room: switched on and off" in shell.words
+    shell.edit('off = ["/bin/true"]', 'off = ["/bin/false"]')
+    assert shell.run("check", shell.rig) == 1
+    assert "LightError: light lamp: /bin/false ended with exit code 1; run it by hand" in shell.words
+
+
+LIT_RIG = """
+stage = {protocol = "simulated", port = "simulated:marlin"}
+camera = {backend = "simulated", size_px = [64, 48]}
+grid = {rows = 1, columns = 2, pitch_mm = 50.0, origin_mm = [50.0, 50.0]}
+light = [
+    {name = "room", driver = "controller", output = "fan", number = 1},
+    {name = "scene", driver = "controller", output = "pin", number = 57},
+    {name = "shutter", driver = "simulated"},
+]
+step = [
+    {kind = "bright", exposure_s = 0.1, lights = ["room", "shutter"]},
+    {kind = "dark_scene", exposure_s = 0.1, lights = ["scene", "shutter"]},
+    {kind = "noise_reference", exposure_s = 0.1, lights = []},
+    {kind = "dark", exposure_s = 0.1, lights = ["room"]},
+]
+"""
+
+
+def test_lights_of_a_rig_file_shine_in_its_capture(shell: Shell) -> None:
+    shell.rig.write_text(LIT_RIG)
+    assert shell.run("capture", shell.rig, shell.session, "--yes") == 0, shell.words
+    frames = [committed.record for _, committed, _ in taken_frames(shell.session)]
+    shone = [record.camera[TRUE_LIGHTS] for record in frames]
+    assert shone == ["room,shutter"] * 2 + ["scene,shutter"] * 2 + [""] * 2 + ["room"]
+    assert [",".join(record.lights or ()) for record in frames] == shone
+    lit, faint, dark = (frames[index].checks["mean_dn"] for index in (0, 2, 4))
+    assert lit > faint + 1000.0 > dark + 1000.0
 
 
 def test_check_remembers_settings_of_stage(shell: Shell) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from typing import ClassVar
 
 from faintfield.rig.simulation.controller.kinematics import Mechanics, ScheduledEvent, SimulatedClock
-from faintfield.rig.stages.protocol import ProtocolName
+from faintfield.rig.stages.protocol import Output, ProtocolName
 
 # At 115200 baud; a byte takes ten bits.
 _SECONDS_PER_BYTE = 10.0 / 115200.0
@@ -89,7 +89,7 @@ def parse_parameters(text: str) -> dict[str, float]:
 class SimulatedFirmware(ABC):
     """A simulated controller; `boot_s` is the time from a restart to the first line that it sends.
 
-    Homing takes `homing_slowdown` times as long, which faults raise.
+    Homing takes `homing_slowdown` times as long, which faults raise. `outputs` are those that are on.
     """
 
     protocol: ClassVar[ProtocolName]
@@ -101,6 +101,7 @@ class SimulatedFirmware(ABC):
         self.mechanics = mechanics
         self.boot_s = boot_s
         self.homing_slowdown = 1.0
+        self.outputs: frozenset[str] = frozenset()
         self._boot: ScheduledEvent | None = None
         self._homing: ScheduledEvent | None = None
         mechanics.on_idle = self._motion_ended
@@ -110,6 +111,7 @@ class SimulatedFirmware(ABC):
         """Restart as after power-up: the step count is lost, the settings stay."""
         self.mechanics.stop_dead()
         self.mechanics.set_count((0.0, 0.0))
+        self.outputs = frozenset()
         self.wire.clear()
         self._line, self._waiting = bytearray(), deque[str]()
         self._cancel_homing()
@@ -122,6 +124,10 @@ class SimulatedFirmware(ABC):
     def homing(self) -> bool:
         """Return whether the carriages are searching their switches."""
         return self._homing is not None
+
+    def output_on(self, output: Output) -> bool:
+        """Return whether an output is on, whatever the controller reports."""
+        return (f"{output.kind} {output.number}" if output.kind in ("pin", "fan") else output.kind) in self.outputs
 
     @abstractmethod
     def receive(self, data: bytes) -> None:

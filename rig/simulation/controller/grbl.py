@@ -2,7 +2,10 @@
 
 As in the real one, an `ok` means parsed, not moved; `?` is ignored while homing and after a critical alarm; a reset
 during motion loses the position (ALARM:3); after ALARM:1 and 2 everything but a reset is ignored, and so is a reset
-before GRBL has asked for it; a failed homing still answers `ok`; and only some reports carry the work offset.
+before GRBL has asked for it; a failed homing still answers `ok`; and only some reports carry the work offset. Outputs
+are reported with the overrides, in every tenth or twentieth report and after a change, but not together with the work
+offset. Alarm, reset and door switch them off; the parser does not notice a door, and ignores a command to switch on
+what it believes to be on.
 """
 
 import math
@@ -19,6 +22,10 @@ _LINE_BYTES, _BUFFER_BYTES = 80, 128
 
 # The work offset is in every 30th report while moving, and in every 10th at rest.
 _OFFSET_EVERY_BUSY, _OFFSET_EVERY_IDLE = 30, 10
+# So are the overrides in every 20th, and in every 10th.
+_OVERRIDES_EVERY_BUSY, _OVERRIDES_EVERY_IDLE = 20, 10
+# Outputs and their letters in reports.
+_OUTPUT_LETTERS = {"spindle": "S", "flood": "F", "mist": "M"}
 
 _ALARM_DELAY_S = 0.05  # from a critical alarm until a reset is accepted
 
@@ -62,6 +69,8 @@ class SimulatedGrbl(SimulatedFirmware):
             0x18: self._reset,
             0x84: self.open_door,
             0x85: self._cancel_jog,
+            0xA0: lambda: self._toggle("flood"),
+            0xA1: lambda: self._toggle("mist"),
         }
         x, y = (Axis(-length - 5.0, 2.0, -0.5 * length, play_mm) for length in self._travel_mm())
         mechanics = Mechanics(clock, (x, y), 1.0 / self._number(100), 1.0, on_switch=self._switch_hit)
@@ -77,6 +86,8 @@ class SimulatedGrbl(SimulatedFirmware):
         self.work_offset, self._reports_to_offset = (0.0, 0.0, 0.0), 0
         self.state, self.critical, self._accepts_reset = "Boot", False, True
         self._held: list[Vector] = []
+        self._parsed_outputs: frozenset[str] = frozenset()
+        self._reports_to_overrides = 0
 
     def receive(self, data: bytes) -> None:
         """Take bytes from the host; real-time characters act at once, even inside a line."""
@@ -103,6 +114,7 @@ class SimulatedGrbl(SimulatedFirmware):
             self.mechanics.stop_dead()
             self._cancel_homing()
         self.state = "Alarm"
+        self._reset_outputs()
         self._waiting.clear()
         self.say(f"ALARM:{code}")
         if code in self._critical_alarms:
@@ -129,6 +141,7 @@ class SimulatedGrbl(SimulatedFirmware):
         if not self._accepts_reset:
             return
         self._held.clear()
+        self._reset_outputs()
         self._line.clear()
         self._waiting.clear()
         if self.state == "Home":
@@ -156,6 +169,7 @@ class SimulatedGrbl(SimulatedFirmware):
 
     def open_door(self) -> None:
         """Open the safety door, which cancels a jog and holds other motion."""
+        self._set_outputs(frozenset())
         jogging = self.state == "Jog"
         self.state = "Door:2" if self.mechanics.moving else "Door:1"
         ahead = self.mechanics.brake()
@@ -180,8 +194,8 @@ class SimulatedGrbl(SimulatedFirmware):
         if self._deaf() or self.state == "Home":
             return
         tell_offset = self._reports_to_offset == 0
+        busy = self.state in ("Jog", "Run")
         if tell_offset:
-            busy = self.state in ("Jog", "Run")
             self._reports_to_offset = _OFFSET_EVERY_BUSY if busy else _OFFSET_EVERY_IDLE
         self._reports_to_offset -= 1
         here = (*self.mechanics.commanded_mm(), 0.0)
@@ -192,7 +206,34 @@ class SimulatedGrbl(SimulatedFirmware):
             fields.append(f"Pn:{pins}")
         if tell_offset:
             fields.append(f"WCO:{_vector(self.work_offset)}")
+        fields += self._output_fields(due=not tell_offset, busy=busy)
         self.say(f"<{'|'.join(fields)}>")
+
+    def _output_fields(self, *, due: bool, busy: bool) -> list[str]:
+        """Return the fields of overrides and outputs, if it is their turn and they are `due`."""
+        if not due or self._reports_to_overrides > 0:
+            self._reports_to_overrides = max(0, self._reports_to_overrides - 1)
+            return []
+        self._reports_to_overrides = (_OVERRIDES_EVERY_BUSY if busy else _OVERRIDES_EVERY_IDLE) - 1
+        return ["Ov:100,100,100", *([self._output_field()] if self.outputs else [])]
+
+    def _output_field(self) -> str:
+        return "A:" + "".join(letter for output, letter in _OUTPUT_LETTERS.items() if output in self.outputs)
+
+    def _set_outputs(self, outputs: frozenset[str]) -> None:
+        """Set the outputs, which the next report tells."""
+        self.outputs = outputs
+        self._reports_to_overrides = 0
+
+    def _reset_outputs(self) -> None:
+        self._parsed_outputs = frozenset()
+        self._set_outputs(self._parsed_outputs)
+
+    def _toggle(self, output: str) -> None:
+        """Switch a coolant as its override does, which a button of the machine may send."""
+        if self.state in ("Idle", "Run"):
+            self._parsed_outputs ^= {output}
+            self._set_outputs(self._parsed_outputs)
 
     def _reported_state(self) -> str:
         return self.state
@@ -203,6 +244,7 @@ class SimulatedGrbl(SimulatedFirmware):
     def _resume(self) -> None:
         if self.state in ("Hold:0", "Door:0"):
             self.state = "Idle"
+            self._set_outputs(self._parsed_outputs)
             held, self._held = self._held, []
             for target in held:
                 self._queue(target, _RAPID_MM_PER_MIN, "Run")
@@ -290,6 +332,9 @@ class SimulatedGrbl(SimulatedFirmware):
             self.work_offset = (here[0] - parsed.get("X", 0.0), here[1] - parsed.get("Y", 0.0), 0.0)
             self._reports_to_offset = 0
             return 0
+        if match := re.fullmatch(r"M(3S\d+(?:\.\d+)?|[5789])", line):
+            self._switch(match[1])
+            return 0
         if not re.search(r"G[01](?!\d)", line):
             return 20
         if not parsed.keys() & {"X", "Y"}:
@@ -300,6 +345,14 @@ class SimulatedGrbl(SimulatedFirmware):
         else:
             self._queue(target, parsed.get("F", _RAPID_MM_PER_MIN), "Run")
         return 0
+
+    def _switch(self, code: str) -> None:
+        ended = {"5": {"spindle"}, "9": {"flood", "mist"}}
+        begun = {"7": {"mist"}, "8": {"flood"}}.get(code, {"spindle"} if code[0] == "3" else set())
+        parsed = (self._parsed_outputs | begun) - ended.get(code, set())
+        if parsed != self._parsed_outputs:
+            self._parsed_outputs = parsed
+            self._set_outputs(parsed)
 
     def _target(self, axis_words: dict[str, float], *, relative: bool, machine: bool) -> tuple[float, float]:
         here = self.mechanics.planned_mm()

@@ -3,7 +3,8 @@
 With hard limits on, its soft limits keep away from the switches by the pull-off. A critical alarm does not silence it:
 it answers status requests, and refuses commands with error:79. A safety door during a jog freezes it in the state
 `Jog`: it ignores a cancel, and a resume runs the rest of the jog. An emergency stop is ALARM:10, and no reset is
-accepted while it is pressed. After power-up it raises ALARM:11 until it is homed, if `$22` asks for that.
+accepted while it is pressed. After power-up it raises ALARM:11 until it is homed, if `$22` asks for that. A change of
+outputs is in the next report, without the overrides, and without letters if all are off.
 """
 
 from typing import ClassVar
@@ -25,6 +26,7 @@ class SimulatedGrblHal(SimulatedGrbl):
     def _reset_state(self) -> None:
         super()._reset_state()
         self._alarm, self._frozen = 0, False
+        self._outputs_changed = False
 
     # Pressed by `press_emergency_stop`; a class attribute, since the first restart comes before any instance has it.
     emergency_stop = False
@@ -48,6 +50,7 @@ class SimulatedGrblHal(SimulatedGrbl):
         if self.state == "Jog":
             self._held = self.mechanics.brake() or self._held
             self._frozen = True
+            self._set_outputs(frozenset())
         else:
             super().open_door()
 
@@ -77,6 +80,15 @@ class SimulatedGrblHal(SimulatedGrbl):
 
     def _margin_mm(self) -> float:
         return self._number(27) if int(self._number(21)) & 1 else 0.0
+
+    def _set_outputs(self, outputs: frozenset[str]) -> None:
+        self._outputs_changed = self._outputs_changed or outputs != self.outputs
+        self.outputs = outputs
+
+    def _output_fields(self, *, due: bool, busy: bool) -> list[str]:
+        fields = super()._output_fields(due=due, busy=busy)
+        changed, self._outputs_changed = self._outputs_changed, False
+        return [*fields, self._output_field()] if changed and len(fields) < 2 else fields
 
     def _reported_state(self) -> str:
         return f"Alarm:{self._alarm}" if self.state == "Alarm" and self._alarm else self.state

@@ -139,6 +139,9 @@ class SimulatedMarlin(SimulatedFirmware):
             "G1": lambda: self._move(parameters),
             "G90": lambda: setattr(self, "_relative", False),
             "G91": lambda: setattr(self, "_relative", True),
+            "M42": lambda: self._switch("pin", parameters, parameters.get("S", 255.0)),
+            "M106": lambda: self._switch("fan", parameters, parameters.get("S", 255.0)),
+            "M107": lambda: self._switch("fan", parameters, 0.0),
             "M84": lambda: self._release_after(parameters.get("S")),
             "M114": lambda: self._tell_position(real="R" in command),
             "M115": self._tell_capabilities,
@@ -164,6 +167,10 @@ class SimulatedMarlin(SimulatedFirmware):
         acceleration = min(self.settings["M204"], along([self.settings["M201"]] * 2, start, target))
         self.mechanics.queue(target, speed, acceleration)
         self._watch_idle()
+
+    def _switch(self, kind: str, parameters: dict[str, float], level: float) -> None:
+        name = f"{kind} {parameters.get('P', 0.0):.0f}"
+        self.outputs = self.outputs | {name} if level else self.outputs - {name}
 
     def _home(self, axes: Sequence[int]) -> None:
         reach_mm = 1.5 * max(self.travel_mm)

@@ -8,6 +8,7 @@ import pytest
 
 from faintfield.rig.cameras.settings import FolderSettings, GPhoto2Settings, SimulatedSettings
 from faintfield.rig.errors import PlanRefused
+from faintfield.rig.lights.settings import CommandSettings
 from faintfield.rig.plan import CapturePlan
 from faintfield.rig.session.resume import adopt_settings, check_same_rig, find_changes, open_session, present_settings
 from faintfield.rig.session.session import FrozenPlan, taken_frames
@@ -93,6 +94,18 @@ def test_port_keeps_a_stage_real_or_simulated(then: str, now: str) -> None:
     with pytest.raises(PlanRefused, match=r"stage\.port \(simulated\) was \w+ and is \w+; set it back"):
         check_same_rig(frozen(before), after)
     check_same_rig(frozen(before), replace(before, stage=replace(before.stage, port=f"{then}2")))
+
+
+def test_command_of_a_light_may_change(tmp_path: Path) -> None:
+    lamps = [CommandSettings(name=name, on=("usbrelay", "A=1"), off=("usbrelay", "A=0")) for name in ("room", "lamp")]
+    before = replace(SMALL_RIG, light=tuple(lamps))
+    now = replace(SMALL_RIG, light=(lamps[0], replace(lamps[1], on=("usbrelay", "B=1"), limit_s=20.0)))
+    capture(tmp_path / "session", Operator({}, {1: "stop"}), before)
+    with open_session(tmp_path / "session", None) as opened:
+        assert [change.key for change in adopt_settings(opened, now)] == ["light[1].on", "light[1].limit_s"]
+        with pytest.raises(PlanRefused, match=r'light\[0\]\.name was "room" and is "hall"'):
+            adopt_settings(opened, replace(now, light=(replace(lamps[0], name="hall"), now.light[1])))
+    assert present_settings(tmp_path / "session") == now
 
 
 def test_changes_are_recorded_all_or_none(session: Path) -> None:

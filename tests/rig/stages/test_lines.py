@@ -44,10 +44,28 @@ MARLIN_LINES = [
 def test_grbl_lines_are_read() -> None:
     kinds = [type(grbl.parse(line)).__name__ for line in GRBL_LINES]
     assert kinds == ["Ok", "ErrorCode", "Alarm", "Report", "Report", "GrblSetting", "Feedback", "Feedback", "Banner"]
-    assert grbl.parse(GRBL_LINES[4]) == grbl.Report("Hold", 0, (1.0, 2.0, 0.0), False, None, "XY")
+    assert grbl.parse(GRBL_LINES[4]) == grbl.Report("Hold", 0, (1.0, 2.0, 0.0), False, None, "XY", is_brief=True)
     assert grbl.parse(GRBL_LINES[3]) == grbl.Report(
         "Idle", None, (-1.0, -2.0, 0.0), True, offset=(0.0, 0.0, 0.0), pins=""
     )
+
+
+@pytest.mark.parametrize(
+    ("fields", "outputs", "is_brief"),
+    [
+        ("FS:0,0", None, True),
+        ("FS:0,0|WCO:0.000,0.000,0.000", None, False),  # GRBL puts the outputs off to the next report
+        ("FS:0,0|Ov:100,100,100", "", False),
+        ("FS:0,0|Ov:100,100,100|A:SFM", "SFM", False),
+        ("Bf:15,128|FS:0,0|Pn:P|A:", "", False),  # grblHAL: the last one was switched off
+        ("FS:0,0|v:100,100,100|:F", None, False),  # damaged
+    ],
+)
+def test_outputs_in_reports_are_read(fields: str, outputs: str | None, is_brief: bool) -> None:
+    report = grbl.parse(f"<Idle|MPos:-1.000,-2.000,0.000|{fields}>")
+    assert isinstance(report, grbl.Report)
+    assert report.outputs == (None if outputs is None else frozenset(outputs))
+    assert report.is_brief == is_brief
 
 
 def test_marlin_lines_are_read() -> None:
