@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from operator import truediv
 
-from faintfield.rig.errors import StageError, StageTimeout, WrongFirmware
+from faintfield.rig.errors import StageAlarm, StageError, StageTimeout, WrongFirmware
 from faintfield.rig.stages import grbl_alarms as failures
 from faintfield.rig.stages import grbl_lines as grbl
 from faintfield.rig.stages.motion import timeout_s
@@ -48,11 +48,12 @@ class GrblController:
         self._alarm: int | None = None
         self._count_lost = False  # since the stage was homed
         self._homing = False  # by the last command
+        self._door_opened = False  # since the last report of rest
 
     def connect(self, wait_s: float = 0.0) -> None:
         """Open the connection, waiting up to `wait_s` for its port, and wait for the banner, as most boards restart."""
         self._offset_mm = self._alarm = None
-        self._count_lost, self._homing = True, False
+        self._count_lost, self._homing, self._door_opened = True, False, False
         self._line.open(wait_s)
         if self._await_banner(_BOOT_S):
             return
@@ -71,7 +72,8 @@ class GrblController:
     def identify(self) -> Identity:
         """Read build information and settings, the settings twice since the line has no checksum."""
         build = {message.kind: message.text for message in self._command("$I") if isinstance(message, grbl.Feedback)}
-        identity = grbl.GrblSettings(read_twice(self._read_settings), build).identity(self._index)
+        values = read_twice(self._read_settings, grbl.motion_settings)
+        identity = grbl.GrblSettings(values, build).identity(self._index)
         motion = identity.motion
         self._braking_s = max(map(truediv, motion.rate_mm_per_s, motion.acceleration_mm_per_s2))
         for _ in range(_MAX_REPORTS_TO_OFFSET):
@@ -104,7 +106,7 @@ class GrblController:
         """Return the machine position of a new report; raises unless the state is idle."""
         report = self._poll()
         if report.state != "Idle":
-            raise failures.state_failure(report, self._alarm)
+            raise self._state_failure(report)
         return self._machine_point(report)
 
     def switches(self) -> frozenset[AxisIndex]:
@@ -161,8 +163,8 @@ class GrblController:
             if isinstance(message, grbl.ErrorCode):
                 if message.code in failures.LOCKED_ERRORS:
                     report = self._poll()
-                    if report.state not in ("Idle", "Jog", "Run"):
-                        raise failures.state_failure(report, self._alarm)
+                    if self._is_frozen(report) or report.state not in ("Idle", "Jog", "Run"):
+                        raise self._state_failure(report)
                 raise failures.error_failure(text, message.code)
             messages.append(message)
         raise StageTimeout(f"no answer to {text!r} within {bound_s:g} s; check cable and power, recover and home it")
@@ -242,12 +244,19 @@ class GrblController:
                 if point == last:
                     return point
                 last = point
-            elif report.state in ("Jog", "Run"):
+            elif report.state in ("Jog", "Run") and not self._is_frozen(report):
                 last = None
             else:
-                raise failures.state_failure(report, self._alarm)
+                raise self._state_failure(report)
         state = f"the stage still moves after {bound_s:.1f} s, where {predicted_s:.1f} s were expected"
         raise StageTimeout(f"{state}; it was told to stop: recover and home it")
+
+    def _is_frozen(self, report: grbl.Report) -> bool:
+        """Return whether a door has frozen a jog: grblHAL still reports it as one, GRBL cancels it."""
+        return self._door_opened and report.state == "Jog"
+
+    def _state_failure(self, report: grbl.Report) -> StageAlarm:
+        return failures.door_failure() if self._is_frozen(report) else failures.state_failure(report, self._alarm)
 
     def _machine_point(self, report: grbl.Report) -> Point:
         values = report.position
@@ -286,8 +295,11 @@ class GrblController:
         return message
 
     def _note(self, message: grbl.Message) -> None:
-        if isinstance(message, grbl.Report) and message.offset is not None:
-            self._offset_mm = message.offset
+        if isinstance(message, grbl.Report):
+            self._offset_mm = message.offset or self._offset_mm
+            self._door_opened = (self._door_opened or message.door_is_open) and message.state != "Idle"
+        elif isinstance(message, grbl.Feedback):
+            self._door_opened = self._door_opened or message.is_door
         elif isinstance(message, grbl.Banner):
             self._count_lost = True
         elif isinstance(message, grbl.Alarm):

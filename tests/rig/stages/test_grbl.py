@@ -1,7 +1,7 @@
 """The GRBL driver on a simulated controller: one test for each peculiarity of the protocol."""
 
 from functools import partial
-from itertools import pairwise
+from itertools import count, pairwise
 
 import pytest
 
@@ -139,14 +139,32 @@ def test_play_in_the_drive_does_not_matter() -> None:
     assert bench.true_position().x_mm == pytest.approx(places[0].x_mm + 0.3), "the play is really there"
 
 
-@pytest.mark.parametrize(
-    ("controller", "start", "old", "new"),
-    [(SimulatedGrbl, b"$130=400", b"400", b"4400"), (SimulatedMarlin, b"echo: M92", b"X80", b"X8")],
-)
-def test_settings_that_change_while_read_are_refused(
-    controller: Controller, start: bytes, old: bytes, new: bytes
-) -> None:
-    bench = Bench(controller)
-    filter_once(bench.wire.filters_to_host, lambda data: data.replace(old, new), lambda data: data.startswith(start))
+CHANGES = [(SimulatedGrbl, b"$130=400", b"400"), (SimulatedMarlin, b"echo: M92", b"X80")]
+
+
+@pytest.mark.parametrize(("controller", "start", "old"), CHANGES)
+def test_settings_that_keep_changing_are_refused(controller: Controller, start: bytes, old: bytes) -> None:
+    bench, digits = Bench(controller), count(1)
+
+    def change(data: bytes) -> bytes:
+        return data.replace(old, old + b"%d" % next(digits)) if data.startswith(start) else data
+
+    bench.wire.filters_to_host.append(change)
     with pytest.raises(StageLost, match="read differently"):
         bench.stage().connect()
+
+
+@pytest.mark.parametrize(("controller", "start", "old"), CHANGES)
+def test_setting_damaged_once_is_read_again(controller: Controller, start: bytes, old: bytes) -> None:
+    stage = homed(Bench(controller))
+    expected = stage.identify()
+    bench = Bench(controller)
+    filter_once(bench.wire.filters_to_host, lambda data: data.replace(old, old + b"0"), lambda data: start in data)
+    stage = homed(bench)
+    assert stage.identify() == expected
+
+
+def test_settings_without_motion_may_keep_changing() -> None:
+    bench, digits = Bench(SimulatedGrbl), count(1)
+    bench.wire.filters_to_host.append(lambda data: b"$30=%d\r\n" % next(digits) if data.startswith(b"$30=") else data)
+    assert homed(bench).trusted
