@@ -5,6 +5,7 @@ cancelled without losing the position, and the parser's state does not change. W
 coordinates, whatever work offset is stored in the controller.
 """
 
+import math
 import re
 from collections.abc import Sequence
 from contextlib import suppress
@@ -19,8 +20,11 @@ from faintfield.rig.stages.transport import LineTransport, Ok, motion_words, rea
 
 # GRBL's real-time characters.
 _CANCEL_JOG, _RESET, _HOLD, _STATUS_REQUEST = b"\x85", b"\x18", b"!", b"?"
-# Between status requests, in s; GRBL's documentation recommends at most five a second.
-_POLL_INTERVAL_S = 0.2
+# Between status requests, in s; GRBL's documentation recommends at most five a second. Where a capture waits for the
+# answer, at the end of a motion and before and after an exposure, it is asked sooner.
+_POLL_INTERVAL_S, _SOON_S = 0.2, 0.05
+# How long (s) after the predicted end of a motion it is asked so often.
+_ARRIVAL_S = 0.5
 # Waits in s: for the banner after the port was opened and the boot loader has run; for the banner after a reset; for
 # the status report of a board that did not restart; for the response to a command.
 _BOOT_S = 3.0
@@ -43,7 +47,7 @@ class GrblController:
         self._clock = line.clock
         self._axes = axes
         self._index = tuple("XYZ".index(axis) for axis in axes)
-        self._braking_s = self._next_poll_s = 0.0
+        self._braking_s, self._polled_s = 0.0, -math.inf
         self._offset_mm: tuple[float, ...] | None = None
         self._alarm: int | None = None
         self._count_lost = False  # since the stage was homed
@@ -91,9 +95,10 @@ class GrblController:
 
     def follow(self, path: Sequence[Point], feed_mm_per_s: float, predicted_s: float) -> Point:
         """Queue one jog per point and wait for the last to end."""
+        begun_s = self._clock.now_s()
         for point in path:
             self._command(f"$J=G90 G21 G53 {motion_words(self._axes, point, feed_mm_per_s)}")
-        return self._wait_until_still(predicted_s)
+        return self._wait_until_still(max(0.0, predicted_s - (self._clock.now_s() - begun_s)))
 
     def jog(self, by: Point, feed_mm_per_s: float, predicted_s: float, *, unlock: bool) -> Point:
         """Jog by a distance, first clearing a lock if `unlock`."""
@@ -104,7 +109,7 @@ class GrblController:
 
     def read_position(self) -> Point:
         """Return the machine position of a new report; raises unless the state is idle."""
-        report = self._poll()
+        report = self._poll(_SOON_S)
         if report.state != "Idle":
             raise self._state_failure(report)
         return self._machine_point(report)
@@ -169,18 +174,21 @@ class GrblController:
             messages.append(message)
         raise StageTimeout(f"no answer to {text!r} within {bound_s:g} s; check cable and power, recover and home it")
 
-    def _poll(self) -> grbl.Report:
-        """Request a status report and return it."""
+    def _poll(self, interval_s: float = _POLL_INTERVAL_S) -> grbl.Report:
+        """Request a status report, not sooner than an interval after the last request, and return it."""
         self._read_until(self._clock.now_s())
-        while self._clock.now_s() < self._next_poll_s:
-            self._receive(self._next_poll_s)
-        self._next_poll_s = self._clock.now_s() + _POLL_INTERVAL_S
-        self._line.send(_STATUS_REQUEST)
+        while self._clock.now_s() < self._polled_s + interval_s:
+            self._receive(self._polled_s + interval_s)
+        self._request_status()
         deadline_s = self._clock.now_s() + _ANSWER_S
         while (message := self._receive(deadline_s)) is not None:
             if isinstance(message, grbl.Report):
                 return message
         raise StageTimeout(f"no status report within {_ANSWER_S:g} s; check cable and power, recover and home it")
+
+    def _request_status(self) -> None:
+        self._polled_s = self._clock.now_s()
+        self._line.send(_STATUS_REQUEST)
 
     def _bring_to_rest(self) -> grbl.Report:
         """Stop what moves, end what is on hold, and return a report of the state `Idle` or `Alarm`.
@@ -219,10 +227,9 @@ class GrblController:
         raise StageTimeout(f"{problem}; switch it off and on, then home it")
 
     def _poll_despite_failures(self) -> grbl.Report | None:
-        self._line.send(_STATUS_REQUEST)
-        self._next_poll_s = self._clock.now_s() + _POLL_INTERVAL_S
+        self._request_status()
         newest: grbl.Report | None = None
-        for text in self._line.lines_until(self._next_poll_s):
+        for text in self._line.lines_until(self._polled_s + _POLL_INTERVAL_S):
             message = grbl.parse(text)
             self._note(message)
             if isinstance(message, grbl.Report):
@@ -238,7 +245,8 @@ class GrblController:
         self._read_until(started_s + predicted_s)
         last: Point | None = None
         while self._clock.now_s() < started_s + bound_s:
-            report = self._poll()
+            arriving = self._clock.now_s() < started_s + predicted_s + _ARRIVAL_S
+            report = self._poll(_SOON_S if arriving else _POLL_INTERVAL_S)
             if report.state == "Idle":
                 point = self._machine_point(report)
                 if point == last:
