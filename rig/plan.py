@@ -42,8 +42,8 @@ MAX_FRAMES = 100_000
 MAX_EXPOSURE_S = 100_000.0
 # No quantity of a rig is larger, and computing with numbers up to it does not overflow.
 MAX_NUMBER = 1e12
-# Time in s to verify that the stage has arrived: two status reports at five per second, and half a wait for the first.
-_ARRIVAL_S = 0.3
+# Time in s to verify that the stage has arrived: two status reports, and a motion that takes longer than predicted.
+_ARRIVAL_S = 0.15
 
 
 class Grid(Struct, frozen=True, forbid_unknown_fields=True):

@@ -1,6 +1,5 @@
 """Planes of the frames so far: back-projections that each frame is added to at once, and PMLEM in the time left."""
 
-from collections import defaultdict
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -44,48 +43,65 @@ class _Refined(NamedTuple):
     done: bool
 
 
-class CompleteViews:
-    """Images of the nodes that have all of their frames, one after another in memory, which solvers read as they are.
+class ViewSums:
+    """Sums of the frames of each node, one after another in memory, which solvers read as they are.
 
-    `np.empty` takes memory as nodes are complete.
+    Those of the `views` that have all of their frames come first; sums of the others follow, in the order of `_order`.
+    There is one image per node, however many frames are missing, and `np.empty` takes its memory when it is used.
     """
 
     def __init__(self, shape: tuple[int, int], nodes: int, frames_per_view: int) -> None:
         self._electrons = np.empty((nodes, *shape), np.float32)
         self._valid = np.empty((nodes, *shape), bool)
         self._frames_per_view = frames_per_view
-        self._waiting: dict[int, list[ElementalImages]] = defaultdict(list)
-        self.views: list[int] = []
+        self._order: list[int] = []
+        self._counts: dict[int, int] = {}
+        self._complete = 0
+
+    @property
+    def views(self) -> tuple[int, ...]:
+        """Views that have all of their frames."""
+        return tuple(self._order[: self._complete])
 
     def add(self, view: int, images: ElementalImages) -> None:
-        """Add a frame to all planes; return its pixels (row, column), in electrons.
-
-        Raises `InputError` if the file cannot be read, or does not fit the others.
-        """
-        frames = self._waiting[view]
-        frames.append(images)
-        if len(frames) < self._frames_per_view:
-            return
-        place = len(self.views)
-        self.views.append(view)
-        self._electrons[place] = sum(frame.electrons[0] for frame in frames)
-        self._valid[place] = np.all([True if frame.valid is None else frame.valid[0] for frame in frames], axis=0)
-        del self._waiting[view]
+        """Add a frame to its node."""
+        if view not in self._counts:
+            place = len(self._order)
+            self._order.append(view)
+            self._counts[view], self._electrons[place], self._valid[place] = 0, 0, True
+        place = self._order.index(view)
+        self._counts[view] += 1
+        self._electrons[place] += images.electrons[0]
+        if images.valid is not None:
+            self._valid[place] &= images.valid[0]
+        if self._counts[view] == self._frames_per_view:
+            self._swap(place, self._complete)
+            self._complete += 1
 
     def drop(self, view: int) -> None:
-        """Forget a node; the last one takes its place."""
-        self._waiting.pop(view, None)
-        if view in self.views:
-            place, last = self.views.index(view), len(self.views) - 1
-            self._electrons[place], self._valid[place] = self._electrons[last], self._valid[last]
-            self.views[place] = self.views[last]
-            self.views.pop()
+        """Forget a node."""
+        if self._counts.pop(view, None) is None:
+            return
+        place = self._order.index(view)
+        if place < self._complete:
+            self._complete -= 1
+            self._swap(place, self._complete)
+            place = self._complete
+        self._swap(place, len(self._order) - 1)
+        self._order.pop()
 
     def images(self, background_e: float | Image, read_variance_e2: float | Image) -> ElementalImages:
         """Return the images in the order of `views`, given what all of them share."""
-        count = len(self.views)
-        valid = self._valid[:count]
-        return ElementalImages(self._electrons[:count], background_e, read_variance_e2, None if valid.all() else valid)
+        valid = self._valid[: self._complete]
+        electrons = self._electrons[: self._complete]
+        return ElementalImages(electrons, background_e, read_variance_e2, None if valid.all() else valid)
+
+    def _swap(self, first: int, second: int) -> None:
+        if first == second:
+            return
+        for values in (self._electrons, self._valid):
+            values[[first, second]] = values[[second, first]]
+        self._order[first], self._order[second] = self._order[second], self._order[first]
 
 
 class _Frame(NamedTuple):
@@ -115,7 +131,7 @@ class PlaneAccumulator:
         shape, nodes = (height // scene.bins, width // scene.bins), len(elemental_set.settings.view)
         self.stack_bytes = 4 * nodes * shape[0] * shape[1]
         keeps = scene.knows_noise and self.stack_bytes <= MAX_STACK_BYTES
-        self._complete = CompleteViews(shape, nodes, elemental_set.frames_per_view) if keeps else None
+        self._sums = ViewSums(shape, nodes, elemental_set.frames_per_view) if keeps else None
 
     @property
     def nodes(self) -> set[tuple[int, int]]:
@@ -125,7 +141,7 @@ class PlaneAccumulator:
     @property
     def complete(self) -> int:
         """Number of nodes that PMLEM can take."""
-        return 0 if self._complete is None else len(self._complete.views)
+        return 0 if self._sums is None else len(self._sums.views)
 
     def add(self, frame: LiveFrame) -> NDArray[np.float32]:
         """Add a frame to all planes; return its pixels (row, column), in electrons.
@@ -140,8 +156,8 @@ class PlaneAccumulator:
             self._latest[index] = view = self._project(index, read)
             if view is not None:
                 running.add(view, _half(frame))
-        if self._complete is not None:
-            self._complete.add(read.view, read.images)
+        if self._sums is not None:
+            self._sums.add(read.view, read.images)
         self.frames[frame.intent] = frame
         return read.pixels
 
@@ -152,10 +168,10 @@ class PlaneAccumulator:
         for index, running in enumerate(self._running):
             if (view := self._project(index, read)) is not None:
                 running.remove(view, _half(frame))
-        if self._complete is not None:
-            self._complete.drop(read.view)
+        if self._sums is not None:
+            self._sums.drop(read.view)
             for same_node in [kept for kept in self.frames.values() if kept.node == frame.node]:
-                self._complete.add(read.view, self._read(same_node).images)
+                self._sums.add(read.view, self._read(same_node).images)
 
     def picture(self, index: int, kind: PictureKind) -> tuple[Image, NDArray[np.bool_], int] | None:
         """Return a plane (row, column) in electrons per pixel, where it is covered, and from how many nodes."""
@@ -176,20 +192,20 @@ class PlaneAccumulator:
 
     def is_refined(self, index: int) -> bool:
         """Return whether PMLEM has reached the optimum of the nodes that are complete."""
-        if self._complete is None or not self._complete.views:
+        if self._sums is None or not self._sums.views:
             return True
         refined = self._refined.get(index)
-        return refined is not None and refined.done and refined.views == tuple(self._complete.views)
+        return refined is not None and refined.done and refined.views == self._sums.views
 
     def refine(self, index: int, interrupted: Callable[[], bool]) -> None:
         """Run PMLEM on a plane, from where it was left, until its optimum is near or `interrupted`.
 
         The weight of the penalty follows from the noise, as in `universal_penalty_weight`; no views are held out.
         """
-        assert self._complete is not None
-        views = tuple(self._complete.views)
+        assert self._sums is not None
+        views = self._sums.views
         elemental_set, bins = self.scene.elemental_set, self.scene.bins
-        images = self._complete.images(
+        images = self._sums.images(
             _binned_sum(elemental_set.background_e(self._noise), bins),
             _binned_sum(elemental_set.read_variance_e2(self._noise), bins),
         )

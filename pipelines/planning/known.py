@@ -19,6 +19,7 @@ from faintfield.pipelines.planning.options import PlanOptions
 from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import RigError
+from faintfield.rig.session.session import FRAMES, has_session, taken_frames
 from faintfield.rig.settings import RigSettings
 from faintfield.rig.simulation.lab import lab_experiment
 from faintfield.rig.stages.motion import StageWorkspace
@@ -165,7 +166,7 @@ def _light_of_frame(path: Path, options: PlanOptions, sensor: Sensor) -> Light:
     """Return the light of a frame, with its interval: by the noise of its pixels, and by that of the calibration."""
     frame = read_frame(path)
     stated_ms = options.frame_exposure_ms
-    exposure_s = frame.exposure_s if stated_ms is None else 1e-3 * stated_ms
+    exposure_s = _exposure_in_session(path) or frame.exposure_s if stated_ms is None else 1e-3 * stated_ms
     if exposure_s is None:
         raise BadValue(f"{path}: states no exposure time; give --frame-exposure-ms")
     if frame.pixels_dn.ndim != 2:
@@ -208,6 +209,15 @@ def _light_of_frame(path: Path, options: PlanOptions, sensor: Sensor) -> Light:
     source = f"{path.name}, {1e3 * exposure_s:g} ms, mean of {part}{exact}"
     ends = low_e / exposure_s, high_e / exposure_s
     return Light(Estimate(light_e / exposure_s, margin_e / _Z95 / exposure_s, ends), source)
+
+
+def _exposure_in_session(path: Path) -> float | None:
+    """Return the exposure of a frame by the plan of its session; None for a file that is no frame of one."""
+    folder = path.absolute().parent
+    if folder.name != FRAMES or not has_session(folder.parent):
+        return None
+    exposures_s = {taken.file: frame.exposure_s for frame, taken, _ in taken_frames(folder.parent)}
+    return exposures_s.get(path.name)
 
 
 def _region(path: Path, options: PlanOptions, width: int, height: int) -> tuple[slice, slice]:

@@ -25,7 +25,7 @@ class PlanOptions:
     test_frame
         A frame of the scene, of any exposure; its mean is taken, with its interval.
     frame_exposure_ms
-        Exposure of that frame; by default what its file states.
+        Exposure of that frame; by default what its session, or else its file states.
     region_px
         Left column, upper row, width and height of the object in that frame; by default all of a test frame.
     depth_mm

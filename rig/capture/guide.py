@@ -172,7 +172,7 @@ def format_capture_duration(duration_s: float, stage: StageSettings) -> str:
 
 # Time in s of a stop besides motion and rest, and of a frame besides exposure and readout, until one has been measured:
 # two status reports, and writing a file.
-_STOP_S, _FRAME_S = 0.5, 0.2
+_STOP_S, _FRAME_S = 0.15, 0.2
 
 
 class Pace:
@@ -279,10 +279,10 @@ class Dialogue:
         done, total = len(self.session.valid()), len(self.session.frames)
         raise CaptureStopped(f"stopped with {done} of {total} frames taken; run the same command to go on")
 
-    def show_status(self, frame: PlannedFrame, doing: str) -> None:
-        """Show the state of the capture, which is `doing` something for `frame`."""
+    def show_status(self, frame: PlannedFrame, doing: str, recording: PlannedFrame | None = None) -> None:
+        """Show the state of the capture, which is `doing` something for `frame`, while another one is recorded."""
         session = self.session
-        missing, steps = session.missing(), session.plan.steps
+        missing, steps = [left for left in session.missing() if left != recording], session.plan.steps
         to_check = {frame.step for frame in missing if steps[frame.step].at == "grid"}
         status = Status(
             doing=doing,

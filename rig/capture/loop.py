@@ -128,7 +128,7 @@ class Capture:
             if frame not in session.skipped():
                 self._handle_request(frame)
                 if frame in session.missing():
-                    self._take(frame)
+                    self._take(frame, following)
             if following is None or following.stop != frame.stop:  # a homing would part the frames of a node
                 self._check_drift(frame, session.frozen.rig.drift.every_nodes)
         if session.plan.steps[first.step].at == "grid":
@@ -152,7 +152,7 @@ class Capture:
                     self._untimed_checks = 0
             return
 
-    def _take(self, frame: PlannedFrame) -> None:
+    def _take(self, frame: PlannedFrame, following: PlannedFrame | None = None) -> None:
         self._failures = 0
         while True:
             try:
@@ -161,7 +161,7 @@ class Capture:
                     if self._drift.watch is not None:
                         self._mark_unchecked("the stage was homed")
                     begin_group(self._session.journal)
-                self._taker.take(frame)
+                self._taker.take(frame, following)
             except (StageError, NotHomed, CameraError, LightError) as failure:
                 if self._handle_failure(frame, failure) == "skip":
                     self._session.skip(frame)

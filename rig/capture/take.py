@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,22 +15,33 @@ from faintfield.rig.capture.checks import LIT_KINDS, Findings, Settling, board_w
 from faintfield.rig.capture.guide import MAX_UNATTENDED_TRIES, Answer, Dialogue, Prompt
 from faintfield.rig.capture.lighting import Lighting
 from faintfield.rig.capture.survey import read_temperature
-from faintfield.rig.errors import CameraError, CameraTimeout, DriftUnknown, LightError, PositionDrifted, RigError
+from faintfield.rig.errors import (
+    CameraError,
+    CameraTimeout,
+    DriftUnknown,
+    LightError,
+    NotHomed,
+    PositionDrifted,
+    RigError,
+    StageError,
+)
 from faintfield.rig.plan import PlannedFrame
 from faintfield.rig.session.journal import CommittedFrame, FrameRecord
 from faintfield.rig.stages.drift import DriftWatch
+from faintfield.rig.stages.protocol import Point
 
 
 class DriftChecks:
     """The drift checks of a capture; `watch`, which measures the drift, is None if `drift.check` is off.
 
-    `nodes` counts those that the stage moved to since the last check.
+    `nodes` counts those with an exposure since the last check.
     """
 
     def __init__(self, dialogue: Dialogue) -> None:
         self._dialogue = dialogue
         self._session, self._rig, self._pace = dialogue.session, dialogue.rig, dialogue.pace
         settings = self._session.frozen.rig.drift
+        self._every_nodes = settings.every_nodes
         self.nodes = 0
         self._failures = 0
         self.watch = DriftWatch(self._rig.stage, limit_mm=settings.limit_mm) if settings.check else None
@@ -48,6 +60,10 @@ class DriftChecks:
         """Note that a frame relies on the position of the stage."""
         if self.watch is not None:
             self.watch.unchecked.append(frame)
+
+    def is_due(self) -> bool:
+        """Return whether a check is due once the present node is done."""
+        return self.watch is not None and 0 < self._every_nodes <= self.nodes
 
     def check_after(self, nodes: int) -> None:
         """Check for drift if at least `nodes` nodes were visited since the last check; 0 means no check."""
@@ -99,12 +115,17 @@ class FrameTaker:
         self._layouts: dict[str, str | None] = {}
         self._unkept_numbers = itertools.count(_FIRST_UNKEPT_NUMBER)
         self.last: PlannedFrame | None = None
+        self._arrived = False  # since the last exposure
+        self._failure_ahead: StageError | NotHomed | None = None
         self._measures = self._settings.settle.measure and self._rig.camera_sees_stage
         for settling in self._session.journal.details("settling", Settling):
             self._rest_as(settling)
 
-    def take(self, frame: PlannedFrame) -> None:
+    def take(self, frame: PlannedFrame, following: PlannedFrame | None = None) -> None:
         """Move to the node of a frame and take it; before the first frame of a step, wait for the sensor to be cool.
+
+        While the frame is written, checked and committed, the stage moves on to the `following` one, if that is given.
+        A failure on this way is raised when the following frame, or any other, is to be taken.
 
         Raises `StageError`, `NotHomed`, `CameraError`, `LightError` or `SessionUnwritable`, after which the frame is
         still missing.
@@ -115,10 +136,11 @@ class FrameTaker:
         self._cooled_step = frame.step
         try:
             self._lighting.prepare(frame, self._look)
-            self._dialogue.show_status(frame, "moving")
+            if self._pace.here != frame.stop.target:
+                self._dialogue.show_status(frame, "moving")
             self._go_to(frame)
             self._dialogue.show_status(frame, "exposing")
-            self._expose(frame)
+            self._expose(frame, following)
         except CameraError:
             self._cooled_step = None  # a camera that failed was perhaps switched off
             raise
@@ -162,27 +184,73 @@ class FrameTaker:
 
     def _go_to(self, frame: PlannedFrame) -> None:
         target = frame.stop.target
+        failure, self._failure_ahead = self._failure_ahead, None
+        if failure is not None:
+            raise failure
         if self._pace.here == target:
             return
         self._pace.depart()
         self._rig.stage.move_to(*target)
-        self._drift.nodes += 1
+        self._arrived = True
         measures = self._measures and frame.kind in LIT_KINDS
         if measures:
             self._measure_settling(frame)
         self._rig.clock.sleep_s(self._pace.rest_s[frame.kind])
         self._pace.arrive(target, frame.kind, timed=not measures)
 
-    def _expose(self, frame: PlannedFrame) -> None:
+    def _expose(self, frame: PlannedFrame, following: PlannedFrame | None) -> None:
         """Take a frame at the present node; the order of these steps makes a kill at any moment harmless."""
         rig, session = self._rig, self._session
         begun_s = rig.clock.now_s()
+        self._drift.nodes += self._arrived
+        self._arrived = False
         intent = session.intend(frame)
         position = rig.stage.verify_at(*frame.stop.target)
         self._lighting.verify(frame)
         exposure = rig.camera.expose(frame.exposure_s, intent)
         rig.stage.verify_at(*frame.stop.target)
         self._lighting.verify(frame)
+        # Leaving the block waits for the record, so that an interrupted motion loses no frame
+        with ThreadPoolExecutor(1, "record of a frame") as recorder:
+            recording = recorder.submit(self._record, frame, intent, position.point, exposure)
+            begun_s += self._go_ahead(frame, following)
+            committed, pixels = recording.result()
+        findings = committed.record
+        self._drift.add(committed)
+        self.last = frame
+        if findings.warnings:
+            self._dialogue.warnings = tuple(f"{frame.name}: {warning}" for warning in findings.warnings)
+        if frame.kind == "charuco":
+            corners = {
+                number: int(taken.record.checks["board_corners"])
+                for number, taken in session.valid().items()
+                if "board_corners" in taken.record.checks
+            }
+            for warning in board_warnings(frame, session.frames, corners, self._settings.checks.board_corners):
+                self._dialogue.warn(warning)
+        self._pace.finish_frame(begun_s, frame.exposure_s)
+        if pixels is not None:
+            self._dialogue.operator.show_frame(frame, pixels, findings.checks)
+
+    def _go_ahead(self, frame: PlannedFrame, following: PlannedFrame | None) -> float:
+        """Move to the node of the following frame, unless there is something to do before; return the time taken."""
+        if following is None or following.stop == frame.stop or self._drift.is_due():
+            return 0.0
+        if self._measures and following.kind in LIT_KINDS:
+            return 0.0
+        begun_s = self._rig.clock.now_s()
+        self._dialogue.show_status(following, "moving", recording=frame)
+        try:
+            self._go_to(following)
+        except (StageError, NotHomed) as failure:
+            self._failure_ahead = failure
+        return self._rig.clock.now_s() - begun_s
+
+    def _record(
+        self, frame: PlannedFrame, intent: int, position: Point, exposure: Exposure
+    ) -> tuple[CommittedFrame, Pixels | None]:
+        """Write, check and commit a frame; set one aside that is none of this session, and raise `CameraError`."""
+        session = self._session
         written = session.write(frame, intent, exposure)
         try:
             pixels = self._decode_frame(frame, written.path, exposure)
@@ -192,24 +260,10 @@ class FrameTaker:
             raise
         lights = self._lighting.of(frame)
         record = FrameRecord(
-            *(position.point, frame.exposure_s, dict(exposure.metadata), findings.values, findings.warnings),
+            *(position, frame.exposure_s, dict(exposure.metadata), findings.values, findings.warnings),
             lights=None if lights is None else tuple(sorted(lights)),
         )
-        self._drift.add(session.commit(frame, written, record))
-        self.last = frame
-        if findings.warnings:
-            self._dialogue.warnings = tuple(f"{frame.name}: {warning}" for warning in findings.warnings)
-        if frame.kind == "charuco":
-            corners = {
-                number: int(committed.record.checks["board_corners"])
-                for number, committed in session.valid().items()
-                if "board_corners" in committed.record.checks
-            }
-            for warning in board_warnings(frame, session.frames, corners, self._settings.checks.board_corners):
-                self._dialogue.warn(warning)
-        self._pace.finish_frame(begun_s, frame.exposure_s)
-        if pixels is not None:
-            self._dialogue.operator.show_frame(frame, pixels, findings.values)
+        return session.commit(frame, written, record), pixels
 
     def _decode_frame(self, frame: PlannedFrame, path: Path, exposure: Exposure) -> Pixels | None:
         """Return the pixels of a frame, None if it cannot be decoded here; its layout must be that of the session."""

@@ -4,6 +4,7 @@ The journal is SQLite in WAL mode with synchronous=FULL: once a call returns, wh
 Rows are only added, and ordered by their numbers; times are for people, since clocks can be set back.
 """
 
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from datetime import UTC, datetime
@@ -122,6 +123,7 @@ class Journal:
         self.path = path
         self._read_only = read_only
         self._traffic: list[tuple[float, str, bytes]] = []
+        self._lock = threading.RLock()  # a frame is recorded in another thread while the stage moves
         if create and not path.exists():
             create_database(path)
         with self._translate_errors():
@@ -248,19 +250,20 @@ class Journal:
     def _transaction(self) -> Iterator[None]:
         """Run the block as one transaction, which also writes the pending traffic; an interrupt may come anywhere."""
         written: list[tuple[float, str, bytes]] = []
-        with self._translate_errors():
+        with self._lock, self._translate_errors():
             try:
                 if self._db.in_transaction:  # an interrupt came before it could be rolled back
                     self._db.execute("ROLLBACK")
                 self._db.execute("BEGIN IMMEDIATE")
                 yield
-                if self._traffic:
-                    self._add("traffic", *((None, *entry) for entry in self._traffic))
-                written, self._traffic = self._traffic, []
+                pending = self._traffic[:]  # the stage may add to it meanwhile
+                if pending:
+                    self._add("traffic", *((None, *entry) for entry in pending))
+                written, self._traffic[: len(pending)] = pending, []
                 self._db.execute("COMMIT")
             except BaseException:
                 if self._db.in_transaction:  # else the commit was done, or nothing begun
-                    self._traffic = written + self._traffic
+                    self._traffic[:0] = written
                     self._db.execute("ROLLBACK")
                 raise
 

@@ -11,7 +11,7 @@ from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.motion import path_duration_s
 from faintfield.rig.stages.protocol import Point
 
-# Lowest rate of position reports, per second: GRBL is asked five times a second; and how many are timed.
+# Lowest rate of position reports, per second: a capture waits for them; and how many are timed.
 _MIN_REPORTS_PER_S, _REPORTS = 4.0, 10
 
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from operator import truediv
 
-from faintfield.rig.errors import StageError, StageRejected, StageTimeout, WrongFirmware
+from faintfield.rig.errors import StageAlarm, StageError, StageRejected, StageTimeout, WrongFirmware
 from faintfield.rig.stages import grbl_alarms as failures
 from faintfield.rig.stages import grbl_lines as grbl
 from faintfield.rig.stages.motion import timeout_s
@@ -20,8 +20,11 @@ from faintfield.rig.stages.transport import LineTransport, Ok, motion_words, rea
 
 # GRBL's real-time characters.
 _CANCEL_JOG, _RESET, _HOLD, _STATUS_REQUEST = b"\x85", b"\x18", b"!", b"?"
-# Between status requests, in s; GRBL's documentation recommends at most five a second.
-_POLL_INTERVAL_S = 0.2
+# Between status requests, in s; GRBL's documentation recommends at most five a second. Where a capture waits for the
+# answer, at the end of a motion and before and after an exposure, it is asked sooner.
+_POLL_INTERVAL_S, _SOON_S = 0.2, 0.05
+# How long (s) after the predicted end of a motion it is asked so often.
+_ARRIVAL_S = 0.5
 # Waits in s: for the banner after the port was opened and the boot loader has run; for the banner after a reset; for
 # the status report of a board that did not restart; for the response to a command.
 _BOOT_S = 3.0
@@ -49,7 +52,7 @@ class GrblController:
         self._clock = line.clock
         self._axes = axes
         self._index = tuple("XYZ".index(axis) for axis in axes)
-        self._braking_s = self._next_poll_s = 0.0
+        self._braking_s, self._polled_s = 0.0, -math.inf
         self._offset_mm: tuple[float, ...] | None = None
         self._alarm: int | None = None
         self._outputs: frozenset[str] | None = None  # as last reported
@@ -58,11 +61,12 @@ class GrblController:
         self._coolants: set[OutputKind] = set()  # as commanded: M9 switches both off
         self._count_lost = False  # since the stage was homed
         self._homing = False  # by the last command
+        self._door_opened = False  # since the last report of rest
 
     def connect(self, wait_s: float = 0.0) -> None:
         """Open the connection, waiting up to `wait_s` for its port, and wait for the banner, as most boards restart."""
         self._offset_mm = self._alarm = None
-        self._count_lost, self._homing = True, False
+        self._count_lost, self._homing, self._door_opened = True, False, False
         self._forget_outputs()
         self._line.open(wait_s)
         if self._await_banner(_BOOT_S):
@@ -82,7 +86,8 @@ class GrblController:
     def identify(self) -> Identity:
         """Read build information and settings, the settings twice since the line has no checksum."""
         build = {message.kind: message.text for message in self._command("$I") if isinstance(message, grbl.Feedback)}
-        identity = grbl.GrblSettings(read_twice(self._read_settings), build).identity(self._index)
+        values = read_twice(self._read_settings, grbl.motion_settings)
+        identity = grbl.GrblSettings(values, build).identity(self._index)
         motion = identity.motion
         self._braking_s = max(map(truediv, motion.rate_mm_per_s, motion.acceleration_mm_per_s2))
         for _ in range(_MAX_REPORTS_TO_OFFSET):
@@ -100,9 +105,10 @@ class GrblController:
 
     def follow(self, path: Sequence[Point], feed_mm_per_s: float, predicted_s: float) -> Point:
         """Queue one jog per point and wait for the last to end."""
+        begun_s = self._clock.now_s()
         for point in path:
             self._command(f"$J=G90 G21 G53 {motion_words(self._axes, point, feed_mm_per_s)}")
-        return self._wait_until_still(predicted_s)
+        return self._wait_until_still(max(0.0, predicted_s - (self._clock.now_s() - begun_s)))
 
     def jog(self, by: Point, feed_mm_per_s: float, predicted_s: float, *, unlock: bool) -> Point:
         """Jog by a distance, first clearing a lock if `unlock`."""
@@ -113,9 +119,9 @@ class GrblController:
 
     def read_position(self) -> Point:
         """Return the machine position of a new report; raises unless the state is idle."""
-        report = self._poll()
+        report = self._poll(_SOON_S)
         if report.state != "Idle":
-            raise failures.state_failure(report, self._alarm)
+            raise self._state_failure(report)
         return self._machine_point(report)
 
     def switches(self) -> frozenset[AxisIndex]:
@@ -219,24 +225,27 @@ class GrblController:
             if isinstance(message, grbl.ErrorCode):
                 if message.code in failures.LOCKED_ERRORS:
                     report = self._poll()
-                    if report.state not in ("Idle", "Jog", "Run"):
-                        raise failures.state_failure(report, self._alarm)
+                    if self._is_frozen(report) or report.state not in ("Idle", "Jog", "Run"):
+                        raise self._state_failure(report)
                 raise failures.error_failure(text, message.code)
             messages.append(message)
         raise StageTimeout(f"no answer to {text!r} within {bound_s:g} s; check cable and power, recover and home it")
 
-    def _poll(self) -> grbl.Report:
-        """Request a status report and return it."""
+    def _poll(self, interval_s: float = _POLL_INTERVAL_S) -> grbl.Report:
+        """Request a status report, not sooner than an interval after the last request, and return it."""
         self._read_until(self._clock.now_s())
-        while self._clock.now_s() < self._next_poll_s:
-            self._receive(self._next_poll_s)
-        self._next_poll_s = self._clock.now_s() + _POLL_INTERVAL_S
-        self._line.send(_STATUS_REQUEST)
+        while self._clock.now_s() < self._polled_s + interval_s:
+            self._receive(self._polled_s + interval_s)
+        self._request_status()
         deadline_s = self._clock.now_s() + _ANSWER_S
         while (message := self._receive(deadline_s)) is not None:
             if isinstance(message, grbl.Report):
                 return message
         raise StageTimeout(f"no status report within {_ANSWER_S:g} s; check cable and power, recover and home it")
+
+    def _request_status(self) -> None:
+        self._polled_s = self._clock.now_s()
+        self._line.send(_STATUS_REQUEST)
 
     def _bring_to_rest(self) -> grbl.Report:
         """Stop what moves, end what is on hold, and return a report of the state `Idle` or `Alarm`.
@@ -275,10 +284,9 @@ class GrblController:
         raise StageTimeout(f"{problem}; switch it off and on, then home it")
 
     def _poll_despite_failures(self) -> grbl.Report | None:
-        self._line.send(_STATUS_REQUEST)
-        self._next_poll_s = self._clock.now_s() + _POLL_INTERVAL_S
+        self._request_status()
         newest: grbl.Report | None = None
-        for text in self._line.lines_until(self._next_poll_s):
+        for text in self._line.lines_until(self._polled_s + _POLL_INTERVAL_S):
             message = grbl.parse(text)
             self._note(message)
             if isinstance(message, grbl.Report):
@@ -294,18 +302,26 @@ class GrblController:
         self._read_until(started_s + predicted_s)
         last: Point | None = None
         while self._clock.now_s() < started_s + bound_s:
-            report = self._poll()
+            arriving = self._clock.now_s() < started_s + predicted_s + _ARRIVAL_S
+            report = self._poll(_SOON_S if arriving else _POLL_INTERVAL_S)
             if report.state == "Idle":
                 point = self._machine_point(report)
                 if point == last:
                     return point
                 last = point
-            elif report.state in ("Jog", "Run"):
+            elif report.state in ("Jog", "Run") and not self._is_frozen(report):
                 last = None
             else:
-                raise failures.state_failure(report, self._alarm)
+                raise self._state_failure(report)
         state = f"the stage still moves after {bound_s:.1f} s, where {predicted_s:.1f} s were expected"
         raise StageTimeout(f"{state}; it was told to stop: recover and home it")
+
+    def _is_frozen(self, report: grbl.Report) -> bool:
+        """Return whether a door has frozen a jog: grblHAL still reports it as one, GRBL cancels it."""
+        return self._door_opened and report.state == "Jog"
+
+    def _state_failure(self, report: grbl.Report) -> StageAlarm:
+        return failures.door_failure() if self._is_frozen(report) else failures.state_failure(report, self._alarm)
 
     def _machine_point(self, report: grbl.Report) -> Point:
         values = report.position
@@ -347,10 +363,13 @@ class GrblController:
     def _note(self, message: grbl.Message) -> None:
         if isinstance(message, grbl.Report):
             self._offset_mm = self._offset_mm if message.offset is None else message.offset
+            self._door_opened = (self._door_opened or message.door_is_open) and message.state != "Idle"
             self._reported_s = self._clock.now_s()
             self._outputs_due = message.outputs is None and not message.is_brief
             self._outputs = self._outputs if message.outputs is None else message.outputs
             self._outputs_unreported = self._outputs_unreported and message.outputs is None
+        elif isinstance(message, grbl.Feedback):
+            self._door_opened = self._door_opened or message.is_door
         elif isinstance(message, grbl.Banner):
             self._count_lost = True
             self._forget_outputs()

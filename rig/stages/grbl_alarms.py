@@ -35,19 +35,30 @@ _ALARMS = {
     18: ("homing failed: it is not set up", "correct $22 and $44 to $46, then recover and home it"),
 }
 
+_DAMAGED = "the command was damaged on its way: try again, with a shorter or shielded cable"
+
 # error:N → meaning, remedy
 _ERRORS = {
-    2: ("bad number format", "check the serial line"),
+    1: ("a letter was expected", _DAMAGED),
+    2: ("bad number format", _DAMAGED),
     3: ("unknown $ command", "flash GRBL 1.1 or grblHAL"),
     5: ("homing is not enabled", "set $22=1"),
     8: ("only allowed when idle", "wait until the stage stands, then try again"),
     9: ("locked by an alarm or a jog in progress", "recover and home it"),
-    11: ("line too long", "check the serial line"),
+    11: ("line too long", _DAMAGED),
     13: ("the safety door is open", "close it, then recover"),
     15: ("jog target outside the travel", "choose one inside, or correct $130 and $131"),
-    16: ("bad jog command", "check the serial line"),
+    16: ("bad jog command", _DAMAGED),
     20: ("unsupported command", "flash GRBL 1.1 or grblHAL"),
+    21: ("two commands of one group", _DAMAGED),
     22: ("no feed rate", "set stage.feed_mm_per_min"),
+    23: ("a whole number was expected", _DAMAGED),
+    24: ("two commands that take axes", _DAMAGED),
+    25: ("a word appears twice", _DAMAGED),
+    26: ("no axis is named", _DAMAGED),
+    31: ("an axis is named that is not used", _DAMAGED),
+    33: ("the target is invalid", _DAMAGED),
+    36: ("a value is not used by the command", _DAMAGED),
     45: ("a limit switch is closed, which allows nothing but homing", "recover and home it"),
     46: ("homing is required", "home it"),
     50: ("the emergency stop is pressed", "release it, then recover and home it"),
@@ -81,6 +92,11 @@ def error_failure(command: str, code: int) -> StageRejected:
     """Return the exception for an error in answer to `command`."""
     meaning, remedy = _ERRORS.get(code, ("unknown here", "look it up in the firmware's list of errors"))
     return StageRejected(f"the controller refused {command!r}: error:{code}, {meaning}; nothing moved by it; {remedy}")
+
+
+def door_failure() -> StageAlarm:
+    """Return the exception for a jog that a door has frozen."""
+    return StageAlarm("the safety door was opened, and the jog is frozen; close the door, then recover and home it")
 
 
 def state_failure(report: Report, alarm: int | None) -> StageAlarm:

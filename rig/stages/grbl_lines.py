@@ -22,6 +22,9 @@ _ROUNDING_MM = 0.001
 _HAL_SETTING = 40
 # The value of $1 that keeps the motors on between motions.
 _KEEP_MOTORS_ON = 255
+# The settings on which motion depends: inversions of step and direction, reports and units, limits and homing, and
+# steps, rates, accelerations and travel of all axes.
+_MOTION_SETTINGS = frozenset({2, 3, 10, 13, *range(20, 28), *range(40, 50), *range(100, 140)})
 
 
 class ErrorCode(Struct, frozen=True):
@@ -53,6 +56,11 @@ class Feedback(Struct, frozen=True):
     kind: str
     text: str
 
+    @property
+    def is_door(self) -> bool:
+        """Return whether the safety door was opened."""
+        return (self.kind, self.text) == ("MSG", "Check Door")
+
 
 class Report(Struct, frozen=True):
     """A real-time status report.
@@ -77,6 +85,11 @@ class Report(Struct, frozen=True):
     def emergency_stop(self) -> bool:
         """Return whether the emergency stop is pressed, which grblHAL reports among the inputs."""
         return "E" in self.pins
+
+    @property
+    def door_is_open(self) -> bool:
+        """Return whether the safety door is open, by its input."""
+        return "D" in self.pins
 
     @property
     def is_moving(self) -> bool:
@@ -126,6 +139,11 @@ _FORMS: tuple[tuple[str, Callable[[re.Match[str]], Message]], ...] = (
     (r"\[([A-Za-z0-9]+):(.*)\]", lambda match: Feedback(match[1], match[2])),
     (r"(?:Grbl|GrblHAL) \d{1,2}\.\d{1,2}[a-z]?(?: .*)?", lambda _: Banner()),
 )
+
+
+def motion_settings(values: dict[int, str]) -> dict[int, str]:
+    """Return the settings on which motion depends."""
+    return {number: value for number, value in values.items() if number in _MOTION_SETTINGS}
 
 
 class GrblSettings(Struct, frozen=True):

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import combinations
 from typing import Literal, Protocol
 
 import serial
@@ -204,12 +205,23 @@ def motion_words(axes: tuple[str, str], point: Point, feed_mm_per_s: float) -> s
     return f"{x}{point.x_mm:.3f} {y}{point.y_mm:.3f} F{60.0 * feed_mm_per_s:.1f}"
 
 
-def read_twice[T](read: Callable[[], T]) -> T:
-    """Return what `read` returns twice in a row; raises `StageLost` if it differs, as answers have no checksum."""
-    first = read()
-    if read() != first:
-        raise StageLost("the settings read differently twice in a row: the line is disturbed; try a shorter cable")
-    return first
+def read_twice[T](read: Callable[[], T], essential: Callable[[T], object] = lambda reading: reading) -> T:
+    """Return what two readings agree on, as answers have no checksum; two that differ are followed by a third.
+
+    Where no two of the three are the same, it is enough that their `essential` parts are. Raises `StageLost` if not
+    even these agree.
+    """
+    readings = [read(), read()]
+    if readings[0] != readings[1]:
+        readings.append(read())
+    pairs = list(combinations(readings, 2))
+    for one, other in pairs:
+        if one == other:
+            return other
+    for one, other in pairs:
+        if essential(one) == essential(other):
+            return other
+    raise StageLost("the settings read differently three times: the line is disturbed; try a shorter cable")
 
 
 def restart_failure() -> StageLost:

@@ -170,6 +170,7 @@ class SimulatedGrbl(SimulatedFirmware):
     def open_door(self) -> None:
         """Open the safety door, which cancels a jog and holds other motion."""
         self._set_outputs(frozenset())
+        self.say("[MSG:Check Door]")
         jogging = self.state == "Jog"
         self.state = "Door:2" if self.mechanics.moving else "Door:1"
         ahead = self.mechanics.brake()
@@ -239,7 +240,8 @@ class SimulatedGrbl(SimulatedFirmware):
         return self.state
 
     def _pins(self) -> str:
-        return "".join(axis for axis, closed in zip("XY", self.mechanics.switches(), strict=True) if closed)
+        pins = "".join(axis for axis, closed in zip("XY", self.mechanics.switches(), strict=True) if closed)
+        return pins + "D" * self.door_is_open
 
     def _resume(self) -> None:
         if self.state in ("Hold:0", "Door:0"):

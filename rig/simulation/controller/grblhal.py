@@ -48,6 +48,7 @@ class SimulatedGrblHal(SimulatedGrbl):
     def open_door(self) -> None:
         """Open the safety door, which freezes a jog."""
         if self.state == "Jog":
+            self.say("[MSG:Check Door]")
             self._held = self.mechanics.brake() or self._held
             self._frozen = True
             self._set_outputs(frozenset())

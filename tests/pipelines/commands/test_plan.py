@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 import tifffile
 
+from faintfield.rig.session.session import taken_frames
 from faintfield.rig.simulation.optics import SimulatedSensor
 from tests.pipelines.by_hand import FITTED, write_fitted_noise
 from tests.pipelines.conftest import Command, assert_refused
+from tests.pipelines.sessions import captured, rig_toml
 
 type Predict = Callable[..., dict[str, Any]]
 
@@ -203,6 +205,13 @@ def test_light_of_test_frame_has_interval(rig: Path, tmp_path: Path, predict: Pr
     plane, row = prediction["depths"][0], prediction["alternatives"][0]
     for number in (prediction["snr"], plane["sigma_e"], row["smallest_contrast"]):
         assert number["ci95"][0] < number["value"] < number["ci95"][1]
+
+
+def test_exposure_of_session_frame_is_known(rig: Path, tmp_path: Path, predict: Predict) -> None:
+    session = captured(tmp_path / "taken", rig_toml(["dark_scene"]))
+    frame = next(path for _, _, path in taken_frames(session))
+    stated = predict(rig, "--test-frame", frame, "--frame-exposure-ms", 100)
+    assert predict(rig, "--test-frame", frame)["light_e"] == stated["light_e"]
 
 
 def test_interval_includes_error_of_calibration(real: Path, tmp_path: Path, predict: Predict) -> None:

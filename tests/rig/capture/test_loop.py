@@ -222,11 +222,11 @@ def test_remaining_time_sums_motions_stops_exposures_checks() -> None:
     a, b = Point(-100.0, -100.0), Point(-50.0, -100.0)
     frames = [frame(0, 0, a, 2.0), frame(1, 0, a, 3.0), frame(2, 0, b, 5.0), frame(3, 1, b, 7.0)]
     pace.check_s = 11.0
-    # At first: a stop takes half a second and the rest, a frame a fifth of a second and the readout
-    motion_s = pace.remaining_s(frames[1:3], 0) - (2 * (0.5 + 0.7) + 2 * (0.2 + 0.3) + 3.0 + 5.0)
+    # At first: a stop takes 0.15 s and the rest, a frame a fifth of a second and the readout
+    motion_s = pace.remaining_s(frames[1:3], 0) - (2 * (0.15 + 0.7) + 2 * (0.2 + 0.3) + 3.0 + 5.0)
     rate, acceleration = stage.feed_mm_per_s(), stage.identify().motion.acceleration_mm_per_s2[0]
     assert motion_s == pytest.approx(50.0 / rate + rate / acceleration)  # upwards, straight to the place
-    expected = 3 * (0.5 + 0.7) + 4 * (0.2 + 0.3) + 17.0 + motion_s
+    expected = 3 * (0.15 + 0.7) + 4 * (0.2 + 0.3) + 17.0 + motion_s
     assert pace.remaining_s(frames, 2) == pytest.approx(expected + 2 * 11.0)
     # Measured times replace the guesses; the first frame of a stop is told from the next
     pace.here = a

@@ -1,7 +1,7 @@
 """The GRBL driver on a simulated controller: one test for each peculiarity of the protocol."""
 
 from functools import partial
-from itertools import pairwise
+from itertools import count, pairwise
 
 import pytest
 
@@ -29,7 +29,7 @@ def test_positions_are_independent_of_offset_and_report() -> None:
         assert stage.position().is_at(Point(-150.0, -120.0))
 
 
-def test_stage_jogs_polls_rarely_and_never_unlocks(bench: Bench) -> None:
+def test_stage_jogs_and_never_unlocks(bench: Bench) -> None:
     traffic = Traffic()
     stage = homed(bench, traffic)
     stage.move_to(-200.0, -200.0)
@@ -37,11 +37,23 @@ def test_stage_jogs_polls_rarely_and_never_unlocks(bench: Bench) -> None:
     assert moves
     assert all(data.startswith(b"$J=G90 G21 G53 ") and len(data) < 80 for data in moves)
     assert b"$X\n" not in traffic.chunks("sent")
+
+
+def test_stage_polls_often_only_at_arrival(bench: Bench) -> None:
+    traffic = Traffic()
+    stage = homed(bench, traffic)
+    # Slower than the driver was told, so that it waits for long
+    firmware(bench, SimulatedGrbl).settings |= {110: "3000.000", 111: "3000.000"}
+    begun_s = bench.clock.now_s()
+    stage.move_to(-300.0, -300.0)
     for _ in range(5):
-        stage.position()
-    polls_s = [at_s for at_s, _, data in traffic.entries if data == b"?"]
-    assert len(polls_s) > 8
-    assert min(later - sooner for sooner, later in pairwise(polls_s)) >= 0.2 - 1e-9
+        stage.verify_at(-300.0, -300.0)
+    polls_s = [at_s for at_s, _, data in traffic.entries if data == b"?" and at_s > begun_s]
+    intervals_s = [later - sooner for sooner, later in pairwise(polls_s)]
+    assert polls_s[0] - begun_s > 4.0, "a motion is not disturbed"
+    assert min(intervals_s) >= 0.05 - 1e-9
+    assert sum(interval_s < 0.2 - 1e-9 for interval_s in intervals_s) < 20
+    assert sum(interval_s >= 0.2 - 1e-9 for interval_s in intervals_s) > 5
 
 
 def test_one_idle_report_does_not_end_a_wait(bench: Bench, stage: Gantry) -> None:
@@ -139,14 +151,32 @@ def test_play_in_the_drive_does_not_matter() -> None:
     assert bench.true_position().x_mm == pytest.approx(places[0].x_mm + 0.3), "the play is really there"
 
 
-@pytest.mark.parametrize(
-    ("controller", "start", "old", "new"),
-    [(SimulatedGrbl, b"$130=400", b"400", b"4400"), (SimulatedMarlin, b"echo: M92", b"X80", b"X8")],
-)
-def test_settings_that_change_while_read_are_refused(
-    controller: Controller, start: bytes, old: bytes, new: bytes
-) -> None:
-    bench = Bench(controller)
-    filter_once(bench.wire.filters_to_host, lambda data: data.replace(old, new), lambda data: data.startswith(start))
+CHANGES = [(SimulatedGrbl, b"$130=400", b"400"), (SimulatedMarlin, b"echo: M92", b"X80")]
+
+
+@pytest.mark.parametrize(("controller", "start", "old"), CHANGES)
+def test_settings_that_keep_changing_are_refused(controller: Controller, start: bytes, old: bytes) -> None:
+    bench, digits = Bench(controller), count(1)
+
+    def change(data: bytes) -> bytes:
+        return data.replace(old, old + b"%d" % next(digits)) if data.startswith(start) else data
+
+    bench.wire.filters_to_host.append(change)
     with pytest.raises(StageLost, match="read differently"):
         bench.stage().connect()
+
+
+@pytest.mark.parametrize(("controller", "start", "old"), CHANGES)
+def test_setting_damaged_once_is_read_again(controller: Controller, start: bytes, old: bytes) -> None:
+    stage = homed(Bench(controller))
+    expected = stage.identify()
+    bench = Bench(controller)
+    filter_once(bench.wire.filters_to_host, lambda data: data.replace(old, old + b"0"), lambda data: start in data)
+    stage = homed(bench)
+    assert stage.identify() == expected
+
+
+def test_settings_without_motion_may_keep_changing() -> None:
+    bench, digits = Bench(SimulatedGrbl), count(1)
+    bench.wire.filters_to_host.append(lambda data: b"$30=%d\r\n" % next(digits) if data.startswith(b"$30=") else data)
+    assert homed(bench).trusted

@@ -34,7 +34,7 @@ def assert_nothing_goes_on(bench: Bench) -> None:
 @pytest.mark.parametrize(
     ("controller", "motion", "freeze", "words"),
     [
-        (SimulatedGrblHal, b"$J=G90 G21 G53 X-300 F3000\n", SimulatedGrblHal.open_door, "moving without a command"),
+        (SimulatedGrblHal, b"$J=G90 G21 G53 X-300 F3000\n", SimulatedGrblHal.open_door, "door was opened"),
         (SimulatedGrblHal, b"G53 G1 X-300 F3000\n", SimulatedGrblHal.pause, "on hold"),
         (SimulatedGrbl, b"G53 G1 X-300 F3000\n", SimulatedGrbl.pause, "on hold"),
     ],
@@ -63,6 +63,25 @@ def test_stopping_leaves_no_motion_to_resume(
     assert_nothing_goes_on(bench)
     stage.home()
     assert stage.trusted
+
+
+def test_door_that_freezes_jog_is_named(bench: Bench, stage: Gantry) -> None:
+    controller = firmware(bench, SimulatedGrblHal)
+
+    def open_door() -> None:
+        controller.door_is_open = True
+        controller.open_door()
+
+    bench.clock.after(0.5, open_door)
+    with pytest.raises(StageAlarm, match="safety door was opened, and the jog is frozen; close the door"):
+        stage.move_to(-300.0, -300.0)
+    with pytest.raises(StageAlarm, match="door is open; close the door"):
+        stage.recover()
+    controller.door_is_open = False
+    stage.recover()
+    assert not stage.trusted
+    stage.home()
+    assert stage.move_to(-300.0, -300.0).trusted
 
 
 def test_open_door_is_reported_and_discards_the_motion() -> None:

@@ -23,6 +23,8 @@ def test_unknown_codes_point_to_the_lists() -> None:
     assert "list of alarms" in str(alarm_failure(99))
     assert "'$J=X1'" in str(error_failure("$J=X1", 99))
     assert "list of errors" in str(error_failure("$J=X1", 99))
+    assert "damaged on its way" in str(error_failure("$J=X1", 1))
+    assert "damaged on its way" in str(error_failure("$J=X1", 36))
 
 
 @pytest.mark.parametrize("state", ["Hold", "Jog", "Home", "Sleep", "Tool"])
