@@ -130,15 +130,21 @@ class Session:
     def seal(self) -> None:
         """Close the journal and write SHA256SUMS over plan, journal and frames, which completes the session.
 
-        Skipped frames are left out for good, as the journal records.
+        Skipped frames are left out for good, as the journal records. Raises `SessionUnwritable` if another program has
+        the journal open; the session can then be resumed.
         """
         self.journal.event("sealed", skipped=sorted(self._skipped), frames=len(self._valid))
-        committed = {frame.file for frame in self.journal.committed()}
-        self.journal.close()
-        names = [PLAN, JOURNAL, *(f"{FRAMES}/{name}" for name in list_names(self.folder / FRAMES) if name in committed)]
-        with translate_errors(self.folder):
-            lines = [f"{sha256(self.folder / name)}  {name}\n" for name in names]
-        write_new(self.folder / SUMS, "".join(lines).encode())
+        write_sums(self.folder, self.journal)
+
+
+def write_sums(folder: Path, journal: Journal) -> None:
+    """Close the journal of the session in `folder` for good, and write SHA256SUMS over plan, journal and frames."""
+    committed = {frame.file for frame in journal.committed()}
+    journal.finish()
+    names = [PLAN, JOURNAL, *(f"{FRAMES}/{name}" for name in list_names(folder / FRAMES) if name in committed)]
+    with translate_errors(folder):
+        lines = [f"{sha256(folder / name)}  {name}\n" for name in names]
+    write_new(folder / SUMS, "".join(lines).encode())
 
 
 def is_sealed(folder: Path) -> bool:
