@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 
 import msgspec
 
-from faintfield.rig.cameras.protocol import Decode, Exposure, Pixels
+from faintfield.rig.cameras.protocol import Decode, Exposure, Pixels, UntriggeredCamera
 from faintfield.rig.cameras.settings import CoolingSettings
 from faintfield.rig.capture.checks import LIT_KINDS, Findings, Settling, board_warnings, check_frame, measure_settling
 from faintfield.rig.capture.guide import MAX_UNATTENDED_TRIES, Answer, Dialogue, Prompt
@@ -98,7 +98,8 @@ class FrameTaker:
         self._layouts: dict[str, str | None] = {}
         self._unkept_numbers = itertools.count(_FIRST_UNKEPT_NUMBER)
         self.last: PlannedFrame | None = None
-        self._measures = self._settings.settle.measure and self._rig.camera_sees_stage
+        triggered_by_us = not isinstance(self._rig.camera, UntriggeredCamera)  # others expose long after the move
+        self._measures = self._settings.settle.measure and self._rig.camera_sees_stage and triggered_by_us
         for settling in self._session.journal.details("settling", Settling):
             self._rest_as(settling)
 
@@ -113,8 +114,11 @@ class FrameTaker:
         self._cooled_step = frame.step
         self._dialogue.show_status(frame, "moving")
         self._go_to(frame)
-        self._dialogue.show_status(frame, "exposing")
         try:
+            if isinstance(self._rig.camera, UntriggeredCamera):
+                self._dialogue.show_status(frame, "waiting for silence of the camera, trigger nothing yet")
+                self._rig.camera.await_silence(frame.exposure_s)
+            self._dialogue.show_status(frame, "exposing")
             self._expose(frame)
         except CameraError:
             self._cooled_step = None  # a camera that failed was perhaps switched off

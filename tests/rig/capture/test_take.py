@@ -10,15 +10,18 @@ from unittest import mock
 import numpy as np
 import pytest
 import tifffile
+from msgspec.structs import replace
 
 from faintfield.pipelines.live.guided import read_pixels
+from faintfield.rig import devices
 from faintfield.rig.cameras.protocol import Exposure, Pixels
 from faintfield.rig.errors import CameraError, CaptureStopped
 from faintfield.rig.session.journal import Journal
 from faintfield.rig.session.session import taken_frames
 from faintfield.rig.session.verify import verify
+from faintfield.rig.settings import SettleSettings
 from faintfield.rig.simulation.lab import SimulatedCamera
-from tests.faults.capturing import FRAMES, Operator, assert_complete, capture
+from tests.faults.capturing import FRAMES, SMALL_RIG, Operator, assert_complete, capture, events
 
 type Change = Callable[[Exposure], Exposure]
 
@@ -116,3 +119,21 @@ def test_operator_may_skip_a_damaged_frame(tmp_path: Path) -> None:
     verdict = verify(tmp_path / "session")
     assert verdict.problems == ()
     assert verdict.left_out == ("00002_bright_0_r0_c2",)
+
+
+class WatchedCamera(SimulatedCamera):
+    """A camera that somebody else triggers; the frames are those of the simulated one."""
+
+    def await_silence(self, exposure_s: float) -> None:
+        self._clock.sleep_s(exposure_s + 5.0)
+
+
+def test_untriggered_camera_is_silent_before_each_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(devices, "SimulatedCamera", WatchedCamera)
+    operator = Operator()
+    settings = replace(SMALL_RIG, settle=SettleSettings(measure=True))
+    assert capture(tmp_path / "session", operator, settings) is None
+    doing = [status.doing.partition(" ")[0] for status in operator.statuses]
+    before = [doing[place - 2 : place] for place, state in enumerate(doing) if state == "exposing"]
+    assert before == [["moving", "waiting"]] * FRAMES
+    assert events(tmp_path / "session", "settling") == []  # its frames do not follow the move at once
