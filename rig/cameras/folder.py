@@ -91,7 +91,7 @@ class FolderCamera:
                         continue
                     raise CameraError(
                         f"{self._folder / names[0]}: came without a request, {self._last_file_s - before_s:.1f} s "
-                        "after the last file; the program takes frames by itself, so that one may begin while the stage "
+                        "after the last file; the program takes frames by itself, and one may begin while the stage "
                         "moves: let it take one frame each time it is triggered, or state camera.delay_s"
                     )
 
