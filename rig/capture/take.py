@@ -96,6 +96,7 @@ class FrameTaker:
         self._settings = self._session.rig
         self._cooled_step: int | None = None
         self._layouts: dict[str, str | None] = {}
+        self._refused_layout: str | None = None
         self._unkept_numbers = itertools.count(_FIRST_UNKEPT_NUMBER)
         self.last: PlannedFrame | None = None
         triggered_by_us = not isinstance(self._rig.camera, UntriggeredCamera)  # others expose long after the move
@@ -205,18 +206,28 @@ class FrameTaker:
             self._dialogue.operator.show_frame(frame, pixels, findings.values)
 
     def _decode_frame(self, frame: PlannedFrame, path: Path, exposure: Exposure) -> Pixels | None:
-        """Return the pixels of a frame, None if it cannot be decoded here; its layout must be that of the session."""
+        """Return the pixels of a frame, None if it cannot be decoded here; its layout must be that of the session.
+
+        Where that is the layout of a single frame, two exposures in a row that agree on another one outvote it.
+        """
         pixels = exposure.pixels if exposure.pixels is not None else self._decode(path)
         layout = self._layouts[path.name] = _layout(pixels)
         numbers = self._session.valid().keys() - {frame.number}  # a frame is not compared with an earlier take of it
         first = self._session.valid()[min(numbers)] if numbers else None
         expected = None if first is None else self._layout_of(first)
-        if first is not None and expected is not None and layout != expected:
-            raise CameraError(
-                f"{path.name}: {f'has {layout}' if layout else 'cannot be decoded'}, but {first.file} has {expected}; "
-                "set the camera as it was when the session was begun, and take this frame again"
-            )
-        return pixels
+        refused, self._refused_layout = self._refused_layout, None
+        if first is None or expected is None or layout == expected:
+            return pixels
+        if len(numbers) == 1 and layout is not None and layout == refused:
+            self._session.void([first], f"has {expected}, and the next exposures {layout}")
+            self._dialogue.warn(f"{first.file} has {expected}, and the next exposures {layout}; it is taken again")
+            return pixels
+        self._refused_layout = layout
+        only = " or, if that one was odd, just take this frame again" if len(numbers) == 1 and layout else ""
+        raise CameraError(
+            f"{path.name}: {f'has {layout}' if layout else 'cannot be decoded'}, but {first.file} has {expected}; "
+            f"set the camera as it was when the session was begun, and take this frame again{only}"
+        )
 
     def _layout_of(self, committed: CommittedFrame) -> str | None:
         if committed.file not in self._layouts:

@@ -93,16 +93,16 @@ class Session:
 
     def write(self, frame: PlannedFrame, intent: int, exposure: Exposure) -> WrittenFile:
         """Write the file of an exposure under a name that contains its number, and is therefore unique."""
-        content = encode_exposure(exposure)
         name = exposure_name(frame, intent) + exposure.suffix
         if not is_plain_name(name):
             raise SessionUnwritable(f"{exposure.suffix!r:.60} is no suffix of a file; correct what the camera gives")
         path = self.folder / FRAMES / name
-        # Hash the bytes in memory, while they are written: `verify` then finds errors of the disk
-        with ThreadPoolExecutor(1) as hashing:
+        # Hash the bytes in memory, while they are written: `verify` then finds errors of the disk. Where writing fails,
+        # the failure keeps them: unless they are released, Python complains as it ends.
+        with encode_exposure(exposure) as content, ThreadPoolExecutor(1) as hashing:
             digest = hashing.submit(hashlib.sha256, content)
             write_new(path, content)
-        return WrittenFile(intent, path, digest.result().hexdigest(), len(content))
+            return WrittenFile(intent, path, digest.result().hexdigest(), len(content))
 
     def reject(self, frame: PlannedFrame, written: WrittenFile, why: str) -> None:
         """Set the file of an exposure aside that is no frame of this session; its frame stays missing."""

@@ -137,3 +137,23 @@ def test_untriggered_camera_is_silent_before_each_frame(tmp_path: Path, monkeypa
     before = [doing[place - 2 : place] for place, state in enumerate(doing) if state == "exposing"]
     assert before == [["moving", "waiting"]] * FRAMES
     assert events(tmp_path / "session", "settling") == []  # its frames do not follow the move at once
+
+
+@pytest.mark.parametrize("odd", [cropped, coloured])
+def test_odd_first_frame_is_outvoted_and_taken_again(tmp_path: Path, odd: Change) -> None:
+    with changed({1: odd}):
+        assert capture(tmp_path / "session", decode=read_pixels) is None
+    assert_complete(tmp_path / "session", superseded=1)
+    for _, _, path in taken_frames(tmp_path / "session"):
+        pixels = read_pixels(path)
+        assert pixels is not None
+        assert pixels.shape == (12, 16)
+    (failure,) = events(tmp_path / "session", "camera_failed")
+    assert "or, if that one was odd, just take this frame again" in str(failure.detail["message"])
+
+
+def test_odd_second_frame_does_not_outvote_the_first(tmp_path: Path) -> None:
+    with changed({2: cropped, 3: shallow, 5: cropped, 6: cropped}):
+        assert capture(tmp_path / "session", decode=read_pixels) is None
+    assert_complete(tmp_path / "session")
+    assert len(events(tmp_path / "session", "camera_failed")) == 4
