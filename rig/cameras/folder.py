@@ -50,10 +50,10 @@ class FolderCamera:
         self._known: set[Path] | None = None
         self._device = 0
         self._known_when_late: set[Path] | None = None
-        # When the last file came, or the folder was opened, and an upper bound of the delay of files, that of the
-        # frame that came soonest; until there is one, and after a file that nobody asked for, the longest allowed.
-        self._last_file_s = 0.0
+        # Upper bound of the delay of files, that of the frame that came soonest; until there is one, and after a file
+        # that nobody asked for, the longest allowed.
         self._delay_s = settings.arrival_s
+        self._is_silent = False
 
     def open(self) -> None:
         """Remember the files that are already in the folder, which are not frames of this session."""
@@ -62,7 +62,7 @@ class FolderCamera:
         with self._translate_errors():
             self._device = self._folder.stat().st_dev
             self._known = set(self._files())
-        self._last_file_s = self._clock.now_s()
+        self._is_silent = False
 
     def report(self) -> CameraReport:
         """Return the folder's name."""
@@ -73,8 +73,9 @@ class FolderCamera:
     def await_silence(self, exposure_s: float) -> None:
         """Wait until no file has come for the exposure time and `silence_s`, or the delay of files if that is longer.
 
-        Raises `CameraError` if one comes meanwhile: the program takes frames by itself, and which of them begins after
-        a request is not known, as the delay of its files is not. With `delay_s` it is, and nothing is waited for.
+        With the stage at rest, an exposure that began while it moved would have come meanwhile. Raises `CameraError` if
+        a file comes: the program takes frames by itself, and which of them begin after a request is not known, as the
+        delay of its files is not. With `delay_s` it is, and nothing is waited for.
         """
         known = self._require_open()
         if self._settings.delay_s is not None:
@@ -82,25 +83,25 @@ class FolderCamera:
         with self._translate_errors():
             if self._pass_over(known):  # late and stray files show another position
                 self._known_when_late = None
-            while self._clock.now_s() < self._last_file_s + exposure_s + max(self._settings.silence_s, self._delay_s):
+            since_s = self._clock.now_s()
+            while self._clock.now_s() < since_s + exposure_s + max(self._settings.silence_s, self._delay_s):
                 self._clock.sleep_s(_POLL_S)
-                before_s, awaits_late = self._last_file_s, self._known_when_late is not None
                 if names := self._pass_over(known):
-                    self._known_when_late = None
-                    if awaits_late:  # this is the frame that did not come in time
-                        continue
-                    raise CameraError(
-                        f"{self._folder / names[0]}: came without a request, {self._last_file_s - before_s:.1f} s "
-                        "after the last file; the program takes frames by itself, and one may begin while the stage "
-                        "moves: let it take one frame each time it is triggered, or state camera.delay_s"
-                    )
+                    if self._known_when_late is None:
+                        raise CameraError(
+                            f"{self._folder / names[0]}: came {self._clock.now_s() - since_s:.1f} s into the silence "
+                            "before a request; the program takes frames by itself, and one may begin while the stage "
+                            "moves: let it take one frame each time it is triggered, or state camera.delay_s"
+                        )
+                    self._known_when_late, since_s = None, self._clock.now_s()  # the frame that did not come in time
+        self._is_silent = True
 
     def _pass_over(self, known: set[Path]) -> list[str]:
         """Take the files that are new for no frames, and return their names."""
         new = sorted(set(self._files()) - known)
         if new:
             known.update(new)
-            self._last_file_s, self._delay_s = self._clock.now_s(), self._settings.arrival_s
+            self._delay_s = self._settings.arrival_s
         return [path.name for path in new]
 
     def expose(self, exposure_s: float, number: int) -> Exposure:
@@ -114,8 +115,10 @@ class FolderCamera:
         """
         known = self._require_open()
         bound_s = exposure_s + self._settings.arrival_s
-        self.await_silence(exposure_s)
         with self._translate_errors():
+            if not self._is_silent or set(self._files()) - known:
+                self.await_silence(exposure_s)
+            self._is_silent = False
             files = set(self._files())
             if self._known_when_late is not None and files - self._known_when_late:
                 self._known_when_late = None  # the late file has come in the meantime
@@ -134,8 +137,7 @@ class FolderCamera:
                         raise CameraError(f"{arrival.path}: {reason}")
                     if self._is_complete(arrival):
                         known.add(arrival.path)
-                        self._last_file_s = self._clock.now_s()
-                        self._delay_s = min(self._delay_s, self._last_file_s - asked_s - exposure_s)
+                        self._delay_s = min(self._delay_s, self._clock.now_s() - asked_s - exposure_s)
                         suffix, name = arrival.path.suffix.lower(), arrival.path.name
                         return Exposure(suffix, arrival.path.read_bytes(), metadata={"camera_file": name})
                 self._clock.sleep_s(_POLL_S)

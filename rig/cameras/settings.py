@@ -197,8 +197,8 @@ class FolderSettings(MosaicSettings, frozen=True, forbid_unknown_fields=True, ta
     quiet_s : float
         Time without a change after which a file that cannot be decoded here, or that ends in zeros, is complete.
     silence_s : float
-        Time without a file, in addition to the exposure, that is waited for before each frame: a program that takes
-        frames by itself at intervals up to this betrays itself meanwhile, and is refused.
+        Time without a file, in addition to the exposure, that is waited for at each node before a frame: a program that
+        takes frames by itself, at intervals up to this, betrays itself meanwhile, and is refused.
     delay_s : float, optional
         Of a program that takes frames by itself: longest time from the end of an exposure until its file appears. Files
         that come sooner after a request are passed over, and no silence is waited for. By default the program is

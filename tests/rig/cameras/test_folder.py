@@ -44,10 +44,10 @@ class Program(SimulatedClock):
         for action in due:
             action()
 
-    def ask(self, silence_s: float = 100.0) -> "Program":
+    def ask(self, camera: FolderCamera) -> "Program":
         """Note that a frame is asked for after a silence; what comes is timed from here."""
         self.due = []
-        self.sleep_s(silence_s)
+        camera.await_silence(0.0)
         self.asked_s = self.now_s()
         return self
 
@@ -71,7 +71,7 @@ def watching(program: Program, decode: Decode = lambda path: None, *, file_times
     settings = FolderSettings(str(program.folder), frame_mb=1.0, arrival_s=20.0, quiet_s=5.0, file_times=file_times)
     camera = FolderCamera(settings, program, decode)
     camera.open()
-    program.ask()
+    program.ask(camera)
     return camera
 
 
@@ -94,8 +94,7 @@ class TriggeredFolder(FolderCamera):
 
     def expose(self, exposure_s: float, number: int) -> Exposure:
         self.files += 1
-        self.await_silence(exposure_s)
-        self.program.ask(0.0)
+        self.program.ask(self)
         self.program.at(exposure_s + 1.0, f"IMG_{self.files}.NEF", b"RAW ")
         self.program.at(exposure_s + 2.0, f"IMG_{self.files}.NEF", b"RAW FILE")
         return super().expose(exposure_s, number)
@@ -112,7 +111,7 @@ def test_file_before_the_exposure_ends_is_refused(program: Program) -> None:
     program.at(0.3, "early.nef", b"begun before")
     with pytest.raises(CameraError, match=r"early\.nef: came 0\.50 s after .* 2 s, .*; .* take this frame again"):
         camera.expose(2.0, 1)
-    program.ask().at(2.5, "right.nef", b"as asked for")
+    program.ask(camera).at(2.5, "right.nef", b"as asked for")
     assert camera.expose(2.0, 2).content == b"as asked for"  # the early file is not taken for it
 
 
@@ -121,7 +120,7 @@ def test_file_changed_before_the_exposure_ends_is_refused(program: Program) -> N
     program.at(6.0, "moved.nef", b"of an hour ago", changed_s=-3600.0)
     with pytest.raises(CameraError, match=r"moved\.nef: was last changed at .* UTC, 3605\.\d s before .* 5 s .*file_t"):
         camera.expose(5.0, 1)
-    program.ask()
+    program.ask(camera)
     program.at(6.0, "coarse.nef", b"on FAT", changed_s=3.5)  # rounded down to 2 s
     assert camera.expose(5.0, 2).content == b"on FAT"
     camera = watching(program, file_times=False)
@@ -199,8 +198,7 @@ def test_earlier_and_late_files_are_no_frames(program: Program) -> None:
     with pytest.raises(CameraTimeout, match=r"no file came within 20\.1 s; "):
         camera.expose(0.1, 1)
     (program.folder / "late.nef").write_bytes(b"of the frame before")
-    camera.await_silence(0.1)
-    program.ask(0.0).at(0.5, "new.nef", b"new")
+    program.ask(camera).at(0.5, "new.nef", b"new")
     program.at(0.5, "notes.txt", b"no frame")
     assert camera.expose(0.1, 2).content == b"new"
 
@@ -213,10 +211,10 @@ def test_first_file_after_timeout_may_be_late(program: Program, reopened: bool) 
     if reopened:  # as a capture does after a failure
         camera.close()
         camera.open()
-    program.ask().at(2.0, "late.nef", b"of the frame before")
+    program.ask(camera).at(2.0, "late.nef", b"of the frame before")
     with pytest.raises(CameraError, match=r"late\.nef: may be the frame before, .*; take this frame again"):
         camera.expose(0.1, 2)
-    program.ask().at(2.0, "right.nef", b"as asked for")
+    program.ask(camera).at(2.0, "right.nef", b"as asked for")
     assert camera.expose(0.1, 3).content == b"as asked for"
 
 
@@ -227,7 +225,7 @@ def test_late_file_while_closed_is_not_awaited(program: Program) -> None:
     camera.close()
     (program.folder / "late.nef").write_bytes(b"of the frame before")
     camera.open()
-    program.ask().at(2.0, "right.nef", b"as asked for")
+    program.ask(camera).at(2.0, "right.nef", b"as asked for")
     assert camera.expose(0.1, 2).content == b"as asked for"
 
 
@@ -237,7 +235,7 @@ def test_endless_file_and_two_files_are_refused(program: Program) -> None:
         program.at(second, "endless.nef", b"more " * second)
     with pytest.raises(CameraTimeout, match=r"endless\.nef never stopped growing"):
         camera.expose(0.1, 1)
-    program.ask().at(1.0, "a.nef", b"a")
+    program.ask(camera).at(1.0, "a.nef", b"a")
     program.at(1.0, "b.nef", b"b")
     with pytest.raises(CameraError, match=r"2 files came for one frame \(a.nef, b.nef\); "):
         camera.expose(0.1, 2)
@@ -267,7 +265,7 @@ def test_vanished_folder_is_named_until_it_returns(tmp_path: Path) -> None:
         camera.expose(0.1, 2)
     folder.mkdir()
     camera.open()
-    program.ask().at(1.0, "new.nef", b"new")
+    program.ask(camera).at(1.0, "new.nef", b"new")
     assert camera.expose(0.1, 3).content == b"new"
 
 
@@ -330,12 +328,15 @@ class FreeProgram(SimulatedClock):
             self.next_s += self._period_s
 
 
-def frames_begun(camera: FolderCamera, program: FreeProgram, exposure_s: float, moves_s: list[float]) -> list[float]:
-    """Return when each frame that the camera took began after its request, in s; a refused one is asked for again."""
+def frames_begun(
+    camera: FolderCamera, program: FreeProgram, exposure_s: float, moves_s: list[float]
+) -> list[tuple[float, float]]:
+    """Return when each frame that the camera took began, in s after its request, and after the stage came to rest."""
     begun_s = []
     for move_s in moves_s:
         program.sleep_s(move_s)
-        for _ in range(3):
+        for _ in range(3):  # a refused frame is asked for again
+            rested_s = program.now_s()
             try:
                 camera.await_silence(exposure_s)
                 asked_s = program.now_s()
@@ -347,22 +348,23 @@ def frames_begun(camera: FolderCamera, program: FreeProgram, exposure_s: float, 
                 camera.open()
             else:
                 assert content is not None
-                begun_s.append(float(content) - asked_s)
+                begun_s.append((float(content) - asked_s, float(content) - rested_s))
                 break
     return begun_s
 
 
 @given(
     exposure_s=st.floats(0.05, 10.0),
-    pause_s=st.floats(0.01, 9.5),
+    pause_s=st.floats(0.01, 9.5) | st.floats(0.01, 59.5),
     delay_s=st.floats(0.0, 30.0),
     first_s=st.floats(-60.0, 0.0) | st.just(math.inf),
-    moves_s=st.lists(st.floats(0.1, 20.0), min_size=4, max_size=4),
+    moves_s=st.lists(st.floats(0.1, 60.0), min_size=4, max_size=4),
     stated=st.booleans(),
 )
 @example(exposure_s=1.0, pause_s=1.6, delay_s=1.5, first_s=-0.7, moves_s=[0.5] * 9, stated=False)
 @example(exposure_s=1.0, pause_s=1.6, delay_s=1.5, first_s=math.inf, moves_s=[0.5] * 9, stated=False)
 @example(exposure_s=1.0, pause_s=1.6, delay_s=1.5, first_s=-0.7, moves_s=[0.5] * 9, stated=True)
+@example(exposure_s=1.0, pause_s=20.8, delay_s=5.0, first_s=math.inf, moves_s=[20.0] * 9, stated=False)
 def test_no_frame_of_free_program_begins_before_request(
     exposure_s: float, pause_s: float, delay_s: float, first_s: float, moves_s: list[float], stated: bool
 ) -> None:
@@ -372,9 +374,13 @@ def test_no_frame_of_free_program_begins_before_request(
         camera = FolderCamera(settings, program)
         camera.open()
         begun_s = frames_begun(camera, program, exposure_s, moves_s)
-    assert all(after_s > -0.001 for after_s in begun_s)  # names have milliseconds
-    # Without its delay, the program is found out; the frame for which it was started may be taken
-    assert len(begun_s) == len(moves_s) if stated else len(begun_s) <= (first_s == math.inf)
+    assert all(after_rest_s > -0.001 for _, after_rest_s in begun_s)  # names have milliseconds
+    if stated:
+        assert len(begun_s) == len(moves_s)
+    if stated or pause_s < 9.5:  # the silence of `silence_s`, 10 s, is longer
+        assert all(after_request_s > -0.001 for after_request_s, _ in begun_s)
+    if not stated and pause_s < 9.5:  # it is found out; the frame for which it was started may be taken
+        assert len(begun_s) <= (first_s == math.inf)
 
 
 def test_triggered_program_is_waited_for_once_measured(program: Program) -> None:
@@ -394,9 +400,7 @@ def test_late_file_of_triggered_program_is_no_free_one(program: Program) -> None
     camera = watching(program)
     with pytest.raises(CameraTimeout):
         camera.expose(0.1, 1)
-    camera.close()  # as a capture does after a failure
-    camera.open()
-    program.ask(0.0).at(3.0, "late.nef", b"of the frame before")
+    program.at(23.0, "late.nef", b"of the frame before")
     camera.await_silence(0.1)
-    program.ask(0.0).at(2.0, "right.nef", b"as asked for")
+    program.ask(camera).at(2.0, "right.nef", b"as asked for")
     assert camera.expose(0.1, 2).content == b"as asked for"
