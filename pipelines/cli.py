@@ -7,7 +7,7 @@ import faintfield
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run one command and exit: 0 done, 1 a named failure (one line), 2 wrong usage."""
+    """Run one command and exit: 0 done, 1 a named failure (one line), 2 wrong usage, 128 + N ended by signal N."""
     sys.exit(run(sys.argv[1:] if arguments is None else arguments))
 
 

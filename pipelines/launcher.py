@@ -7,7 +7,7 @@ the command runs or its help is shown.
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import takewhile
 from json import dumps
 from pathlib import Path
@@ -21,6 +21,7 @@ from faintfield.pipelines.console import framed_console, inform, visible
 from faintfield.pipelines.errors import NAMED_FAILURES, FileFailed, MemoryShort, WrongUsage
 from faintfield.pipelines.formats.units import json_of
 from faintfield.pipelines.log_file import logged
+from faintfield.pipelines.termination import Terminated
 from faintfield.recon.names import on_compiling
 
 DONE, FAILED, WRONG_USAGE = 0, 1, 2
@@ -273,6 +274,10 @@ def launch(arguments: Sequence[str]) -> int:
     except NAMED_FAILURES as failure:
         inform(f"faintfield: {type(failure).__name__}: {failure}")
         return FAILED
+    except Terminated as end:
+        with suppress(OSError):  # the terminal may be gone
+            inform(f"faintfield: Terminated: ended by {end}; finished results are kept, and no file is half-written")
+        return 128 + end.number
     except KeyboardInterrupt:
         inform("faintfield: Interrupted: stopped by Ctrl-C; finished results are kept, and no file is half-written")
         return FAILED

@@ -164,8 +164,8 @@ def capture(
     )
 
 
-def verify(path: Path, /, *, inputs: Path | None = None) -> Verification:
-    """Verify a session or results without changing a byte of them.
+def verify(path: Path, /, *, inputs: Path | None = None, repair: bool = False) -> Verification:
+    """Verify a session or results; unless a session is to be repaired, not a byte of them is changed.
 
     Of a session: its plan, its journal and the SHA-256 of every frame, then the results in its folder. Of results:
     every record against its own digest, the files that it vouches for, and the inputs that it was made from.
@@ -177,7 +177,10 @@ def verify(path: Path, /, *, inputs: Path | None = None) -> Verification:
     inputs
         Folder of the session or set that the results were made from; searched for around them by default. Inputs that
         are not found are named as not checked, which is no failure.
+    repair
+        Seal a session again that faintfield 0.2.0 sealed while another program read its journal, or whose sealing was
+        interrupted; whatever else is wrong, nothing is changed.
     """
     from faintfield.pipelines.workflows.verify import verify_folder
 
-    return verify_folder(path, inputs)
+    return verify_folder(path, inputs, repaired=repair)

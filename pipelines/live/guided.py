@@ -16,6 +16,7 @@ from faintfield.pipelines.live.capture_page import serve_page
 from faintfield.pipelines.live.panel import CapturePanel, SessionFrames
 from faintfield.pipelines.live.planes_client import LiveOrder, live_planes
 from faintfield.pipelines.live.terminal import TerminalView
+from faintfield.pipelines.termination import interrupt_on_termination
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.capture.guide import format_capture_duration
 from faintfield.rig.capture.loop import Capture
@@ -41,7 +42,7 @@ def capture_session(
         inform(f"{folder}: is complete, nothing is left to capture; `faintfield verify` compares every byte of it")
         return 0
     panel = CapturePanel(unattended=unattended)
-    with ExitStack() as stack:
+    with interrupt_on_termination(), ExitStack() as stack:
         session = stack.enter_context(open_session(folder, frozen, lambda frames: progress(list(frames), "comparing")))
         for change in adopt_settings(session, settings):
             inform(f"{folder}: {change}, from now on")

@@ -11,6 +11,7 @@ from faintfield.pipelines.arguments import StageConnection
 from faintfield.pipelines.console import console, inform, visible
 from faintfield.pipelines.errors import BadValue, WrongUsage
 from faintfield.pipelines.formats.toml_files import read_rig_tables
+from faintfield.pipelines.termination import interrupt_on_termination
 from faintfield.rig.devices import SIMULATED_FIRMWARE, open_stage
 from faintfield.rig.errors import StageUnfit
 from faintfield.rig.simulation.controller.bench import Server
@@ -95,13 +96,14 @@ def _connected(connection: StageConnection) -> Iterator[Gantry]:
     except ValueError as failure:
         raise BadValue(f"{failure}") from failure
     stage = open_stage(settings)
-    stage.connect()
-    try:
-        for warning in stage.identify().warnings:
-            inform(f"warning: {warning}")
-        yield stage
-    finally:
-        stage.close()
+    with interrupt_on_termination():
+        stage.connect()
+        try:
+            for warning in stage.identify().warnings:
+                inform(f"warning: {warning}")
+            yield stage
+        finally:
+            stage.close()
 
 
 def _settings(connection: StageConnection) -> StageSettings:

@@ -18,7 +18,7 @@ from faintfield.pipelines.formats.results.verification import (
 )
 from faintfield.rig.errors import SessionCorrupt
 from faintfield.rig.session.session import JOURNAL, has_session, taken_frames
-from faintfield.rig.session.verify import Verdict, verify
+from faintfield.rig.session.verify import WAL_NOT_COVERED, Verdict, repair, verify
 
 # Problems printed one by one; the failure gives their number.
 _MAX_SHOWN = 10
@@ -32,8 +32,8 @@ class Verified(msgspec.Struct, frozen=True):
     results: ResultVerdict | None
 
 
-def verify_folder(path: Path, inputs: Path | None) -> Verified:
-    """Verify a session, and the results in a folder or of one record.
+def verify_folder(path: Path, inputs: Path | None, *, repaired: bool = False) -> Verified:
+    """Verify a session, which is sealed again first if it is to be `repaired`, and the results in a folder or record.
 
     Raises
     ------
@@ -44,7 +44,7 @@ def verify_folder(path: Path, inputs: Path | None) -> Verified:
         raise MissingFile(f"{inputs}: no such folder; name that of the session or set")
     session, known = None, {}
     if has_session(path) or (path / JOURNAL).exists():
-        session = verify(path, lambda paths: progress(list(paths), "hashing"))
+        session = (repair if repaired else verify)(path, lambda paths: progress(list(paths), "hashing"))
         _report_session(path, session)
         if not session.problems:
             known = {frame.resolve(): taken.sha256 for _, taken, frame in taken_frames(path)}  # just found to be true
@@ -58,6 +58,8 @@ def verify_folder(path: Path, inputs: Path | None) -> Verified:
             lambda file: known.get(file) or sha256(file),
         )
         _report_results(path, results)
+    if session and session.problems == (WAL_NOT_COVERED,):
+        raise SessionCorrupt(f"{path}: {WAL_NOT_COVERED}")
     if session and session.problems:
         raise SessionCorrupt(
             f"{path}: is damaged: {_count(session.problems, 'problem')}, the first: {session.problems[0]}; "

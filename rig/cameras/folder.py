@@ -50,6 +50,10 @@ class FolderCamera:
         self._known: set[Path] | None = None
         self._device = 0
         self._known_when_late: set[Path] | None = None
+        # Upper bound of the delay of files, that of the frame that came soonest; until there is one, and after a file
+        # that nobody asked for, the longest allowed.
+        self._delay_s = settings.arrival_s
+        self._is_silent = False
 
     def open(self) -> None:
         """Remember the files that are already in the folder, which are not frames of this session."""
@@ -58,11 +62,47 @@ class FolderCamera:
         with self._translate_errors():
             self._device = self._folder.stat().st_dev
             self._known = set(self._files())
+        self._is_silent = False
 
     def report(self) -> CameraReport:
         """Return the folder's name."""
         self._require_open()
-        return CameraReport(f"files in {self._folder}", round(self._settings.frame_mb * 1e6), readout_s=1.0)
+        wait_s = self._settings.silence_s if self._settings.delay_s is None else self._settings.delay_s
+        return CameraReport(f"files in {self._folder}", round(self._settings.frame_mb * 1e6), readout_s=1.0 + wait_s)
+
+    def await_silence(self, exposure_s: float) -> None:
+        """Wait until no file has come for the exposure time and `silence_s`, or the delay of files if that is longer.
+
+        With the stage at rest, an exposure that began while it moved would have come meanwhile. Raises `CameraError` if
+        a file comes: the program takes frames by itself, and which of them begin after a request is not known, as the
+        delay of its files is not. With `delay_s` it is, and nothing is waited for.
+        """
+        known = self._require_open()
+        if self._settings.delay_s is not None:
+            return
+        with self._translate_errors():
+            if self._pass_over(known):  # late and stray files show another position
+                self._known_when_late = None
+            since_s = self._clock.now_s()
+            while self._clock.now_s() < since_s + exposure_s + max(self._settings.silence_s, self._delay_s):
+                self._clock.sleep_s(_POLL_S)
+                if names := self._pass_over(known):
+                    if self._known_when_late is None:
+                        raise CameraError(
+                            f"{self._folder / names[0]}: came {self._clock.now_s() - since_s:.1f} s into the silence "
+                            "before a request; the program takes frames by itself, and one may begin while the stage "
+                            "moves: let it take one frame each time it is triggered, or state camera.delay_s"
+                        )
+                    self._known_when_late, since_s = None, self._clock.now_s()  # the frame that did not come in time
+        self._is_silent = True
+
+    def _pass_over(self, known: set[Path]) -> list[str]:
+        """Take the files that are new for no frames, and return their names."""
+        new = sorted(set(self._files()) - known)
+        if new:
+            known.update(new)
+            self._delay_s = self._settings.arrival_s
+        return [path.name for path in new]
 
     def expose(self, exposure_s: float, number: int) -> Exposure:
         """Wait for the next file to appear and become complete.
@@ -71,33 +111,42 @@ class FolderCamera:
         is complete when neither its size nor its time has changed for `quiet_s`.
 
         A file that appears too early is refused, and the first after a frame that did not come in time: it may be that
-        frame.
+        frame. A silence comes first unless there was one, and only frames that were asked for since.
         """
         known = self._require_open()
         bound_s = exposure_s + self._settings.arrival_s
         with self._translate_errors():
+            if not self._is_silent or set(self._files()) - known:
+                self.await_silence(exposure_s)
+            self._is_silent = False
             files = set(self._files())
             if self._known_when_late is not None and files - self._known_when_late:
                 self._known_when_late = None  # the late file has come in the meantime
-            known.update(files)  # a late or unrequested frame shows another position
             asked_s, folder_time_s = self._clock.now_s(), self._folder_time_s()
+            if self._settings.delay_s is not None:  # the files of frames that were begun before the request come first
+                self._clock.sleep_s(exposure_s + self._settings.delay_s)
+                bound_s += exposure_s + self._settings.delay_s
+            self._pass_over(known)
             arrival: _Arrival | None = None
             while self._clock.now_s() < asked_s + bound_s:
                 arrival = self._arriving_file(known, arrival)
                 if arrival is not None:
                     reason = self._late_reason() or self._early_reason(arrival, exposure_s, asked_s, folder_time_s)
                     if reason:
-                        known.add(arrival.path)
+                        self._pass_over(known)
                         raise CameraError(f"{arrival.path}: {reason}")
                     if self._is_complete(arrival):
                         known.add(arrival.path)
+                        self._delay_s = min(self._delay_s, self._clock.now_s() - asked_s - exposure_s)
+                        self._is_silent = True
                         suffix, name = arrival.path.suffix.lower(), arrival.path.name
                         return Exposure(suffix, arrival.path.read_bytes(), metadata={"camera_file": name})
                 self._clock.sleep_s(_POLL_S)
-        self._known_when_late = set(known)
-        state = (
-            "no file came" if arrival is None else f"{arrival.path.name} {arrival.problem or 'never stopped growing'}"
-        )
+        if arrival is None:
+            self._known_when_late, state = set(known), "no file came"
+        else:
+            state = f"{arrival.path.name} {arrival.problem or 'never stopped growing'}"
+            self._pass_over(known)
         remedy = "check that the camera's program is triggered and saves there"
         raise CameraTimeout(f"{self._folder}: {state} within {bound_s:g} s; {remedy}")
 
@@ -121,8 +170,10 @@ class FolderCamera:
 
     def _arriving_file(self, known: set[Path], before: _Arrival | None) -> _Arrival | None:
         new = sorted(set(self._files()) - known)
+        if self._settings.delay_s is not None:  # more frames may follow
+            new = [before.path] if before is not None and before.path in new else new[:1]
         if len(new) > 1:
-            known.update(new)
+            self._pass_over(known)
             problem = f"{self._folder}: {len(new)} files came for one frame ({new[0].name}, {new[1].name})"
             raise CameraError(f"{problem}; save one file a frame, then take this one again")
         if not new:

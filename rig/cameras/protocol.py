@@ -106,6 +106,14 @@ class Thermometer(Protocol):
         """Return the temperature in °C, None if this camera has no sensor for it."""
 
 
+@runtime_checkable
+class UntriggeredCamera(Protocol):
+    """A camera that a person or a program triggers, and that has to be at rest before a frame is asked for."""
+
+    def await_silence(self, exposure_s: float) -> None:
+        """Wait until no exposure is under way that could be taken for the next frame; raises `CameraError`."""
+
+
 def call_within[T](
     bound_s: float,
     call: Callable[[], T],

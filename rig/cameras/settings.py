@@ -196,6 +196,13 @@ class FolderSettings(MosaicSettings, frozen=True, forbid_unknown_fields=True, ta
         Time limit from the end of the exposure until the file is complete.
     quiet_s : float
         Time without a change after which a file that cannot be decoded here, or that ends in zeros, is complete.
+    silence_s : float
+        Time without a file, in addition to the exposure, that is waited for at each node before a frame: a program that
+        takes frames by itself, at intervals up to this, betrays itself meanwhile, and is refused.
+    delay_s : float, optional
+        Of a program that takes frames by itself: longest time from the end of an exposure until its file appears. Files
+        that come sooner after a request are passed over, and no silence is waited for. By default the program is
+        triggered.
     file_times : bool
         Refuse a file that was last changed before the exposure could end; switch this off for a program that gives its
         files the camera's own time.
@@ -206,6 +213,8 @@ class FolderSettings(MosaicSettings, frozen=True, forbid_unknown_fields=True, ta
     frame_mb: float = 60.0
     arrival_s: float = 60.0
     quiet_s: float = 5.0
+    silence_s: float = 10.0
+    delay_s: float | None = None
     file_times: bool = True
 
     def __post_init__(self) -> None:
@@ -214,6 +223,9 @@ class FolderSettings(MosaicSettings, frozen=True, forbid_unknown_fields=True, ta
             raise ValueError(f"camera.folder = {self.folder!r} names no folder; give the folder of the camera's files")
         if not 0.0 <= self.quiet_s < self.arrival_s:
             raise ValueError(f"camera.quiet_s = {self.quiet_s:g}; give 0 to less than arrival_s = {self.arrival_s:g}")
+        if not 0.0 <= min(self.silence_s, self.delay_s or 0.0):
+            problem = f"camera.silence_s = {self.silence_s:g} and delay_s = {self.delay_s}"
+            raise ValueError(f"{problem}; no time is negative, correct them")
 
 
 class SimulatedSettings(MosaicSettings, frozen=True, forbid_unknown_fields=True, tag_field="backend", tag="simulated"):

@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 
 import msgspec
 
-from faintfield.rig.cameras.protocol import Decode, Exposure, Pixels
+from faintfield.rig.cameras.protocol import Decode, Exposure, Pixels, UntriggeredCamera
 from faintfield.rig.cameras.settings import CoolingSettings
 from faintfield.rig.capture.checks import LIT_KINDS, Findings, Settling, board_warnings, check_frame, measure_settling
 from faintfield.rig.capture.guide import MAX_UNATTENDED_TRIES, Answer, Dialogue, Prompt
@@ -113,11 +113,13 @@ class FrameTaker:
         self._settings = self._session.rig
         self._cooled_step: int | None = None
         self._layouts: dict[str, str | None] = {}
+        self._refused_layout: str | None = None
         self._unkept_numbers = itertools.count(_FIRST_UNKEPT_NUMBER)
         self.last: PlannedFrame | None = None
         self._arrived = False  # since the last exposure
         self._failure_ahead: StageError | NotHomed | None = None
-        self._measures = self._settings.settle.measure and self._rig.camera_sees_stage
+        triggered_by_us = not isinstance(self._rig.camera, UntriggeredCamera)  # others expose long after the move
+        self._measures = self._settings.settle.measure and self._rig.camera_sees_stage and triggered_by_us
         for settling in self._session.journal.details("settling", Settling):
             self._rest_as(settling)
 
@@ -139,6 +141,8 @@ class FrameTaker:
             if self._pace.here != frame.stop.target:
                 self._dialogue.show_status(frame, "moving")
             self._go_to(frame)
+            if self._arrived or self.last is None or self.last.step != frame.step:
+                self._await_silence(frame)
             self._dialogue.show_status(frame, "exposing")
             self._expose(frame, following)
         except CameraError:
@@ -147,6 +151,12 @@ class FrameTaker:
         except RigError:
             self._lighting.forget()
             raise
+
+    def _await_silence(self, frame: PlannedFrame) -> None:
+        """Let a camera that we do not trigger finish what it may have begun before the frame's place and light."""
+        if isinstance(self._rig.camera, UntriggeredCamera):
+            self._dialogue.show_status(frame, "waiting for silence of the camera, trigger nothing yet")
+            self._rig.camera.await_silence(frame.exposure_s)
 
     def _wait_for_temperature(self, frame: PlannedFrame, settings: CoolingSettings, target_c: float) -> None:
         """Wait until the sensor is at its temperature: dark current doubles over a few kelvins."""
@@ -266,18 +276,28 @@ class FrameTaker:
         return session.commit(frame, written, record), pixels
 
     def _decode_frame(self, frame: PlannedFrame, path: Path, exposure: Exposure) -> Pixels | None:
-        """Return the pixels of a frame, None if it cannot be decoded here; its layout must be that of the session."""
+        """Return the pixels of a frame, None if it cannot be decoded here; its layout must be that of the session.
+
+        Where that is the layout of a single frame, two exposures in a row that agree on another one outvote it.
+        """
         pixels = exposure.pixels if exposure.pixels is not None else self._decode(path)
         layout = self._layouts[path.name] = _layout(pixels)
         numbers = self._session.valid().keys() - {frame.number}  # a frame is not compared with an earlier take of it
         first = self._session.valid()[min(numbers)] if numbers else None
         expected = None if first is None else self._layout_of(first)
-        if first is not None and expected is not None and layout != expected:
-            raise CameraError(
-                f"{path.name}: {f'has {layout}' if layout else 'cannot be decoded'}, but {first.file} has {expected}; "
-                "set the camera as it was when the session was begun, and take this frame again"
-            )
-        return pixels
+        refused, self._refused_layout = self._refused_layout, None
+        if first is None or expected is None or layout == expected:
+            return pixels
+        if len(numbers) == 1 and layout is not None and layout == refused:
+            self._session.void([first], f"has {expected}, and the next exposures {layout}")
+            self._dialogue.warn(f"{first.file} has {expected}, and the next exposures {layout}; it is taken again")
+            return pixels
+        self._refused_layout = layout
+        only = " or, if that one was odd, just take this frame again" if len(numbers) == 1 and layout else ""
+        raise CameraError(
+            f"{path.name}: {f'has {layout}' if layout else 'cannot be decoded'}, but {first.file} has {expected}; "
+            f"set the camera as it was when the session was begun, and take this frame again{only}"
+        )
 
     def _layout_of(self, committed: CommittedFrame) -> str | None:
         if committed.file not in self._layouts:

@@ -8,8 +8,9 @@ the system.
 import os
 import sqlite3
 import stat
+import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from functools import cache, partial
 from pathlib import Path
 
@@ -54,8 +55,11 @@ _MAX_VALUE_BYTES = 2**24
 _STEPS_PER_BYTE = 5
 _STEPS = 1_000_000
 
-# Bytes 18 and 19 of a file in WAL mode: the versions of the format that a writer and a reader must know.
-_WAL_VERSIONS = b"\x02\x02"
+# Bytes 18 and 19 of a file, the versions of the format that a writer and a reader must know: in WAL mode, as during a
+# capture, and in a complete session.
+_WAL_VERSIONS, _SINGLE_FILE_VERSIONS = b"\x02\x02", b"\x01\x01"
+# Tries to leave WAL mode while another program reads the journal, and the time between them in s.
+_TRIES, _RETRY_S = 50, 0.2
 
 # What to do when the system is at fault, by SQLite's primary result code; all other codes blame the file.
 _REMEDIES = {
@@ -101,7 +105,7 @@ def connect(path: Path, *, read_only: bool) -> sqlite3.Connection:
             raise SessionCorrupt(f"{path}: holds {size} bytes, at most {MAX_JOURNAL_BYTES}; restore it from a copy")
         with path.open("rb") as opened:
             header = opened.read(20)
-        if header[:16] != b"SQLite format 3\0" or header[18:] != _WAL_VERSIONS:
+        if header[:16] != b"SQLite format 3\0" or header[18:] not in (_WAL_VERSIONS, _SINGLE_FILE_VERSIONS):
             raise SessionCorrupt(f"{path}: is not a journal; restore it from a copy")
     mode = "rw" if not read_only else "ro" if wal.exists() else "ro&immutable=1"
     db = sqlite3.connect(
@@ -140,6 +144,51 @@ def check_database(db: sqlite3.Connection, path: Path) -> int:
     return formats[0]
 
 
+def enter_wal_mode(db: sqlite3.Connection) -> None:
+    """Let the database have a WAL, which `leave_wal_mode` may have ended; no rollback journal is written."""
+    if db.execute("PRAGMA journal_mode").fetchone() != ("wal",):
+        db.execute("PRAGMA journal_mode = MEMORY")
+    db.execute("PRAGMA journal_mode = WAL")
+
+
+def leave_wal_mode(db: sqlite3.Connection, path: Path) -> None:
+    """Move all records into the one file of the database, whose WAL ends; no rollback journal is written.
+
+    Raises `SessionUnwritable` if another program keeps the journal open, which is only waited for a few seconds.
+    """
+    for attempts_left in reversed(range(_TRIES)):
+        try:
+            db.execute("PRAGMA journal_mode = MEMORY")
+        except sqlite3.OperationalError as failure:
+            if failure.sqlite_errorcode != sqlite3.SQLITE_BUSY:
+                raise
+            if not attempts_left:
+                raise SessionUnwritable(
+                    f"{path}: is open in {_other_user(path)}, so that the session cannot be sealed; what was committed "
+                    "is safe: close it there, and run the same command again"
+                ) from failure
+            time.sleep(_RETRY_S)
+        else:
+            break
+    if wal_bytes(path):
+        raise SessionUnwritable(f"{path}: its WAL does not end; check the disk, and run the same command again")
+
+
+def wal_bytes(path: Path) -> int:
+    """Return the size of the WAL beside a database: of records that are not in the database file itself."""
+    wal = _companions(path)[0]
+    return wal.stat().st_size if wal.exists() else 0
+
+
+def _other_user(path: Path) -> str:
+    """Return another process that holds a lock on a file, as Linux lists them; the others are not known."""
+    with suppress(OSError, ValueError):
+        for fields in map(str.split, Path("/proc/locks").read_text().splitlines()):
+            if fields[1] == "POSIX" and fields[5].endswith(f":{path.stat().st_ino}") and int(fields[4]) != os.getpid():
+                return f"process {fields[4]} ({Path('/proc', fields[4], 'comm').read_text().strip()})"
+    return "another program"
+
+
 @contextmanager
 def translate_sqlite_errors(path: Path, *, read_only: bool) -> Iterator[None]:
     """Raise `SessionUnwritable` or `SessionUnreadable` where the system is at fault, `SessionCorrupt` for the file."""
@@ -171,8 +220,7 @@ def _companions(path: Path) -> tuple[Path, Path, Path]:
 
 
 def _size(path: Path) -> int:
-    wal = _companions(path)[0]
-    return path.stat().st_size + (wal.stat().st_size if wal.exists() else 0)
+    return path.stat().st_size + wal_bytes(path)
 
 
 def _schema(db: sqlite3.Connection) -> list[tuple[str, ...]]:

@@ -70,10 +70,10 @@ def set_aside(path: Path, folder: Path) -> Path:
     return target
 
 
-def encode_exposure(exposure: Exposure) -> bytes | memoryview:
-    """Return the bytes of the file to keep: the camera's own file, or its array as a TIFF."""
+def encode_exposure(exposure: Exposure) -> memoryview:
+    """Return the bytes of the file to keep, the camera's own file, or its array as a TIFF; they are to be released."""
     if exposure.content is not None:
-        return exposure.content
+        return memoryview(exposure.content)
     assert exposure.pixels is not None
     buffer = BytesIO()
     photometric = "rgb" if exposure.pixels.ndim == 3 else "minisblack"

@@ -18,7 +18,14 @@ from faintfield.rig.cameras.protocol import Metadata
 from faintfield.rig.errors import SessionCorrupt
 from faintfield.rig.files import is_plain_name
 from faintfield.rig.plan import MAX_FRAMES
-from faintfield.rig.session.database import check_database, connect, create_database, translate_sqlite_errors
+from faintfield.rig.session.database import (
+    check_database,
+    connect,
+    create_database,
+    enter_wal_mode,
+    leave_wal_mode,
+    translate_sqlite_errors,
+)
 from faintfield.rig.stages.protocol import Point
 from faintfield.rig.stages.transport import Direction
 
@@ -134,7 +141,7 @@ class Journal:
                 self.format = check_database(self._db, self.path)
                 self._db.execute("COMMIT")
                 if not read_only:  # prefer durability to speed
-                    self._db.execute("PRAGMA journal_mode = WAL")
+                    enter_wal_mode(self._db)
                     self._db.execute("PRAGMA synchronous = FULL")
                     self._db.execute("PRAGMA foreign_keys = ON")
         except BaseException:
@@ -154,6 +161,17 @@ class Journal:
                 self._write_traffic()
         finally:
             self._db.close()
+
+    def finish(self) -> None:
+        """Close the journal for good: all that it holds is in one file, and no program has it open.
+
+        Raises `SessionUnwritable` if another program has, and goes on having it for some seconds.
+        """
+        if self._traffic:
+            self._write_traffic()
+        with self._translate_errors():
+            leave_wal_mode(self._db, self.path)
+        self.close()
 
     def record(self, at_s: float, direction: Direction, data: bytes) -> None:
         """Record serial traffic, which reaches the disk with the next entry."""

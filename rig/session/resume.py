@@ -47,6 +47,8 @@ _OPEN_KEYS = {
     "camera.answer_s",
     "camera.arrival_s",
     "camera.quiet_s",
+    "camera.silence_s",
+    "camera.delay_s",
     "camera.file_times",
     "camera.settle_limit_s",
     "light.on",

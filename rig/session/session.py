@@ -93,16 +93,16 @@ class Session:
 
     def write(self, frame: PlannedFrame, intent: int, exposure: Exposure) -> WrittenFile:
         """Write the file of an exposure under a name that contains its number, and is therefore unique."""
-        content = encode_exposure(exposure)
         name = exposure_name(frame, intent) + exposure.suffix
         if not is_plain_name(name):
             raise SessionUnwritable(f"{exposure.suffix!r:.60} is no suffix of a file; correct what the camera gives")
         path = self.folder / FRAMES / name
-        # Hash the bytes in memory, while they are written: `verify` then finds errors of the disk
-        with ThreadPoolExecutor(1) as hashing:
+        # Hash the bytes in memory, while they are written: `verify` then finds errors of the disk. Where writing fails,
+        # the failure keeps them: unless they are released, Python complains as it ends.
+        with encode_exposure(exposure) as content, ThreadPoolExecutor(1) as hashing:
             digest = hashing.submit(hashlib.sha256, content)
             write_new(path, content)
-        return WrittenFile(intent, path, digest.result().hexdigest(), len(content))
+            return WrittenFile(intent, path, digest.result().hexdigest(), len(content))
 
     def reject(self, frame: PlannedFrame, written: WrittenFile, why: str) -> None:
         """Set the file of an exposure aside that is no frame of this session; its frame stays missing."""
@@ -130,15 +130,21 @@ class Session:
     def seal(self) -> None:
         """Close the journal and write SHA256SUMS over plan, journal and frames, which completes the session.
 
-        Skipped frames are left out for good, as the journal records.
+        Skipped frames are left out for good, as the journal records. Raises `SessionUnwritable` if another program has
+        the journal open; the session can then be resumed.
         """
         self.journal.event("sealed", skipped=sorted(self._skipped), frames=len(self._valid))
-        committed = {frame.file for frame in self.journal.committed()}
-        self.journal.close()
-        names = [PLAN, JOURNAL, *(f"{FRAMES}/{name}" for name in list_names(self.folder / FRAMES) if name in committed)]
-        with translate_errors(self.folder):
-            lines = [f"{sha256(self.folder / name)}  {name}\n" for name in names]
-        write_new(self.folder / SUMS, "".join(lines).encode())
+        write_sums(self.folder, self.journal)
+
+
+def write_sums(folder: Path, journal: Journal) -> None:
+    """Close the journal of the session in `folder` for good, and write SHA256SUMS over plan, journal and frames."""
+    committed = {frame.file for frame in journal.committed()}
+    journal.finish()
+    names = [PLAN, JOURNAL, *(f"{FRAMES}/{name}" for name in list_names(folder / FRAMES) if name in committed)]
+    with translate_errors(folder):
+        lines = [f"{sha256(folder / name)}  {name}\n" for name in names]
+    write_new(folder / SUMS, "".join(lines).encode())
 
 
 def is_sealed(folder: Path) -> bool:

@@ -1,4 +1,4 @@
-"""Verify a session: compare its plan, journal, files and hashes; nothing is changed."""
+"""Verify a session: compare its plan, journal, files and hashes; and seal it again where records are not covered."""
 
 import os
 from collections.abc import Callable, Iterable, Iterator
@@ -9,9 +9,11 @@ from msgspec import Struct
 
 from faintfield.rig.files import read_regular, sha256
 from faintfield.rig.plan import planned_frames
-from faintfield.rig.session.disk import list_names, lock_session, translate_errors
+from faintfield.rig.session.database import wal_bytes
+from faintfield.rig.session.disk import list_names, lock_session, set_aside, translate_errors
 from faintfield.rig.session.journal import Begun, CommittedFrame, Sealed, Suspect
 from faintfield.rig.session.session import (
+    ASIDE,
     FRAMES,
     JOURNAL,
     PLAN,
@@ -20,11 +22,21 @@ from faintfield.rig.session.session import (
     exposure_name,
     is_sealed,
     open_journal,
+    read_plan,
     read_plan_and_hash,
+    write_sums,
 )
 
 # The sums of a capture of MAX_FRAMES frames, taken three times each, have this size in bytes.
 _MAX_SUMS_BYTES = 50_000_000
+
+# Problems of a session that faintfield 0.2.0 sealed while another program read its journal: with the WAL at hand, it
+# can be sealed again; in a copy without the WAL, records are lost.
+WAL_NOT_COVERED = (
+    f"{JOURNAL}-wal: holds records that {SUMS} does not cover, as faintfield 0.2.0 left them while another program "
+    f"read the journal; run `faintfield verify` with --repair, which moves them into {JOURNAL} and writes {SUMS} anew"
+)
+_WAL_LOST = f"{JOURNAL}: ends before the session was sealed; copy {JOURNAL}-wal too, which was beside it"
 
 # SHA-256 of files by name, or why a file cannot be read.
 type _Digests = dict[str, str | OSError]
@@ -87,6 +99,7 @@ def verify(folder: Path, progress: Callable[[Iterable[Path]], Iterable[Path]] = 
         problems += disagreements(frames, committed)
         problems += _compare(committed, digests, orphans - set(interrupted))
         if is_sealed(folder):
+            problems += [WAL_NOT_COVERED] * (wal_bytes(folder / JOURNAL) > 0) + [_WAL_LOST] * (not sealed)
             problems += _compare_sums(folder, committed, digests)
         valid = {frame.frame: frame for frame in committed if frame.void is None}
         left_out = {number for numbers in sealed[-1:] for number in numbers}
@@ -105,6 +118,26 @@ def verify(folder: Path, progress: Callable[[Iterable[Path]], Iterable[Path]] = 
             suspect=tuple(frame.file for frame in valid.values() if frame.intent in suspects),
             sealed=is_sealed(folder),
         )
+
+
+def repair(folder: Path, progress: Callable[[Iterable[Path]], Iterable[Path]] = iter) -> Verdict:
+    """Seal the session in `folder` again if its journal was sealed with records in a WAL; return what `verify` does.
+
+    Nothing is changed where there is any other problem. The earlier SHA256SUMS is set aside. A sealing that was
+    interrupted, this one too, is completed.
+    """
+    verdict = verify(folder, progress)
+    if verdict.missing or verdict.problems != ((WAL_NOT_COVERED,) if verdict.sealed else ()):
+        return verdict
+    with lock_session(folder), open_journal(folder, read_plan(folder)) as journal:
+        last = journal.events()[-1:]
+        if not last or last[0].kind != "sealed":
+            return verdict
+        if is_sealed(folder):
+            set_aside(folder / SUMS, folder / ASIDE)
+        journal.event("sealed", skipped=last[0].detail["skipped"], frames=verdict.present)
+        write_sums(folder, journal)
+    return verify(folder, progress)
 
 
 def _digest(path: Path) -> str | OSError:

@@ -201,4 +201,4 @@ def test_failing_camera(tmp_path: Path, failures: int) -> None:
 
 
 def test_bytes_of_the_camera_are_kept() -> None:
-    assert encode_exposure(Exposure(".nef", content=b"raw")) == b"raw"
+    assert bytes(encode_exposure(Exposure(".nef", content=b"raw"))) == b"raw"

@@ -10,15 +10,18 @@ from unittest import mock
 import numpy as np
 import pytest
 import tifffile
+from msgspec.structs import replace
 
 from faintfield.pipelines.live.guided import read_pixels
+from faintfield.rig import devices
 from faintfield.rig.cameras.protocol import Exposure, Pixels
 from faintfield.rig.errors import CameraError, CaptureStopped
 from faintfield.rig.session.journal import Journal
 from faintfield.rig.session.session import taken_frames
 from faintfield.rig.session.verify import verify
+from faintfield.rig.settings import SettleSettings
 from faintfield.rig.simulation.lab import SimulatedCamera
-from tests.faults.capturing import FRAMES, Operator, assert_complete, capture
+from tests.faults.capturing import FRAMES, SMALL_RIG, Operator, assert_complete, capture, events
 
 type Change = Callable[[Exposure], Exposure]
 
@@ -116,3 +119,41 @@ def test_operator_may_skip_a_damaged_frame(tmp_path: Path) -> None:
     verdict = verify(tmp_path / "session")
     assert verdict.problems == ()
     assert verdict.left_out == ("00002_bright_0_r0_c2",)
+
+
+class WatchedCamera(SimulatedCamera):
+    """A camera that somebody else triggers; the frames are those of the simulated one."""
+
+    def await_silence(self, exposure_s: float) -> None:
+        self._clock.sleep_s(exposure_s + 5.0)
+
+
+def test_untriggered_camera_is_silent_once_at_each_node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(devices, "SimulatedCamera", WatchedCamera)
+    operator = Operator()
+    settings = replace(SMALL_RIG, settle=SettleSettings(measure=True))
+    assert capture(tmp_path / "session", operator, settings) is None
+    places = {(frame.step, frame.stop) for frame, _, _ in taken_frames(tmp_path / "session")}
+    silences = [status for status in operator.statuses if status.doing.startswith("waiting for silence")]
+    assert len(silences) == len(places) < FRAMES
+    assert events(tmp_path / "session", "settling") == []  # its frames do not follow the move at once
+
+
+@pytest.mark.parametrize("odd", [cropped, coloured])
+def test_odd_first_frame_is_outvoted_and_taken_again(tmp_path: Path, odd: Change) -> None:
+    with changed({1: odd}):
+        assert capture(tmp_path / "session", decode=read_pixels) is None
+    assert_complete(tmp_path / "session", superseded=1)
+    for _, _, path in taken_frames(tmp_path / "session"):
+        pixels = read_pixels(path)
+        assert pixels is not None
+        assert pixels.shape == (12, 16)
+    (failure,) = events(tmp_path / "session", "camera_failed")
+    assert "or, if that one was odd, just take this frame again" in str(failure.detail["message"])
+
+
+def test_odd_second_frame_does_not_outvote_the_first(tmp_path: Path) -> None:
+    with changed({2: cropped, 3: shallow, 5: cropped, 6: cropped}):
+        assert capture(tmp_path / "session", decode=read_pixels) is None
+    assert_complete(tmp_path / "session")
+    assert len(events(tmp_path / "session", "camera_failed")) == 4

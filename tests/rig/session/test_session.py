@@ -9,13 +9,15 @@ from unittest import mock
 import numpy as np
 import pytest
 
+from faintfield.rig.cameras.protocol import Exposure
 from faintfield.rig.errors import SessionBusy, SessionCorrupt, SessionUnwritable
 from faintfield.rig.session import journal as journal_module
+from faintfield.rig.session import session as session_module
 from faintfield.rig.session.disk import set_aside, write_new
 from faintfield.rig.session.journal import Journal
 from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.verify import verify
-from tests.faults.capturing import FRAMES, capture_small
+from tests.faults.capturing import FRAMES, SMALL_RIG, capture_small, frozen_plan
 from tests.rig.session.forging import contents, flip, frame_files
 
 
@@ -162,6 +164,22 @@ def test_frame_is_never_overwritten(tmp_path: Path) -> None:
         write_new(path, b"second")
     assert path.read_bytes() == b"first"
     assert set_aside(path, tmp_path / "aside").read_bytes() == b"first"
+
+
+def test_failed_write_releases_the_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    contents: list[memoryview] = []
+
+    def fail(path: Path, content: memoryview) -> None:
+        contents.append(content)
+        raise SessionUnwritable(f"{path}: the disk is full")
+
+    with open_session(tmp_path / "session", frozen_plan(SMALL_RIG)) as session:
+        frame = session.missing()[0]
+        monkeypatch.setattr(session_module, "write_new", fail)
+        with pytest.raises(SessionUnwritable):
+            session.write(frame, session.intend(frame), Exposure(".tiff", pixels=np.zeros((4, 4), np.uint16)))
+    with pytest.raises(ValueError, match="released"):  # else Python complains when the failure is gone
+        bytes(contents[0])
 
 
 def test_interrupted_write_leaves_no_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
