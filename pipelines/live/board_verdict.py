@@ -118,18 +118,19 @@ def judge(
     prediction = TransferPrediction(start, plan.depths_mm)
     so_far = _information(prediction, standing_boards(start, boards), plan)
     error_px, depth_mm = prediction.error_px(so_far)
+    when = " when this sweep is done" if any(plan.to_come.values()) else ""
+    predicted = f"predicted transfer error{when} {error_px:.2g} px at {depth_mm:g} mm, wanted {plan.wanted_px:g}"
     if adjustment is not None and error_px <= plan.wanted_px:
-        words = f"predicted transfer error {error_px:.2g} px at {depth_mm:g} mm, wanted {plan.wanted_px:g}: reached"
-        more = ", the sweeps that are left make it smaller still" if plan.sweeps_left else ""
-        return BoardVerdict(f"{words}{more}", error_px, depth_mm, reached=True), adjustment
+        alone = len(adjustment.geometry.boards) == 1
+        more = ", but nothing checks a single board yet" if alone else ", the boards are good enough"
+        return BoardVerdict(f"{predicted}: reached{more}", error_px, depth_mm, reached=True), adjustment
     board = max(boards.values(), key=lambda board: (board.columns * board.rows, board.name))
     placements = candidate_placements(prediction, so_far, board, np.array(coverage(observations, size_px)))
     advice = _advise(placements, error_px, plan, known=adjustment is not None)
     if adjustment is None:
         words = f"the boards so far do not determine the lens (wanted: a transfer error of {plan.wanted_px:g} px)"
         return BoardVerdict(f"{words}: {advice}"), None
-    words = f"predicted transfer error {error_px:.2g} px at {depth_mm:g} mm, wanted {plan.wanted_px:g}: {advice}"
-    return BoardVerdict(words, error_px, depth_mm), adjustment
+    return BoardVerdict(f"{predicted}: {advice}", error_px, depth_mm), adjustment
 
 
 def _advise(placements: Sequence[Placement], error_px: float, plan: SweepPlan, *, known: bool) -> str:
@@ -137,7 +138,7 @@ def _advise(placements: Sequence[Placement], error_px: float, plan: SweepPlan, *
         return "no placement of this board is seen from all nodes; take a smaller grid or a smaller board"
     best = placements[0]
     words = describe_placement(best, with_distance=known)
-    where = f"put the board {words}"
+    where = f"next, put the board {words}"
     if not plan.sweeps_left:
         where = f"no board sweep is left; to reach it, add one in a new session with the board {words}"
     return f"{where}; that would give {best.error_px:.2g} px" if known and best.error_px < error_px else where
