@@ -29,8 +29,9 @@ from faintfield.calib.lens import Lens
 from faintfield.pipelines.live.board_progress import BoardVerdict, SweepProgress
 from faintfield.rig.plan import CapturePlan
 
-# The lens is not known until its focal length is known this well.
-_MAX_FOCAL_SIGMA = 0.1
+# The lens is not known until its focal length is known this well, relative; few boards may fit with any, even less
+# than any lens has, in widths of the detector.
+_MAX_FOCAL_SIGMA, _MIN_FOCAL_WIDTHS = 0.1, 0.2
 
 # Focal length in widths of the detector that stands for the lens until then.
 _NOMINAL_FOCAL_WIDTHS = 1.25
@@ -147,8 +148,10 @@ def _advise(placements: Sequence[Placement], error_px: float, plan: SweepPlan, *
 def _knows_lens(adjustment: Adjustment) -> bool:
     """Return whether the focal length is known at all, and the lens one that can be."""
     geometry = adjustment.geometry
-    sigma_px = float(np.sqrt(geometry.covariance[0, 0]))
-    if not sigma_px <= _MAX_FOCAL_SIGMA * geometry.lens.fx_px:
+    focal_px, variance_px2 = geometry.lens.fx_px, geometry.covariance[0, 0]
+    if focal_px < _MIN_FOCAL_WIDTHS * geometry.lens.size_px[0]:
+        return False
+    if not 0 < variance_px2 <= (_MAX_FOCAL_SIGMA * focal_px) ** 2:
         return False
     try:
         geometry.lens.rays_at(np.array([[0.0, 0.0], np.array(geometry.lens.size_px) - 1.0]))
