@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.board import Board
+from faintfield.calib.geometry.acceptance import require_seen
 from faintfield.calib.geometry.calibrate import Adjustment
 from faintfield.calib.geometry.observations import Node
 from faintfield.calib.homography import (
@@ -27,9 +28,10 @@ from faintfield.calib.homography import (
     transfer_derivative,
 )
 
-# Standard deviations of what is known of a lens before any corner is: focal lengths relative, the principal point in
-# widths, distortion coefficients. They matter only while boards leave some direction free.
+# Standard deviations of what is known of lens and poses before any corner is: focal lengths relative, the principal
+# point in widths, distortion coefficients, rad and mm. They matter only while boards leave some direction free.
 _PRIOR_FOCAL, _PRIOR_CENTRE, _PRIOR_DISTORTION = 0.3, 0.1, 0.3
+_PRIOR_RAD, _PRIOR_MM = 1.0, 1000.0
 
 # The same of the boards' bend in mm: free, and where none is fitted.
 _PRIOR_BEND_MM, _NO_BEND_MM = 5.0, 1e-6
@@ -70,7 +72,8 @@ class Information:
 class TransferPrediction:
     """Prediction of the error of transfers by planes, linear about a geometry.
 
-    The state is the lens, the poses of all nodes but the reference in their order, and the bend of the boards.
+    The state is the lens, the poses of all nodes but the reference in their order, and the bend of the boards. Raises
+    `NotIdentifiable` if a plane is not seen from half of the nodes.
     """
 
     def __init__(self, adjustment: Adjustment, depths_mm: Sequence[float]) -> None:
@@ -175,8 +178,9 @@ class TransferPrediction:
         lens = self.geometry.lens
         sigmas = [_PRIOR_FOCAL * lens.fx_px] * 2 + [_PRIOR_CENTRE * lens.size_px[0]] * 2
         sigmas += [_PRIOR_DISTORTION] * len(lens.distortion)
-        prior = np.zeros(self._size)
+        prior = np.empty(self._size)
         prior[: self._lens_size] = np.array(sigmas) ** -2.0
+        prior[self._lens_size : -2].reshape(-1, 6)[:] = np.repeat([_PRIOR_RAD, _PRIOR_MM], 3) ** -2.0
         prior[-2:] = (_PRIOR_BEND_MM if with_warp else _NO_BEND_MM) ** -2.0
         return np.diag(prior) * self.geometry.sigma_px**2
 
@@ -184,7 +188,7 @@ class TransferPrediction:
         """Return W (state, state): the mean square error of the transfer is the sum of W times the covariance."""
         geometry = self.geometry
         plane, pixels = fronto_parallel_rt_ref_plane(depth_mm), image_lattice(geometry.lens.size_px)
-        wanted, points = np.zeros((self._size, self._size)), 0
+        wanted, points, seen = np.zeros((self._size, self._size)), 0, 0
         for node, rt in enumerate(geometry.rt_cam_ref):
             if node == geometry.reference:
                 continue
@@ -193,7 +197,9 @@ class TransferPrediction:
             columns = np.r_[: self._lens_size, self._first_column(node) + np.arange(6)]
             wanted[np.ix_(columns, columns)] += np.einsum("pai,paj->ij", slope, slope)
             points += len(slope)
-        return wanted / max(points, 1)
+            seen += bool(len(slope))
+        require_seen(depth_mm, seen, len(geometry.nodes) - 1)
+        return wanted / points
 
 
 def _bend_shape(board: Board) -> NDArray[np.float64]:

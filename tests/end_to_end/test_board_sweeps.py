@@ -25,6 +25,7 @@ from faintfield.pipelines.live.capture_page import serve_page
 from faintfield.pipelines.live.panel import CapturePanel
 from faintfield.rig.capture.guide import Status
 from faintfield.rig.plan import PlannedFrame, Stop
+from faintfield.rig.session.homings import read_homing_groups
 from faintfield.rig.session.verify import verify
 from faintfield.rig.stages.protocol import Point
 from tests.end_to_end.browser import Tab
@@ -61,7 +62,8 @@ def capture_with_boards(
 
     monkeypatch.setattr(guided, "followed_boards", followed)
     monkeypatch.setattr(CapturePanel, "end", wait)
-    (folder / "rig.toml").write_text(rig_toml(["charuco"] * 3, rows=2, columns=2))
+    text = rig_toml(["charuco"] * 3, rows=2, columns=2)
+    (folder / "rig.toml").write_text(text.replace("check = false", "check = true"))  # homes after each sweep
     assert cli.run(["capture", str(folder / "rig.toml"), str(folder / "session"), "--yes", "--page"]) == 0
     return clients[0]
 
@@ -75,6 +77,9 @@ def test_terminal_says_verdict_and_poses(
     assert "poses: measured, of the boards of this session" in said
     assert client.progress is not None
     assert not Path(client.progress.geometry).exists()  # it is for this capture only
+    news, groups = client.news(), read_homing_groups(tmp_path / "session").groups
+    assert {frame.intent: frame.homing for frame in news.frames} == groups
+    assert len(set(groups.values())) > 1
     assert verify(tmp_path / "session").problems == ()
     assert {path.name for path in (tmp_path / "session").iterdir()} == {
         *("SHA256SUMS", "frames", "journal.sqlite", "lock", "plan.json")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import spearmanr
 
+from faintfield.calib.errors import NotIdentifiable
 from faintfield.calib.geometry import RigGeometry, rms_over_views, transfer_sigma_at
 from faintfield.calib.geometry.calibrate import Adjustment, adjust, nominal_adjustment
 from faintfield.calib.geometry.information import Information, TransferPrediction, standing_boards
@@ -91,6 +92,12 @@ def test_advised_placement_lowers_true_error_most() -> None:
     assert true_px < 0.7 * errors_with(before, worst, range(100, 104))[0]
     assert true_px == pytest.approx(predicted_px, rel=0.4)
     assert best.error_px == pytest.approx(predicted_px, rel=0.25)
+
+
+def test_plane_outside_views_is_not_reached() -> None:
+    adjustment, *_ = solved(simulated(3))
+    with pytest.raises(NotIdentifiable, match="plane at 5 mm: 0 of the 8 views"):
+        TransferPrediction(adjustment, (500.0, 5.0))
 
 
 @pytest.mark.deep
