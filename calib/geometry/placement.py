@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.board import Board, predefined_dictionary
+from faintfield.calib.geometry.bundle import rt_of, transform_of
 from faintfield.calib.geometry.information import Information, StandingBoard, TransferPrediction
+from faintfield.calib.geometry.observations import BoardObservation, determines_pose
 from faintfield.calib.geometry.rig_geometry import RigGeometry
 from faintfield.calib.homography import rotation_matrix
 
@@ -25,6 +27,9 @@ _NEAR_FILL, _FAR_OVER_NEAR = 0.85, 1.6
 # Share of its corners that every node sees at least, so that the board joins the nodes; steps of the distances tried.
 _MIN_SEEN, _DISTANCE_STEP = 1 / 3, 1.08
 _MAX_STEPS = 30
+
+# Corners of a view from which the pose of a board is told: enough to tell which way it is tilted.
+_MIN_CORNERS_OF_POSE = 12
 
 # Smallest bit of a marker that the detector reads, in pixels.
 _MIN_BIT_PX = 3.0
@@ -78,6 +83,24 @@ def tilt_of(rt_ref_board: NDArray[np.float64]) -> Tilt:
     if abs(normal[0]) >= abs(normal[1]):
         return Tilt(deg, "left" if normal[0] > 0 else "right")
     return Tilt(deg, "up" if normal[1] > 0 else "down")
+
+
+def board_in_view(geometry: RigGeometry, board: Board, seen: BoardObservation) -> NDArray[np.float64] | None:
+    """Return rt_ref_board (6,) of a board by one view of a node of known pose; None if it shows too little."""
+    enough = len(seen.corners) >= _MIN_CORNERS_OF_POSE and determines_pose(seen, {board.name: board.corner_shape})
+    if seen.node not in geometry.nodes or not enough:
+        return None
+    rays = geometry.lens.rays_at(seen.pixels)[:, np.newaxis]
+    points = board.corners_mm()[seen.corners]
+    solved, rotations, translations, errors = cv2.solvePnPGeneric(
+        points, rays, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+    )
+    if not solved:
+        return None
+    best = int(np.argmin(np.ravel(errors)))
+    cam_from_board = transform_of(np.append(np.ravel(rotations[best]), np.ravel(translations[best])))
+    ref_from_cam = np.linalg.inv(transform_of(geometry.rt_cam_ref[geometry.nodes.index(seen.node)]))
+    return rt_of(ref_from_cam @ cam_from_board)
 
 
 def count_cells(pixels: NDArray[np.float64], size_px: tuple[int, int]) -> NDArray[np.int64]:

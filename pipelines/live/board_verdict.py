@@ -10,6 +10,7 @@ from functools import reduce
 from operator import add
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from faintfield.calib.board import Board
@@ -19,6 +20,7 @@ from faintfield.calib.geometry.calibrate import Adjustment, adjust, nominal_adju
 from faintfield.calib.geometry.information import Information, StandingBoard, TransferPrediction, standing_boards
 from faintfield.calib.geometry.placement import (
     Placement,
+    board_in_view,
     board_middle_mm,
     candidate_placements,
     count_cells,
@@ -74,27 +76,29 @@ def coverage(observations: Sequence[BoardObservation], size_px: tuple[int, int])
 def sweeps_seen(
     observations: Sequence[BoardObservation], adjustment: Adjustment | None, boards: Mapping[str, Board]
 ) -> tuple[SweepProgress, ...]:
-    """Return the boards of each sweep, with the poses of an adjustment where there is one."""
-    poses = (
-        {}
-        if adjustment is None
-        else {(pose.target.sweep, pose.target.board): pose.rt_ref_board for pose in adjustment.geometry.boards}
-    )
+    """Return the boards of each sweep; where they stand follows from an adjustment, or from a view by its lens."""
     seen: dict[tuple[int, str], list[BoardObservation]] = {}
     for observation in observations:
         seen.setdefault((observation.target.sweep, observation.target.board), []).append(observation)
-    progress = []
-    for (sweep, name), views in sorted(seen.items()):
-        entry = SweepProgress(
-            sweep + 1, name, sum(len(view.corners) for view in views), len({view.node for view in views})
-        )
-        if (pose := poses.get((sweep, name))) is not None:
-            tilt, distance_mm = tilt_of(pose), float(board_middle_mm(boards[name], pose)[2])
-            entry = SweepProgress(
-                entry.sweep, name, entry.corners, entry.nodes, round(distance_mm), tilt.deg, tilt.direction
-            )
-        progress.append(entry)
-    return tuple(progress)
+    return tuple(_sweep_seen(views, adjustment, boards[name]) for (_, name), views in sorted(seen.items()))
+
+
+def _sweep_seen(views: Sequence[BoardObservation], adjustment: Adjustment | None, board: Board) -> SweepProgress:
+    target, corners, nodes = views[0].target, sum(len(view.corners) for view in views), {view.node for view in views}
+    progress = SweepProgress(target.sweep + 1, board.name, corners, len(nodes))
+    if adjustment is None:
+        return progress
+    poses = [
+        pose.rt_ref_board
+        for pose in adjustment.geometry.boards
+        if (pose.target.sweep, pose.target.board) == (target.sweep, board.name)
+    ]
+    best = max(views, key=lambda view: len(view.corners))
+    rt_ref_board = poses[0] if poses else board_in_view(adjustment.geometry, board, best)
+    if rt_ref_board is None:
+        return progress
+    tilt, distance_mm = tilt_of(rt_ref_board), float(board_middle_mm(board, rt_ref_board)[2])
+    return replace(progress, distance_mm=round(distance_mm), tilt_deg=tilt.deg, direction=tilt.direction)
 
 
 def judge(

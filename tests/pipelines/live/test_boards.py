@@ -100,6 +100,11 @@ def test_boards_in_turn_end_in_geometry_of_command(session: Path, tmp_path: Path
     assert [(it.direction, it.nodes) for it in last.sweeps] == [("down", 9), ("up", 9), ("left", 9)]
     np.testing.assert_allclose([it.tilt_deg or 0 for it in last.sweeps], [22.4, 24.7, 28.4], atol=0.5)
     np.testing.assert_allclose([it.distance_mm or 0 for it in last.sweeps], [540, 560, 560], atol=5)
+    # The board of the third sweep is told by its first view
+    first = next(it for it in told if it.frames == 2 * _NODES + 1).sweeps[-1]
+    assert (first.sweep, first.direction, first.nodes) == (3, "left", 1)
+    assert first.tilt_deg == pytest.approx(28.4, abs=2.0)
+    assert first.distance_mm == pytest.approx(560, abs=15)
     assert last.last is not None
     assert last.last.frame == "00026_charuco_2_r2_c2"
     assert last.last.size_px == (320, 240)
