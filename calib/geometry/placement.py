@@ -53,10 +53,14 @@ class Tilt:
 
 @dataclass(frozen=True)
 class Placement:
-    """A pose in which a board could be shown next, in words too, and the transfer error that it would lead to."""
+    """A pose in which a board could be shown next, in words too, and the transfer error that it would lead to.
+
+    `width` is that of the board in the image, in widths of the image.
+    """
 
     rt_ref_board: NDArray[np.float64]
     distance_mm: float
+    width: float
     far: bool
     direction: Direction
     part: str
@@ -152,7 +156,8 @@ def candidate_placements(
             if is_far and _bit_px(geometry, board, distance_mm) < _MIN_BIT_PX:
                 continue
             error_px = prediction.error_px(so_far + prediction.of_sweep([seen]))[0]
-            found.append(Placement(seen.rt_ref_board, distance_mm, is_far, direction, name, error_px))
+            width = geometry.lens.fx_px * board.columns * board.square_mm / distance_mm / geometry.lens.size_px[0]
+            found.append(Placement(seen.rt_ref_board, distance_mm, width, is_far, direction, name, error_px))
     return sorted(found, key=lambda placement: placement.error_px)
 
 
@@ -199,10 +204,13 @@ def _bit_px(geometry: RigGeometry, board: Board, distance_mm: float) -> float:
 
 
 def describe_placement(placement: Placement, *, with_distance: bool = True) -> str:
-    """Return a placement in plain words, with its distance in mm if the lens is known well enough to state it."""
-    distance = "far away, about 0.6 of the picture wide" if placement.far else "near, so that it fills the picture"
-    if with_distance:
-        distance = f"{'far away' if placement.far else 'near'} (about {round(placement.distance_mm, -1):.0f} mm)"
+    """Return a placement in plain words, with its width in the picture if no lens is known that tells its distance."""
+    size = (
+        f"about {round(placement.distance_mm, -1):.0f} mm"
+        if with_distance
+        else f"as wide as {placement.width:.0%} of the picture"
+    )
+    distance = f"{'far away' if placement.far else 'near'} ({size})"
     edges = {"left": "left", "right": "right", "up": "upper", "down": "lower"}
     tilt = "facing the camera"
     if placement.direction:

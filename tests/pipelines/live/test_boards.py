@@ -173,7 +173,8 @@ def test_verdict_states_error_wish_and_advice() -> None:
 def test_facing_board_leads_to_advice_without_lens() -> None:
     words, reached, error_px = judged([FACING], 0.5)
     assert words.startswith("the boards so far do not determine the lens")
-    assert "tilted by about 25° " in words
+    assert "% of the picture), tilted by about 25° " in words
+    assert " mm)" not in words
     assert (reached, error_px) == (False, None)
 
 
