@@ -143,7 +143,7 @@ def _advise(placements: Sequence[Placement], error_px: float, plan: SweepPlan, *
         return "no placement of this board is seen from all nodes; take a smaller grid or a smaller board"
     best = placements[0]
     words = describe_placement(best, with_distance=known)
-    where = f"next, put the board {words}"
+    where = f"{'after it' if any(plan.to_come.values()) else 'next'}, put the board {words}"
     if not plan.sweeps_left:
         where = f"no board sweep is left; to reach it, add one in a new session with the board {words}"
     return f"{where}; that would give {best.error_px:.2g} px" if known and best.error_px < error_px else where
