@@ -123,7 +123,8 @@ def judge(
     prediction = TransferPrediction(start, plan.depths_mm)
     so_far = _information(prediction, standing_boards(start, boards), plan)
     error_px, depth_mm = prediction.error_px(so_far)
-    when = " when this sweep is done" if any(plan.to_come.values()) else ""
+    under_way = [sweep + 1 for sweep, nodes in plan.to_come.items() if nodes]
+    when = f" when sweep {max(under_way)} is done" if under_way else ""
     predicted = f"predicted transfer error{when} {error_px:.2g} px at {depth_mm:g} mm, wanted {plan.wanted_px:g}"
     if adjustment is not None and error_px <= plan.wanted_px:
         alone = len(adjustment.geometry.boards) == 1

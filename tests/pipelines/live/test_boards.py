@@ -180,7 +180,7 @@ def test_facing_board_leads_to_advice_without_lens() -> None:
 
 def test_half_a_sweep_predicts_its_end() -> None:
     words, _, half_px = judged(_SIX[:3], 0.01, to_come=5)
-    assert words.startswith("predicted transfer error when this sweep is done ")
+    assert words.startswith("predicted transfer error when sweep 3 is done ")
     assert ": after it, put the board " in words
     assert half_px == pytest.approx(judged(_SIX[:3], 0.01)[2], rel=0.2)
 
