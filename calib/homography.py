@@ -137,18 +137,20 @@ def transfer_sigma_px(
     points = image_lattice(lens.size_px) if pixels is None else np.asarray(pixels, np.float64)
     sigma_px = np.full((len(rt_cam_ref), len(points)), np.nan)
     for view, (rt, covariance) in enumerate(zip(np.asarray(rt_cam_ref, float), covariances, strict=True)):
-        slope = _transfer_derivative(lens, rt, rt_ref_plane, points)
+        slope = transfer_derivative(lens, rt, rt_ref_plane, points)
         variances = np.einsum("pai,ij,paj->p", slope, covariance, slope)
-        images_px = transfer(lens, rt, rt_ref_plane, points)
-        visible = ((images_px >= -0.5) & (images_px <= np.array(lens.size_px) - 0.5)).all(axis=1)
+        visible = np.isfinite(slope).all(axis=(1, 2))
         sigma_px[view, visible] = np.sqrt(np.maximum(variances[visible], 0))
     return sigma_px
 
 
-def _transfer_derivative(
+def transfer_derivative(
     lens: Lens, rt_cam_ref: NDArray[np.float64], rt_ref_plane: NDArray[np.floating], pixels: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the derivative (point, 2, parameter) of `transfer` by lens and pose, from central differences."""
+    """Return the derivative (point, 2, parameter) of `transfer` by lens and pose, from central differences.
+
+    It is NaN where the view does not see the point.
+    """
     values = np.array([*lens.parameters, *rt_cam_ref])
     derivative = np.empty((len(pixels), 2, len(values)))
     for index, value in enumerate(values):
@@ -158,4 +160,7 @@ def _transfer_derivative(
             for moved in values + step * np.eye(len(values))[index] * [[1], [-1]]
         )
         derivative[:, :, index] = (ahead - behind) / (2 * step)
+    images_px = transfer(lens, rt_cam_ref, rt_ref_plane, pixels)
+    visible = ((images_px >= -0.5) & (images_px <= np.array(lens.size_px) - 0.5)).all(axis=1)
+    derivative[~visible] = np.nan
     return derivative

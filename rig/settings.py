@@ -122,6 +122,9 @@ class CheckSettings(Struct, frozen=True, forbid_unknown_fields=True):
         Smallest number of board corners that makes a charuco frame useful.
     leak_dn : float
         Largest difference between the means of two parts of a dark frame or a noise reference.
+    transfer_px : float, optional
+        Wanted error of the transfer between views, which the boards are to reach; by default the limit of
+        `faintfield geometry`.
     """
 
     saturation_dn: float | None = None
@@ -131,11 +134,14 @@ class CheckSettings(Struct, frozen=True, forbid_unknown_fields=True):
     sharpness_share: float = 0.5
     board_corners: int = 6
     leak_dn: float = 8.0
+    transfer_px: float | None = None
 
     def __post_init__(self) -> None:
         for name in ("saturated_share", "sharpness_share"):
             if not 0.0 <= (share := getattr(self, name)) <= 1.0:
                 raise ValueError(f"{name} = {share:g}; a share lies between 0 and 1")
+        if self.transfer_px is not None and not 0.0 < self.transfer_px < math.inf:
+            raise ValueError(f"transfer_px = {self.transfer_px:g}; an error is positive")
 
 
 class DriftSettings(Struct, frozen=True, forbid_unknown_fields=True):

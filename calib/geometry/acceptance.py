@@ -66,11 +66,7 @@ def require_determined(
         except LensNotInvertible:  # an undetermined lens may fold the image
             of_views_px = np.full((len(geometry.nodes), 1), np.inf)
         seen, others = int((~np.isnan(of_views_px)).any(axis=1).sum()), len(of_views_px) - 1
-        if 2 * seen < others:
-            raise NotIdentifiable(
-                f"plane at {depth_mm:g} mm: {seen} of the {others} views beside the centre's see anything of it, limit "
-                "half; give --depth-mm in mm from the camera, or nodes that lie nearer to one another"
-            )
+        require_seen(depth_mm, seen, others)
         sigma_px = rms_over_views(of_views_px)
         if not sigma_px <= limit_px:
             raise NotIdentifiable(
@@ -78,6 +74,15 @@ def require_determined(
                 f"limit {limit_px:g} px (the corners fit to {geometry.rms_inlier_px:.2g} px, which says little): "
                 f"{'; '.join(find_shortcomings(geometry, observations, depth_mm) or [_MORE])}"
             )
+
+
+def require_seen(depth_mm: float, seen: int, others: int) -> None:
+    """Check that at least half of the views but the reference see something of a plane; raises `NotIdentifiable`."""
+    if 2 * seen < others:
+        raise NotIdentifiable(
+            f"plane at {depth_mm:g} mm: {seen} of the {others} views beside the centre's see anything of it, limit "
+            "half; give --depth-mm in mm from the camera, or nodes that lie nearer to one another"
+        )
 
 
 def find_shortcomings(geometry: RigGeometry, observations: Observations, depth_mm: float) -> list[str]:

@@ -235,9 +235,9 @@ def _polish(inputs: dict[str, Any]) -> None:
 def _initial_poses(problem: BundleProblem, focal_px: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return rt_cam_ref (node, 6) and rt_ref_board (target, 6) along the tree of the best-fitting views."""
     observations = problem.observations
-    poses, errors = zip(*(_pose(problem, view, focal_px) for view in range(len(observations.node_of))), strict=True)
+    poses, errors = zip(*(view_pose(problem, view, focal_px) for view in range(len(observations.node_of))), strict=True)
     rt_cam_ref, rt_ref_board = (
-        np.array([_rt(transforms[index]) for index in range(len(transforms))])
+        np.array([rt_of(transforms[index]) for index in range(len(transforms))])
         for transforms in _tree(observations, poses, errors)
     )
     return rt_cam_ref, rt_ref_board
@@ -253,11 +253,11 @@ def _focal_by_trial(problem: BundleProblem) -> float:
     ranked = zip_longest(*(of_target.tolist() for of_target in per_target))
     chosen = [view for rank in ranked for view in rank if view is not None][:_MAX_FOCAL_VIEWS]
     focal_px = _FOCAL_WIDTHS * problem.size_px[0]
-    errors = [sum(_pose(problem, view, focal)[1] ** 2 for view in chosen) for focal in focal_px]
+    errors = [sum(view_pose(problem, view, focal)[1] ** 2 for view in chosen) for focal in focal_px]
     return float(focal_px[int(np.argmin(errors))])
 
 
-def _pose(problem: BundleProblem, view: int, focal_px: float) -> tuple[Transform, float]:
+def view_pose(problem: BundleProblem, view: int, focal_px: float) -> tuple[Transform, float]:
     """Return the transform from board to camera that fits one view, and its rms reprojection error in pixels.
 
     The lens is a pinhole whose principal point is the middle of the detector.
@@ -303,5 +303,13 @@ def _tree(
     return camera_from_ref, ref_from_board
 
 
-def _rt(transform: Transform) -> NDArray[np.float64]:
+def rt_of(transform: Transform) -> NDArray[np.float64]:
+    """Return a transform as Rodrigues vector and translation (6,)."""
     return np.append(cv2.Rodrigues(transform[:3, :3])[0].ravel(), transform[:3, 3])
+
+
+def transform_of(rt: NDArray[np.float64]) -> Transform:
+    """Return the homogeneous matrix of a pose (6,)."""
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = rotation_matrix(rt), rt[3:]
+    return transform

@@ -16,7 +16,15 @@ from faintfield.calib.geometry.acceptance import (
     inconsistent_views,
     require_determined,
 )
-from faintfield.calib.geometry.bundle import LENS_MODELS, Bundle, BundleProblem, solve
+from faintfield.calib.geometry.bundle import (
+    LENS_MODELS,
+    Bundle,
+    BundleProblem,
+    rt_of,
+    solve,
+    transform_of,
+    view_pose,
+)
 from faintfield.calib.geometry.covariance import Uncertainty, homing_shifts, uncertainty
 from faintfield.calib.geometry.observations import (
     BoardObservation,
@@ -115,6 +123,78 @@ def calibrate_geometry(
     geometry = replace(geometry, holdout_ratio=holdout_ratio(bundle, gathered))
     _require_fit(geometry, settings)
     return geometry
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """A solution that nothing has judged yet: geometry, corners, which of them count, and whether boards may bend."""
+
+    geometry: RigGeometry
+    observations: Observations
+    inlier: NDArray[np.bool_]
+    with_warp: bool
+
+
+def adjust(
+    boards: Mapping[str, Board],
+    observations: Sequence[BoardObservation],
+    size_px: tuple[int, int],
+    reference: Node,
+    lens_model: str,
+) -> Adjustment:
+    """Return the solution from the corners that there are so far; homings within sweeps are left out of account.
+
+    Raises
+    ------
+    TooFewViews, NotIdentifiable, PoorFit
+        There is no solution, or corners contradict one another.
+    """
+    problem = _problem(boards, size_px, reference, lens_model, as_one_homing(observations))
+    bundle = _solve(problem)
+    solved = _Solved(problem, bundle, uncertainty(bundle, problem.observations))
+    _require_residuals(bundle, problem.observations)
+    return Adjustment(_geometry(solved), problem.observations, bundle.inlier, problem.with_warp)
+
+
+def nominal_adjustment(
+    boards: Mapping[str, Board],
+    observations: Sequence[BoardObservation],
+    lens: Lens,
+    reference: Node,
+    rt_cam_ref: Mapping[Node, NDArray[np.float64]],
+) -> Adjustment:
+    """Return a geometry at stated poses and a stated lens, in which only the boards are where the corners put them.
+
+    It stands for the solution while the corners leave lens or poses free. Its covariance is not known, and is zero.
+    """
+    problem = _problem(boards, lens.size_px, reference, "opencv5", as_one_homing(observations))
+    gathered = problem.observations
+    corners = (gathered.weights > 0).sum(axis=(1, 2))
+    poses = []
+    for number, target in enumerate(gathered.targets):
+        view = int(np.argmax(np.where(gathered.target_of == number, corners, -1)))
+        ref_from_cam = np.linalg.inv(transform_of(rt_cam_ref[gathered.nodes[gathered.node_of[view]]]))
+        poses.append(BoardPose(target, rt_of(ref_from_cam @ view_pose(problem, view, lens.fx_px)[0])))
+    nodes = sorted(gathered.nodes)
+    size = len(lens.parameters) + 6 * len(nodes)
+    geometry = RigGeometry(
+        lens=lens,
+        lens_model=problem.lens_model,
+        nodes=nodes,
+        reference=nodes.index(reference),
+        rt_cam_ref=np.array([rt_cam_ref[node] for node in nodes]),
+        covariance=np.zeros((size, size)),
+        boards=poses,
+        warp_mm=np.zeros(2),
+        sigma_px=float(np.median(np.concatenate([seen.sigma_px for seen in observations]))),
+        rms_inlier_px=0.0,
+        rms_mrcal_px=0.0,
+        corners=gathered.corner_count,
+        outliers=0,
+        holdout_ratio=None,
+        repeatability=None,
+    )
+    return Adjustment(geometry, gathered, gathered.weights > 0, problem.with_warp)
 
 
 @dataclass(frozen=True)

@@ -101,7 +101,7 @@ def gather(
     ValueError
         A corner does not exist on its board.
     """
-    useful = [observation for observation in observations if _determines_pose(observation, corner_shapes)]
+    useful = [observation for observation in observations if determines_pose(observation, corner_shapes)]
     nodes = _connected_nodes(useful, reference)
     if not nodes:
         raise TooFewViews(
@@ -149,7 +149,7 @@ def _lattices(
     return pixels, weights
 
 
-def _determines_pose(observation: BoardObservation, corner_shapes: dict[str, tuple[int, int]]) -> bool:
+def determines_pose(observation: BoardObservation, corner_shapes: dict[str, tuple[int, int]]) -> bool:
     """Return whether corners are enough, and on two rows and two columns at least: they then determine the pose."""
     row, column = np.divmod(observation.corners, corner_shapes[observation.target.board][1])
     return len(observation.corners) >= _MIN_CORNERS and len(np.unique(row)) > 1 and len(np.unique(column)) > 1

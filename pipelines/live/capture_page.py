@@ -30,6 +30,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from faintfield.pipelines.console import conceal, inform
 from faintfield.pipelines.formats.image_files import encoded
+from faintfield.pipelines.live.boards_client import BoardsClient
 from faintfield.pipelines.live.panel import REQUESTS, CapturePanel, SessionFrames, ShownFrame
 from faintfield.pipelines.live.planes_client import PlanesClient
 from faintfield.pipelines.live.terminal import LABELS, describe_values, display_levels
@@ -65,11 +66,15 @@ class _PressRequest(msgspec.Struct, forbid_unknown_fields=True):
 
 @contextmanager
 def serve_page(
-    panel: CapturePanel, frames: SessionFrames | None = None, planes: PlanesClient | None = None
+    panel: CapturePanel,
+    frames: SessionFrames | None = None,
+    planes: PlanesClient | None = None,
+    boards: BoardsClient | None = None,
 ) -> Iterator[str]:
     """Serve the page of a capture while the block runs; yield its address, which no log records.
 
-    It shows prompts and state of `panel`, the `frames` of the session when a node is clicked, and live planes.
+    It shows prompts and state of `panel`, the `frames` of the session when a node is clicked, live planes, and the
+    board sweeps.
     """
     token = secrets.token_urlsafe(24)
     conceal(token)
@@ -77,7 +82,7 @@ def serve_page(
     listener = socket.create_server((_HOST, 0))
     server = uvicorn.Server(
         uvicorn.Config(
-            _TokenMiddleware(_pages(panel, frames, planes, audience), token),
+            _TokenMiddleware(_pages(panel, frames, planes, boards, audience), token),
             http=_BoundedConnection,
             h11_max_incomplete_event_size=_MAX_HEADER_BYTES,
             backlog=_MAX_ARRIVALS,
@@ -187,7 +192,11 @@ def _is_own(headers: Headers) -> bool:
 
 
 def _pages(
-    panel: CapturePanel, frames: SessionFrames | None, planes: PlanesClient | None, audience: _Audience
+    panel: CapturePanel,
+    frames: SessionFrames | None,
+    planes: PlanesClient | None,
+    boards: BoardsClient | None,
+    audience: _Audience,
 ) -> Router:
     """Return the addresses behind the token."""
     html = files("faintfield.pipelines.live").joinpath("capture.html").read_text(encoding="utf-8")
@@ -197,7 +206,11 @@ def _pages(
 
     async def state(request: Request) -> Response:
         audience.note(informed="informed" in request.query_params)
-        return _json(_state(panel) | {"planes": None if planes is None else _planes(planes)})
+        parts = {
+            "planes": None if planes is None else _planes(planes),
+            "boards": None if boards is None else _boards(boards),
+        }
+        return _json(_state(panel) | parts)
 
     async def picture(_: Request) -> Response:
         shown = panel.shown
@@ -281,6 +294,16 @@ def _planes(planes: PlanesClient) -> dict[str, Any]:
         "offered": planes.frame_count(),
         "silence_s": round(planes.silence_s()),
         "status": msgspec.to_builtins(planes.status),
+    }
+
+
+def _boards(boards: BoardsClient) -> dict[str, Any]:
+    """Return the progress of the board sweeps as a JSON object; there is none before the first message."""
+    progress = boards.progress
+    return {
+        "ended": boards.failure(),
+        "poses": "" if progress is None else progress.poses,
+        "progress": None if progress is None else msgspec.to_builtins(progress),
     }
 
 

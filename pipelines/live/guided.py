@@ -4,6 +4,7 @@ import signal
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import FrameType
 
 import numpy as np
@@ -12,9 +13,12 @@ from faintfield.pipelines.console import console, inform, progress
 from faintfield.pipelines.errors import InputError, UnknownFormat
 from faintfield.pipelines.formats.files import require_room
 from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.results.geometry import DEFAULT_DEPTHS_MM
+from faintfield.pipelines.live.board_progress import BoardOrder
+from faintfield.pipelines.live.boards_client import BoardsClient, followed_boards
 from faintfield.pipelines.live.capture_page import serve_page
 from faintfield.pipelines.live.panel import CapturePanel, SessionFrames
-from faintfield.pipelines.live.planes_client import LiveOrder, live_planes
+from faintfield.pipelines.live.planes_client import NO_POSES, LiveOrder, live_planes
 from faintfield.pipelines.live.terminal import TerminalView
 from faintfield.pipelines.termination import interrupt_on_termination
 from faintfield.rig.cameras.protocol import Pixels
@@ -24,7 +28,7 @@ from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import CameraError, CaptureStopped, RigError
 from faintfield.rig.session.resume import adopt_settings, check_same_rig, open_session
-from faintfield.rig.session.session import FrozenPlan, has_session, is_sealed, read_plan
+from faintfield.rig.session.session import FrozenPlan, Session, has_session, is_sealed, read_plan
 from faintfield.rig.settings import RigSettings
 
 
@@ -49,8 +53,11 @@ def capture_session(
         before = len(session.valid())
         if before:
             inform(f"{folder}: {before} of {len(session.frames)} frames are there; going on")
+        frames = SessionFrames(session)
+        # Without a person at page or terminal, nobody could follow the advice
+        boards = _follow_boards(panel, stack, session, frames) if page or not unattended else None
         if page:
-            _open_page(panel, stack, SessionFrames(session), planes)
+            _open_page(panel, stack, frames, planes, boards)
         stack.enter_context(TerminalView(panel).show())
         stack.enter_context(_stop_on_interrupt(panel))
         try:
@@ -78,13 +85,40 @@ def _plan_session(settings: RigSettings, folder: Path) -> FrozenPlan:
     return FrozenPlan(rig.plan, settings)
 
 
-def _open_page(panel: CapturePanel, stack: ExitStack, frames: SessionFrames, order: LiveOrder | None) -> None:
+def _follow_boards(
+    panel: CapturePanel, stack: ExitStack, session: Session, frames: SessionFrames
+) -> BoardsClient | None:
+    """Follow the board sweeps until the stack is closed; None if there are none, or that cannot begin."""
+    if not any(frame.kind == "charuco" for frame in session.frames):
+        return None
+    out = Path(stack.enter_context(TemporaryDirectory(prefix="faintfield-")))
+    depths_mm = session.rig.scene.depth_mm or DEFAULT_DEPTHS_MM
+    frames.note_homings()
+    order = BoardOrder(session.folder.absolute(), out, depths_mm, session.rig.checks.transfer_px)
+    boards = stack.enter_context(followed_boards(order, frames.of_boards))
+    if boards is not None:
+        panel.on_change += [frames.note_homings, boards.note_change]
+    return boards
+
+
+def _open_page(
+    panel: CapturePanel,
+    stack: ExitStack,
+    frames: SessionFrames,
+    order: LiveOrder | None,
+    boards: BoardsClient | None,
+) -> None:
     """Serve the page until the stack is closed; if that fails, go on where prompts can be answered otherwise."""
-    planes = None if order is None else stack.enter_context(live_planes(order, frames.of_dark_scene))
+    planes = None
+    if order is not None:
+        poses = (lambda: NO_POSES) if boards is None else boards.poses
+        planes = stack.enter_context(live_planes(order, frames.of_dark_scene, poses))
     if planes is not None:
         panel.on_change.append(planes.note_change)
+        if boards is not None:
+            boards.on_poses.append(planes.note_change)
     try:
-        address = stack.enter_context(serve_page(panel, frames, planes))
+        address = stack.enter_context(serve_page(panel, frames, planes, boards))
     except (OSError, RuntimeError) as failure:
         if not (panel.unattended or console.is_terminal):
             raise CaptureStopped(

@@ -13,11 +13,13 @@ from typing import Any, get_args
 import numpy as np
 from msgspec import Struct
 
+from faintfield.pipelines.live.board_progress import BoardFrame, BoardNews
 from faintfield.pipelines.live.planes_client import LiveFrame
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.capture.checks import LIT_KINDS
 from faintfield.rig.capture.guide import Answer, OperatorRequest, Prompt, Status
 from faintfield.rig.plan import PlannedFrame
+from faintfield.rig.session.homings import Homed
 from faintfield.rig.session.journal import CommittedFrame
 from faintfield.rig.session.session import Session
 
@@ -135,6 +137,8 @@ class SessionFrames:
 
     def __init__(self, session: Session) -> None:
         self._session = session
+        self._homings: list[Homed] = []
+        self._count = -1
 
     def at(self, step: int, node: tuple[int, int]) -> list[dict[str, Any]]:
         """Return the frames of a step at a node, in the order of the plan, as JSON objects."""
@@ -148,6 +152,30 @@ class SessionFrames:
             for frame, planned in self._valid()
             if planned.step == step and planned.stop.node == node
         ]
+
+    def of_boards(self) -> BoardNews:
+        """Return the frames of the board sweeps in the order of the plan, and those that are left out."""
+        homings = self._homings
+        frames = tuple(
+            BoardFrame(
+                frame.frame,
+                frame.intent,
+                frame.file,
+                max((homed.group for homed in homings if homed.first_intent <= frame.intent), default=0),
+            )
+            for frame, planned in self._valid()
+            if planned.kind == "charuco"
+        )
+        return BoardNews(frames, tuple(frame.number for frame in self._session.skipped() if frame.kind == "charuco"))
+
+    def note_homings(self) -> None:
+        """Read from the journal which frames share a homing; called in the thread of the capture, whose journal it is.
+
+        Nothing is read unless frames have come.
+        """
+        count = len(self._session.valid())
+        if count != self._count:
+            self._count, self._homings = count, self._session.journal.details("homed", Homed)
 
     def of_dark_scene(self) -> tuple[LiveFrame, ...]:
         """Return the frames of the dark scene, in the order of the plan."""

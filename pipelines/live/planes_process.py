@@ -4,11 +4,8 @@ It is started by `pipelines.live.planes_client`, reads frames and calibrations, 
 frames that wait are taken newest first; PMLEM runs when none does.
 """
 
-import os
-import select
 import sys
 from multiprocessing.connection import Connection
-from threading import Thread
 from typing import Literal
 
 import cv2
@@ -21,6 +18,7 @@ from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import encoded, grey_levels
 from faintfield.pipelines.live.plane_accumulator import MAX_STACK_BYTES, PlaneAccumulator
 from faintfield.pipelines.live.planes_client import (
+    NO_POSES,
     LiveFrame,
     LiveNews,
     LiveOrder,
@@ -30,6 +28,7 @@ from faintfield.pipelines.live.planes_client import (
     PlaneStatus,
 )
 from faintfield.pipelines.live.planes_scene import LiveScene, dark_frames, live_scene
+from faintfield.pipelines.live.side_process import end_with_capture
 from faintfield.pipelines.live.terminal import display_levels
 from faintfield.recon.errors import ReconstructionError
 from faintfield.recon.names import on_compiling
@@ -61,6 +60,7 @@ class LivePlanes:
         self._wanted: dict[int, LiveFrame] = {}
         self._unusable: set[int] = set()
         self._shown = 0
+        self._poses = NO_POSES
         self._tasks: set[tuple[int, _Task]] = set()
         self._status = LiveStatus(
             "waiting for frames of the dark scene", planes=tuple(PlaneStatus(depth) for depth in order.depths_mm)
@@ -78,6 +78,9 @@ class LivePlanes:
             if news is not None:
                 self._wanted = {frame.intent: frame for frame in news.frames}
                 self._shown = min(news.depth, self._indices[-1])
+                if news.poses.path != self._poses.path:
+                    self._begin_again()
+                self._poses = news.poses
             busy = self._begin() if self._planes is None else self._advance(self._planes)
             if not busy and self._wanted and self._planes is not None:
                 self._report(doing="up to date")
@@ -90,7 +93,7 @@ class LivePlanes:
         folder = self._order.session / FRAMES
         try:
             frozen = read_plan(self._order.session)
-            scene = live_scene(self._order, frozen, read_frame(folder / first.file))
+            scene = live_scene(self._order, frozen, read_frame(folder / first.file), self._poses)
             self._report(doing="computing where each pixel looks")
             self._planes = PlaneAccumulator(scene, folder, self._order.depths_mm)
         except _FAILURES as failure:
@@ -107,6 +110,11 @@ class LivePlanes:
             problems=(),
         )
         return True
+
+    def _begin_again(self) -> None:
+        """Forget all planes, as poses are others; their pictures stay until there are new ones."""
+        self._planes = None
+        self._tasks, self._unusable = set(), set()
 
     def _advance(self, planes: PlaneAccumulator) -> bool:
         """Do what matters most; return whether anything was to be done."""
@@ -226,19 +234,11 @@ def stretch(plane: NDArray[np.floating], covered: NDArray[np.bool_]) -> tuple[fl
     return black, max(white, black + 1e-6)
 
 
-def _end_with_capture(line: Connection) -> None:
-    """Wait until the capture has hung up, however it ended, and end in the middle of a step."""
-    watch = select.poll()
-    watch.register(line.fileno(), 0)  # a hang-up is always told
-    watch.poll()
-    os._exit(0)
-
-
 def main() -> None:
     """Serve the connection whose number is the argument, until the capture ends."""
     cv2.setNumThreads(1)
     line = Connection(int(sys.argv[1]))
-    Thread(target=_end_with_capture, args=(line,), daemon=True, name="end with the capture").start()
+    end_with_capture(line)
     try:
         LivePlanes(line.recv(), line).run()
     except (EOFError, ConnectionError):  # the capture has ended

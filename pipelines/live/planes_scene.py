@@ -14,7 +14,7 @@ from faintfield.pipelines.formats.results.noise import NOISE_FILE, FittedNoise, 
 from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSetFile
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.formats.sets.session_set import nominal_view, relative_to_axis, with_measured_geometry
-from faintfield.pipelines.live.planes_client import LiveOrder
+from faintfield.pipelines.live.planes_client import NO_POSES, BoardPoses, LiveOrder
 from faintfield.pipelines.planning.known import KnownLens, Sensor, calibration_file, known_lens, known_sensor
 from faintfield.rig.plan import CapturePlan, PlannedFrame, planned_frames
 from faintfield.rig.session.session import FrozenPlan
@@ -44,16 +44,20 @@ class LiveScene:
     knows_noise: bool
 
 
-def live_scene(order: LiveOrder, frozen: FrozenPlan, frame: Frame) -> LiveScene:
+def live_scene(order: LiveOrder, frozen: FrozenPlan, frame: Frame, boards: BoardPoses = NO_POSES) -> LiveScene:
     """Return what is known of the dark scene of a session that is being captured, given any of its frames.
 
-    Poses are the measured ones of a geometry.json if it has all nodes, else those that the stage is told. Raises
+    Poses are the measured ones of a geometry.json if it has all nodes, else those that the stage is told. A geometry
+    that is given, or lies in the session, precedes that of its `boards`, and this one that beside rig.toml. Raises
     `RigError` or `InputError` if no lens is known, or a file cannot be used; the message says what to give.
     """
     height, width = frame.pixels_dn.shape[:2]
     size_px = (width, height)
     folders = order.session, order.rig.parent
-    geometry = calibration_file(order.geometry, GEOMETRY_FILE, *folders)
+    geometry = calibration_file(order.geometry, GEOMETRY_FILE, order.session)
+    of_boards = geometry is None and boards.path is not None
+    if geometry is None:
+        geometry = boards.path or calibration_file(None, GEOMETRY_FILE, order.rig.parent)
     sensor = known_sensor(frozen.rig, calibration_file(order.noise, NOISE_FILE, *folders))
     known = known_lens(frozen.rig, sensor, geometry, order.fx_px)
     lens, lens_source = _lens(geometry, known, size_px, "as given" if order.fx_px else "of the simulated camera")
@@ -61,6 +65,10 @@ def live_scene(order: LiveOrder, frozen: FrozenPlan, frame: Frame) -> LiveScene:
     mosaic = fitted.mosaic or frozen.rig.mosaic or frame.mosaic
     planned = _planned_set(order.session, frozen.plan, lens, fitted)
     elemental_set, poses = _with_poses(planned, geometry, lens_source)
+    if of_boards and elemental_set.poses == "measured":
+        poses = "measured, of the boards of this session"
+    elif boards.refusal and elemental_set.poses != "measured":
+        poses += f"; the boards of this session gave none: {boards.refusal}"
     plane_of_colour = 1 if frame.pixels_dn.ndim == 3 else None
     return LiveScene(
         elemental_set,

@@ -8,7 +8,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from msgspec import UNSET
+from msgspec import UNSET, structs
 
 from faintfield.calib.detection import BoardCorners, detect_boards
 from faintfield.calib.errors import TooFewViews
@@ -24,7 +24,6 @@ from faintfield.calib.geometry import (
     transfer_sigma_at,
 )
 from faintfield.calib.geometry.bundle import load_mrcal
-from faintfield.calib.geometry.rig_geometry import HomingShift
 from faintfield.calib.geometry.stage import approach_directions, stage_report
 from faintfield.calib.noise.strips import usable_cores
 from faintfield.pipelines.arguments import LensName
@@ -42,9 +41,8 @@ from faintfield.pipelines.formats.results.geometry import (
     BoardRecord,
     GeometryOptions,
     GeometryRecord,
-    HomingRecord,
     LensRecord,
-    NodeRecord,
+    camera_poses,
     write_geometry,
 )
 from faintfield.pipelines.formats.sets.board_set import BoardSet, BoardView, load_board_set
@@ -147,17 +145,9 @@ def _inform_of_boards(per_view: list[tuple[BoardView, list[BoardCorners]]]) -> N
 
 
 def _record(board_set: BoardSet, rig: RigGeometry, stage: StageReport, options: GeometryOptions) -> GeometryRecord:
-    lens = rig.lens
-    numbers = lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, tuple(lens.distortion)
-    lens_sigma = tuple(np.sqrt(np.diag(rig.covariance)[: len(lens.parameters)]).tolist())
-    poses = zip(rig.nodes, rig.rt_cam_ref.tolist(), rig.sigma_mm().tolist(), rig.sigma_rad().tolist(), strict=True)
     transfers_px = {f"{depth:g}": rms_over_views(transfer_sigma_at(rig, depth)) for depth in options.depth_mm}
     return GeometryRecord(
-        lens=LensRecord(rig.lens_model, *numbers, lens_sigma),
-        size_px=lens.size_px,
-        reference_node=rig.nodes[rig.reference],
-        nodes=[NodeRecord(*pose) for pose in poses],
-        homings=[_homing_record(shift) for shift in rig.homings] or UNSET,
+        **structs.asdict(camera_poses(rig)),
         rms_inlier_px=rig.rms_inlier_px,
         rms_mrcal_px=rig.rms_mrcal_px,
         corner_sigma_px=rig.sigma_px,
@@ -181,11 +171,6 @@ def _homing_warnings(board_set: BoardSet, rig: RigGeometry) -> list[str]:
         f"the stage homed again within sweep {', '.join(map(str, rig.undetermined_homings))}, and no other sweep joins "
         "the nodes before and after, which may be shifted by as much as its switches repeat; take one more sweep"
     ]
-
-
-def _homing_record(shift: HomingShift) -> HomingRecord:
-    (x, y, z), sigmas = shift.shift_mm.tolist(), np.sqrt(np.diag(shift.covariance_mm2)).tolist()
-    return HomingRecord(shift.before, shift.after, (x, y, z), (sigmas[0], sigmas[1], sigmas[2]))
 
 
 def _board_record(board_set: BoardSet, pose: BoardPose, warp_mm: list[float]) -> BoardRecord:

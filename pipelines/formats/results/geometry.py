@@ -5,7 +5,7 @@ Keys stand in the file in the order of the fields. Lengths are in mm, angles in 
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import cv2
 import msgspec
@@ -19,6 +19,9 @@ from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.files import exclusive, remove, remove_leftovers, sha256, write_record, write_whole
 from faintfield.pipelines.formats.reading import is_file, is_folder, read_json
 from faintfield.pipelines.formats.units import Node, Pose, Shift
+
+if TYPE_CHECKING:  # readers of the record need no solver
+    from faintfield.calib.geometry.rig_geometry import HomingShift, RigGeometry
 
 GEOMETRY_FILE = "geometry.json"
 COVARIANCE_FILE = "geometry_covariance.npz"
@@ -93,6 +96,26 @@ class CameraPoses(Struct, frozen=True, kw_only=True):
                         known[end] = known[here] + sign * np.array(homing.shift_mm)
                         waiting.append(end)
         return (*known[after].tolist(),) if after in known else None
+
+
+def camera_poses(rig: "RigGeometry") -> CameraPoses:
+    """Return lens and poses of a geometry as they are recorded."""
+    lens = rig.lens
+    numbers = lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, tuple(lens.distortion)
+    lens_sigma = tuple(np.sqrt(np.diag(rig.covariance)[: len(lens.parameters)]).tolist())
+    poses = zip(rig.nodes, rig.rt_cam_ref.tolist(), rig.sigma_mm().tolist(), rig.sigma_rad().tolist(), strict=True)
+    return CameraPoses(
+        lens=LensRecord(rig.lens_model, *numbers, lens_sigma),
+        size_px=lens.size_px,
+        reference_node=rig.nodes[rig.reference],
+        nodes=[NodeRecord(*pose) for pose in poses],
+        homings=[_homing_record(shift) for shift in rig.homings] or UNSET,
+    )
+
+
+def _homing_record(shift: "HomingShift") -> HomingRecord:
+    (x, y, z), sigmas = shift.shift_mm.tolist(), np.sqrt(np.diag(shift.covariance_mm2)).tolist()
+    return HomingRecord(shift.before, shift.after, (x, y, z), (sigmas[0], sigmas[1], sigmas[2]))
 
 
 class PosesOfSession(CameraPoses, frozen=True, kw_only=True):

@@ -112,7 +112,7 @@ def load_board_set(folder: Path) -> BoardSet:
     path = folder if is_file(folder) else folder / FILE_NAME
     remedy = f"name a session with charuco frames, or a folder of board images and {FILE_NAME} (docs/geometry.md)"
     settings = read_toml(path, BoardSetFile, remedy=remedy)
-    boards = _boards(path, settings.board)
+    boards = named_boards(path, settings.board)
     files: dict[tuple[Node, int, int], list[Path]] = {}
     for index, entry in enumerate(settings.image):
         file = inside(path.parent, entry.file, f"{path}: image[{index}].file")
@@ -134,7 +134,7 @@ def _of_session(folder: Path) -> BoardSet:
             files.setdefault((planned.stop.node, planned.sweep, homings.groups.get(taken.intent) or 0), []).append(path)
     if not files:
         raise BadValue(f"{folder}: the session has no charuco frame yet; capture its charuco steps first")
-    boards = _boards(folder / PLAN, frozen.rig.board)
+    boards = named_boards(folder / PLAN, frozen.rig.board)
     rig, plan = frozen.rig, frozen.plan
     placed = (plan.centre.node, rig.grid.pitch_mm, plan.approach_mm > 0, homings.repeat())
     return BoardSet(folder / PLAN, boards, _views(files, rig.mosaic), *placed)
@@ -165,7 +165,7 @@ def _without_filters(pixels: NDArray[np.float32], mosaic: tuple[str, ...] | None
     return grey
 
 
-def _boards(path: Path, entries: Sequence[BoardSettings]) -> dict[str, Board]:
+def named_boards(path: Path, entries: Sequence[BoardSettings]) -> dict[str, Board]:
     """Return the boards by name; two that share a name or a marker are refused."""
     if not entries:
         raise BadValue(f"{path}: names no [[board]]; give what `faintfield board` printed beneath the board")

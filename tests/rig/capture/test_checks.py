@@ -155,3 +155,9 @@ def test_dark_scene_states_snr_and_new_light() -> None:
     assert later.values["stray_dn"] == pytest.approx(5.0)
     assert later.values["snr"] == pytest.approx(first["snr"])
     assert later.warnings == ()
+
+
+@pytest.mark.parametrize("wanted_px", [0.0, -0.1, float("inf"), float("nan")])
+def test_wanted_transfer_error_is_positive(wanted_px: float) -> None:
+    with pytest.raises(ValueError, match="an error is positive"):
+        CheckSettings(transfer_px=wanted_px)
