@@ -24,6 +24,7 @@ from faintfield.pipelines.reconstruction.overview import (
     REGION_OUTLINED,
 )
 from faintfield.recon.metrics import noise_variance_e2
+from faintfield.recon.threads import map_in_threads
 
 # Width of a picture that is shown pixel for pixel: two stand side by side.
 _PIXELS_ACROSS = 540
@@ -76,7 +77,7 @@ def set_sections(overviews: list[Path]) -> list[SetSection]:
         rank = PREFERRED_POSES.index(overview.poses)
         if key not in distinct or rank < PREFERRED_POSES.index(distinct[key][1].poses):
             distinct[key] = (path.parent, overview)
-    sections = [_section(folder, overview) for folder, overview in distinct.values()]
+    sections = map_in_threads(lambda of_set: _section(*of_set), list(distinct.values()))
     return sorted(sections, key=lambda section: section.noise_free)
 
 

@@ -22,6 +22,7 @@ from faintfield.pipelines.pages.report_planes import Plane, best_column, column_
 from faintfield.pipelines.pages.report_sets import SetSection
 from faintfield.pipelines.reconstruction.depth.depth_map import robust_limits
 from faintfield.pipelines.reconstruction.planes.saturation import has_unknown
+from faintfield.recon.threads import map_in_threads
 
 # A plane of more samples is binned: a phone draws this many in a frame.
 _MAX_SAMPLES = 1_500_000
@@ -152,8 +153,8 @@ def viewer_of(
         picture, *others = _surface_sources(folder, made.surface, title, units_of(made), scales)
         sources, maps = [*sources, picture], maps + others
     fineness, coarser = _choose_fineness(sources)
-    numbers = [_picture(source, fineness, coarser) for source in sources]
-    pictures += numbers + [_map_picture(source, coarser) for source in maps]
+    numbers = map_in_threads(lambda source: _picture(source, fineness, coarser), sources)
+    pictures += numbers + map_in_threads(lambda source: _map_picture(source, coarser), maps)
     _refer(pictures)
     return {
         "pictures": pictures,
@@ -348,7 +349,8 @@ def _choose_fineness(sources: Sequence[_Source]) -> tuple[Fineness, int]:
         binned = [source.binned(coarser)[0] for source in sample]
         for fineness in _FINENESSES:
             limit = most if fineness is _FINENESSES[-1] else budget
-            if sum(len(pack(numbers, fineness.step(numbers)).png) for numbers in binned) <= limit:
+            sizes = map_in_threads(lambda numbers: len(pack(numbers, fineness.step(numbers)).png), binned)  # noqa: B023
+            if sum(sizes) <= limit:
                 return fineness, coarser
         coarser += 1
 

@@ -64,7 +64,7 @@ _EXPOSURE_S = 0.1
 _RANGE_MM = "400:900"
 
 # Sweeps over the nodes with a board at another place each.
-_BOARD_SWEEPS = 6
+_BOARD_SWEEPS = 4
 
 
 @dataclass(frozen=True)
@@ -229,9 +229,8 @@ def demo_metrics(out: Path, session: Path, truth: Path) -> Metrics:
         return metrics
 
     folders = {method: folder_of_method(results, method, _METHODS) for method in _METHODS}
-    measured = load_session(session)
-    metrics = metrics_of(measured, folders)
-    errors = [*metrics.planes, *metrics_of(measured, {DEFAULT_METHOD: out / "tv"}).planes]
+    metrics = metrics_of(load_session(session), folders | {DEFAULT_METHOD: out / "tv"})
+    errors = [*metrics.planes]
     for elemental_set in (nominal_session(session), true_set(session, truth)):
         errors += metrics_of(elemental_set, {DEFAULT_METHOD: out / elemental_set.poses}).planes
     geometry, noise = _geometry_errors(session), _noise_errors(session)

@@ -56,15 +56,17 @@ def reconstruct_folder(
 
 
 def reconstruct_and_report(
-    elemental_set: ElementalSet, out: Path, request: Request, runner: Runner | None = None
+    elemental_set: ElementalSet, out: Path, request: Request, runner: Runner | None = None, *, with_report: bool = True
 ) -> Outcome:
-    """Reconstruct planes of a set into `out`, and write the report of them."""
+    """Reconstruct planes of a set into `out`, and write the report of them unless something else follows into it."""
     started = time.monotonic()
+    report = out / REPORT_FILE
     with exclusive(out):
         outcome = reconstruct_set(elemental_set, out, request, runner or run_serially)
-        report = _write_report(out)
+        if with_report:
+            _write_report(out)
     planes = len({record.file for record in outcome.planes})
-    inform(f"{planes} plane(s) in {time.monotonic() - started:.1f} s: {report}")
+    inform(f"{planes} plane(s) in {time.monotonic() - started:.1f} s: {report if with_report else out}")
     if outcome.recommendation:
         inform(outcome.recommendation)
     return msgspec.structs.replace(outcome, report=str(report))

@@ -211,7 +211,7 @@ def session_steps(
     # Depths of the rig, not of the request: the geometry stays the same for other planes
     gated_mm = list(present_settings(session).scene.depth_mm or DEFAULT_DEPTHS_MM)
     opened = cache(lambda: open_set(session))  # not before it is calibrated
-    made = [] if planes is None else [_step_of_planes(session, opened, planes, runner)]
+    made = [] if planes is None else [_step_of_planes(session, opened, planes, runner, with_report=surface is None)]
     if surface is not None:
         made.append(_step_of_surface(session, opened, surface))
     return [
@@ -232,12 +232,15 @@ def session_steps(
             "report",
             results={f"{RECONSTRUCTIONS}/{REPORT_FILE}": None},
             make=lambda: write_report(session / RECONSTRUCTIONS),
-            needs=tuple(step.name for step in made),
+            # Planes without their surface have a report; a surface writes its own
+            needs=(made[0].name,),
         ),
     ]
 
 
-def _step_of_planes(session: Path, opened: Opened, selection: Selection, runner: Runner | None) -> Step:
+def _step_of_planes(
+    session: Path, opened: Opened, selection: Selection, runner: Runner | None, *, with_report: bool
+) -> Step:
     folders = {folder_of_method(Path(RECONSTRUCTIONS), name, selection.methods): name for name in selection.methods}
 
     def options(folder: Path) -> object:
@@ -247,7 +250,8 @@ def _step_of_planes(session: Path, opened: Opened, selection: Selection, runner:
 
     def make() -> object:
         elemental_set, out = opened()
-        return reconstruct_and_report(elemental_set, out, resolve(selection, elemental_set, out), runner)
+        request = resolve(selection, elemental_set, out)
+        return reconstruct_and_report(elemental_set, out, request, runner, with_report=with_report)
 
     return Step(
         "reconstruct",

@@ -10,8 +10,9 @@ from faintfield.recon.operator.scene_operator import SceneOperator, ViewSelectio
 from faintfield.recon.solver.initialization import smooth_start, well_seen_samples
 from faintfield.recon.solver.proximal import DualField
 
-# Smallest value of the metric relative to its median over seen samples; samples below follow their neighbours.
-_MIN_METRIC = 1e-3
+# Smallest value of a metric relative to its median over seen samples; samples below follow their neighbours. Solvers
+# take a hundredth, as for samples that are not well seen: with less, those hold up all others. Errors take less.
+_MIN_METRIC, _MIN_METRIC_OF_ERRORS = 1e-2, 1e-3
 
 # Samples that a median is taken of: sorting all of a large plane takes as long as a sweep of the data.
 _MEDIAN_SAMPLES = 2**20
@@ -71,17 +72,18 @@ class DataFit:
         is averaged over a sample's neighbours, which is no less than what the pixels between them have.
         """
         if self._operator.row_sums_are_response:
-            return self._metric_of_plane(samples)
+            return _at_least(_MIN_METRIC, self._metric_of_plane(samples))
         metric = self._operator.adjoint_of_precision(samples, self._images, self._min_light_e, self._views)
-        return np.asarray(_positive(metric), samples.dtype)
+        return np.asarray(_at_least(_MIN_METRIC, metric), samples.dtype)
 
     def metric_of_each(self, samples: Image) -> list[Image]:
-        """Return `H_zᵀ[ (H_z 1)/(H f + b + σ²) ]` > 0 (row, column), the metric of each plane alone."""
+        """Return `H_zᵀ[ (H_z 1)/(H f + b + σ²) ]` > 0 (row, column), the curvature of each plane alone, for errors."""
         operator = self._operator
         if operator.row_sums_are_response:
-            return operator.planes_of(self.metric(samples))
-        metric = operator.adjoint_of_precision(samples, self._images, self._min_light_e, self._views, of_each=True)
-        return [_positive(of_plane) for of_plane in operator.planes_of(metric)]
+            metric = self._metric_of_plane(samples)
+        else:
+            metric = operator.adjoint_of_precision(samples, self._images, self._min_light_e, self._views, of_each=True)
+        return [_at_least(_MIN_METRIC_OF_ERRORS, of_plane) for of_plane in operator.planes_of(metric)]
 
     def _metric_of_plane(self, samples: Image) -> Image:
         likelihood = self._images.likelihood
@@ -95,7 +97,7 @@ class DataFit:
         (precision,) = self._operator.planes_of(np.reciprocal(variance_e2, out=variance_e2))
         metric = blurred(precision, (1,)).reshape(samples.shape)
         metric *= self._coverage
-        return _positive(metric)
+        return metric
 
     def _averaged(self, known_e2: NDArray[np.float64], level_e: float) -> float | Image:
         """Return b + σ² for each sample, averaged such that the inverse of its sum with typical light is kept."""
@@ -107,9 +109,9 @@ class DataFit:
         return np.asarray(np.maximum(1 / mean - level_e, 0))
 
 
-def _positive(metric: Image) -> Image:
+def _at_least(share: float, metric: Image) -> Image:
     seen = metric[metric > 0]
-    return np.maximum(metric, _MIN_METRIC * np.median(seen[:: 1 + seen.size // _MEDIAN_SAMPLES]))
+    return np.maximum(metric, share * np.median(seen[:: 1 + seen.size // _MEDIAN_SAMPLES]))
 
 
 @dataclass(frozen=True)

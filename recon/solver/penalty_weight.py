@@ -191,7 +191,7 @@ def _losses(
 
     step = 1
     score(step)
-    while step > -_MAX_STEPS and best() <= step + 1:
+    while step > -_MAX_STEPS and best() <= step:
         step -= 1
         score(step)
     step = max(losses)

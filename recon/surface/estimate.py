@@ -25,7 +25,7 @@ from faintfield.recon.surface.regularization import PiecewisePlane, lowest, sum_
 
 # Rounds of depth and light without the views that judge them, before one more with all views; fewest views of which
 # some are left out to judge: both halves of the others must find depths.
-_ROUNDS, _MIN_JUDGED = 3, 2 * MIN_VIEWS
+_ROUNDS, _MIN_JUDGED = 2, 2 * MIN_VIEWS
 
 # Scales of windows in samples: the small one, the one that its votes are gathered over, and that of the first round.
 _WINDOW, _GATHERED, _GATHERED_AT_FIRST = 1.5, 4.0, 6.0

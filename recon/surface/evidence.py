@@ -18,7 +18,7 @@ from faintfield.recon.threads import map_in_threads
 _OF_DEPTH, _OF_SURFACE = 0.6, 1.15
 
 # Steps of the proximal problems: the light is good enough long before its minimum.
-_STEPS = 80
+_STEPS = 40
 
 # Views below which the light of a sample follows its neighbours.
 _FEW_VIEWS = 8.0

@@ -13,7 +13,7 @@ from faintfield.rig.errors import CaptureStopped
 from faintfield.rig.plan import CaptureStep, PlannedFrame, StepKind
 from faintfield.rig.session.session import Session
 from faintfield.rig.stages.gantry import Gantry
-from faintfield.rig.stages.motion import one_sided_path, path_duration_s
+from faintfield.rig.stages.motion import one_sided_duration_s
 from faintfield.rig.stages.protocol import Point, StageSettings
 
 if TYPE_CHECKING:  # views of a capture need no drivers
@@ -234,8 +234,10 @@ class Pace:
         return total_s
 
     def _motion_s(self, start: Point, target: Point) -> float:
-        path = (start, *one_sided_path(start, target, self._stage.settings.approach_mm))
-        return path_duration_s(path, self._stage.identify().motion, self._stage.feed_mm_per_s())
+        stage = self._stage
+        return one_sided_duration_s(
+            start, target, stage.settings.approach_mm, stage.identify().motion, stage.feed_mm_per_s()
+        )
 
 
 # Without an operator, a capture stops after this many failures in a row at one frame, or failed drift checks in all.

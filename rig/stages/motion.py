@@ -11,7 +11,6 @@ from faintfield.rig.errors import KeepOutCrossed, OutsideTravel
 from faintfield.rig.stages.protocol import Box, MotionLimits, Point
 
 
-@lru_cache(maxsize=4096)  # the time to go is predicted before every frame, over all that are left
 def duration_s(start: Point, end: Point, motion: MotionLimits, feed_mm_per_s: float = math.inf) -> float:
     """Return the duration of a straight motion from rest to rest; `feed_mm_per_s` is the requested speed.
 
@@ -42,6 +41,14 @@ def one_sided_path(start: Point, target: Point, approach_mm: float) -> tuple[Poi
     """
     turn = Point(*(b - approach_mm if b < a else b for a, b in zip(start, target, strict=True)))
     return (target,) if turn == target else (turn, target)
+
+
+@lru_cache(maxsize=4096)  # the time to go is predicted before every frame, over all that are left
+def one_sided_duration_s(
+    start: Point, target: Point, approach_mm: float, motion: MotionLimits, feed_mm_per_s: float = math.inf
+) -> float:
+    """Return the duration of the path of `one_sided_path`."""
+    return path_duration_s((start, *one_sided_path(start, target, approach_mm)), motion, feed_mm_per_s)
 
 
 def timeout_s(predicted_s: float) -> float:

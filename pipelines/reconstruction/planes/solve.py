@@ -176,7 +176,8 @@ def _with_occlusion(
         return without("a plane would be hidden from all views")
     options = replace(objective.options, penalty_weight=first.penalty_weight or 0.0)
     behind = replace(objective, posed=replace(objective.posed, operator=occluded), options=options)
-    better = solve_pmlem(behind)
+    near = objective.posed.operator.samples_of([solution.plane for solution in joint])
+    better = solve_pmlem(replace(behind, start=np.maximum(near, 1e-3 * behind.start)))
     if (better[0].record.objective or 0.0) >= (first.objective or 0.0):
         return without("it explains the images no better")
     return [_of_opaque_part(solution, first) for solution in with_prior(behind, better)]

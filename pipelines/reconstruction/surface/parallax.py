@@ -3,14 +3,13 @@
 The camera looks at the middle depth, which stands still. The film ends where it begins.
 """
 
-from collections.abc import Iterator
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from faintfield.pipelines.formats.image_files import Picture, shrunk
+from faintfield.recon.threads import map_in_threads
 
 FRAMES, FRAME_MS = 24, 80
 
@@ -78,16 +77,19 @@ def render_parallax(
     margins = np.ceil(np.abs(offsets_mm).max(axis=0) * np.abs(nearness).max()).astype(int)
     margins = np.minimum(margins, np.array(size) // 4)  # of a strip, something is left
     columns, rows = (slice(int(cut), side - int(cut)) for cut, side in zip(margins, size, strict=True))
-    return [shrunk(frame[rows, columns], _WIDTH_PX) for frame in _frames(picture, nearness, offsets_mm)]
+    frames = _frames(picture, nearness, offsets_mm)
+    return [shrunk(frame[rows, columns], _WIDTH_PX) for frame in frames]
 
 
-def _frames(picture: Picture, nearness: NDArray[np.float32], offsets_mm: NDArray[np.floating]) -> Iterator[Picture]:
-    """Yield the picture from each viewpoint; `nearness` is the movement of each sample in px per mm of viewpoint."""
+def _frames(picture: Picture, nearness: NDArray[np.float32], offsets_mm: NDArray[np.floating]) -> list[Picture]:
+    """Return the picture from each viewpoint; `nearness` is the movement of each sample in px per mm of viewpoint."""
     rows, columns = np.indices(nearness.shape, np.float32)
     far_to_near = np.argsort(nearness, axis=None).astype(np.int32)
     apart_px = np.hypot(*offsets_mm.T).max() * (cv2.dilate(nearness, np.ones((5, 5))) - nearness)
     far_to_near = far_to_near[apart_px.ravel()[far_to_near] < _EDGE_PX]
-    for x_mm, y_mm in offsets_mm.tolist():
+
+    def seen_from(offset_mm: tuple[float, float]) -> Picture:
+        x_mm, y_mm = offset_mm
         moved = np.stack([-x_mm * nearness, -y_mm * nearness])
         source = _sources(np.rint(columns + moved[0]), np.rint(rows + moved[1]), far_to_near)
         source, from_there = _filled(source, nearness, float(np.hypot(x_mm, y_mm)))
@@ -95,7 +97,9 @@ def _frames(picture: Picture, nearness: NDArray[np.float32], offsets_mm: NDArray
         at_x = np.where(from_there, columns.ravel()[source], columns - moved[0].ravel()[source])
         at_y = np.where(from_there, rows.ravel()[source], rows - moved[1].ravel()[source])
         seen = cv2.remap(picture, at_x, at_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        yield np.asarray(seen, np.uint8)
+        return np.asarray(seen, np.uint8)
+
+    return map_in_threads(seen_from, offsets_mm.tolist())
 
 
 def _sources(

@@ -47,12 +47,12 @@ def test_weight_is_nearly_the_best_for_the_truth() -> None:
     assert min(scores.values()) < min(scores[min(scores)], scores[max(scores)])
     assert chosen.passes < 60 * 7  # seven folds, because these views have few pixels
     # The weight is the lowest point of the parabola through the best candidate and its neighbours, in steps of √2. The
-    # search went two steps down from its first, where predictions became worse, and then up to one beyond the best.
+    # search went a step down from its first, where predictions became worse, and then up to one beyond the best.
     weights = list(scores)
     middle = int(np.argmin(list(scores.values())))
     a, b, _ = np.polyfit([-1, 0, 1], [scores[weight] for weight in weights[middle - 1 : middle + 2]], 2)
     assert chosen.weight == pytest.approx(weights[middle] * 2 ** (-b / (4 * a)), rel=1e-6)
-    assert weights[0] == pytest.approx(guess / 3 / 2**0.5)
+    assert weights[0] == pytest.approx(guess / 3)
     assert middle == len(weights) - 2
 
 
