@@ -225,11 +225,11 @@ class FrameTaker:
             recording = recorder.submit(self._record, frame, intent, position.point, exposure)
             begun_s += self._go_ahead(frame, following)
             committed, pixels = recording.result()
-        findings = committed.record
+        record = committed.record
         self._drift.add(committed)
         self.last = frame
-        if findings.warnings:
-            self._dialogue.warnings = tuple(f"{frame.name}: {warning}" for warning in findings.warnings)
+        if record.warnings:
+            self._dialogue.warnings = tuple(f"{frame.name}: {warning}" for warning in record.warnings)
         if frame.kind == "charuco":
             corners = {
                 number: int(taken.record.checks["board_corners"])
@@ -240,7 +240,7 @@ class FrameTaker:
                 self._dialogue.warn(warning)
         self._pace.finish_frame(begun_s, frame.exposure_s)
         if pixels is not None:
-            self._dialogue.operator.show_frame(frame, pixels, findings.checks)
+            self._dialogue.operator.show_frame(frame, pixels, record.checks)
 
     def _go_ahead(self, frame: PlannedFrame, following: PlannedFrame | None) -> float:
         """Move to the node of the following frame, unless there is something to do before; return the time taken."""
