@@ -189,7 +189,7 @@ class FolderCamera:
 
     def _late_reason(self) -> str:
         """Return why the first file after a frame that did not come in time is refused, "" if it is another."""
-        if self._known_when_late is None:
+        if self._known_when_late is None or self._settings.delay_s is not None:  # a stated delay says which it is
             return ""
         self._known_when_late = None
         return (

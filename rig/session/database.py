@@ -160,7 +160,7 @@ def leave_wal_mode(db: sqlite3.Connection, path: Path) -> None:
         try:
             db.execute("PRAGMA journal_mode = MEMORY")
         except sqlite3.OperationalError as failure:
-            if failure.sqlite_errorcode != sqlite3.SQLITE_BUSY:
+            if failure.sqlite_errorcode & 0xFF != sqlite3.SQLITE_BUSY:
                 raise
             if not attempts_left:
                 raise SessionUnwritable(
@@ -182,7 +182,7 @@ def wal_bytes(path: Path) -> int:
 
 def _other_user(path: Path) -> str:
     """Return another process that holds a lock on a file, as Linux lists them; the others are not known."""
-    with suppress(OSError, ValueError):
+    with suppress(OSError, ValueError, IndexError):
         for fields in map(str.split, Path("/proc/locks").read_text().splitlines()):
             if fields[1] == "POSIX" and fields[5].endswith(f":{path.stat().st_ino}") and int(fields[4]) != os.getpid():
                 return f"process {fields[4]} ({Path('/proc', fields[4], 'comm').read_text().strip()})"
