@@ -21,15 +21,92 @@ _PARTS = 8
 _BOARD_SEARCH_PX = 1600
 
 
-class Findings(Struct, frozen=True):
-    """Measured values of a frame by name, and warnings, one line each, with the limit and a remedy.
+class Quantity(Struct, frozen=True):
+    """A measured quantity in words, with its unit; `digits` formats the value times `factor`.
 
-    The names are `median_dn`, `contrast_dn`, `saturated_share`, `sharpness`, `board_corners` and `leak_dn`; and for the
-    dark scene `snr`, `darkest_dn` and `stray_dn`, see `_scene_values`.
+    `warning` tells of a value beyond its limit, and what to do; without it such a value is no fault by itself.
+    """
+
+    label: str
+    unit: str
+    digits: str
+    factor: float = 1.0
+    warning: str | None = None
+
+    def text(self, value: float) -> str:
+        """Return a value in words.
+
+        >>> QUANTITIES["saturated_share"].text(0.0123)
+        '1.23 %'
+        """
+        return f"{value * self.factor:{self.digits}} {self.unit}".strip()
+
+
+# The quantities that frames are checked for, by name, in the order in which they are shown.
+QUANTITIES: dict[str, Quantity] = {
+    "snr": Quantity("SNR of the brightest part", "", ".2f"),
+    "stray_dn": Quantity("stray light since the darkest frame", "DN", "+.1f"),
+    "leak_dn": Quantity(
+        "difference of parts, by stray light",
+        "DN",
+        ".1f",
+        warning="parts differ by {value:.1f} DN, limit {limit:g}; look for stray light",
+    ),
+    "board_corners": Quantity("board corners", "", "g"),
+    "saturated_share": Quantity(
+        "saturated pixels",
+        "%",
+        ".2f",
+        100.0,
+        "{value:.1%} of the pixels are saturated, limit {limit:.1%}; expose shorter",
+    ),
+    "contrast_dn": Quantity(
+        "contrast", "DN", ".0f", warning="contrast {value:.0f} DN, limit {limit:.0f}; add light or expose longer"
+    ),
+    "sharpness": Quantity(
+        "sharpness",
+        "",
+        ".3f",
+        warning="sharpness {value:.3f}, limit {limit:.3f}; look for vibration or changed focus",
+    ),
+    "median_dn": Quantity(
+        "median", "DN", ".0f", warning="median {value:.0f} DN, limit {limit:.0f}; light the diffuser or expose longer"
+    ),
+    "darkest_dn": Quantity("mean of the darkest parts", "DN", ".1f"),
+}
+# The quantities whose course over a step is shown, the main one first.
+MAIN_QUANTITIES: dict[StepKind, tuple[str, ...]] = {
+    "charuco": ("board_corners",),
+    "bright": ("sharpness",),
+    "dark_scene": ("snr", "stray_dn"),
+    "noise_reference": ("leak_dn",),
+    "dark": ("leak_dn",),
+    "flat": ("median_dn",),
+}
+
+
+class Limit(Struct, frozen=True):
+    """Smallest or largest value that a quantity may have."""
+
+    value: float
+    is_least: bool = False
+
+    def holds(self, value: float) -> bool:
+        """Return whether a value keeps the limit."""
+        return value >= self.value if self.is_least else value <= self.value
+
+
+class Findings(Struct, frozen=True):
+    """Measured values of a frame, and their limits, by the names of `QUANTITIES`.
+
+    `warnings` are one line each, with the limit and a remedy. `saturation_dn` is the value of a saturated pixel, None
+    if it is not known. The dark scene's `snr`, `darkest_dn` and `stray_dn` are explained at `_scene_values`.
     """
 
     values: dict[str, float]
-    warnings: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
+    limits: dict[str, Limit] = {}
+    saturation_dn: float | None = None
 
 
 def check_frame(
@@ -49,9 +126,10 @@ def check_frame(
     # numpy sorts integers of at most 16 bits by radix, much faster than it finds their quantiles
     ordered_dn = np.sort(grey, axis=None, kind="stable" if grey.dtype.itemsize <= 2 else None)
     values: dict[str, float] = {"median_dn": _quantile(ordered_dn, 0.5)}
+    largest_dn = float(np.iinfo(pixels.dtype).max) if pixels.dtype.kind in "iu" else None
+    saturation_dn = limits.saturation_dn or largest_dn
     if kind in LIT_KINDS:
-        largest_dn = np.iinfo(pixels.dtype).max if pixels.dtype.kind in "iu" else np.inf
-        values["saturated_share"] = float(np.mean(pixels >= (limits.saturation_dn or largest_dn)))
+        values["saturated_share"] = 0.0 if saturation_dn is None else float(np.mean(pixels >= saturation_dn))
     if kind in ("charuco", "bright"):
         values["contrast_dn"] = _quantile(ordered_dn, 0.99) - _quantile(ordered_dn, 0.01)
         values["sharpness"] = _sharpness(grey)
@@ -61,7 +139,9 @@ def check_frame(
         values["leak_dn"] = _leak_dn(grey)
     if kind == "dark_scene":
         values |= _scene_values(grey, earlier)
-    return Findings({name: round(value, 5) for name, value in values.items()}, _warnings(kind, values, limits, earlier))
+    kept = _limits(kind, limits, earlier)
+    rounded = {name: round(value, 5) for name, value in values.items()}
+    return Findings(rounded, _warnings(values, kept), kept, saturation_dn)
 
 
 def _grey(pixels: Pixels) -> Pixels:
@@ -128,30 +208,29 @@ def _count_board_corners(grey: Pixels, boards: Sequence[BoardSettings], white_dn
     return count
 
 
-def _warnings(
-    kind: StepKind, values: dict[str, float], limits: CheckSettings, earlier: Sequence[Mapping[str, float]]
-) -> tuple[str, ...]:
-    warnings = []
-    share = values.get("saturated_share", 0.0)
-    if share > limits.saturated_share:
-        warnings.append(f"{share:.1%} of the pixels are saturated, limit {limits.saturated_share:.1%}; expose shorter")
-    if values.get("contrast_dn", np.inf) < limits.least_contrast_dn:
-        warnings.append(
-            f"contrast {values['contrast_dn']:.0f} DN, limit {limits.least_contrast_dn:.0f}; add light or expose longer"
-        )
-    if kind == "flat" and values["median_dn"] < limits.least_flat_dn:
-        warnings.append(
-            f"median {values['median_dn']:.0f} DN, limit {limits.least_flat_dn:.0f}; "
-            "light the diffuser or expose longer"
-        )
-    earlier_sharpness = [of_frame["sharpness"] for of_frame in earlier if "sharpness" in of_frame]
-    if earlier_sharpness and values.get("sharpness", np.inf) < (
-        limit := limits.sharpness_share * float(np.median(earlier_sharpness))
-    ):
-        warnings.append(f"sharpness {values['sharpness']:.3f}, limit {limit:.3f}; look for vibration or changed focus")
-    if values.get("leak_dn", 0.0) > limits.leak_dn:
-        warnings.append(f"parts differ by {values['leak_dn']:.1f} DN, limit {limits.leak_dn:g}; look for stray light")
-    return tuple(warnings)
+def _limits(kind: StepKind, settings: CheckSettings, earlier: Sequence[Mapping[str, float]]) -> dict[str, Limit]:
+    limits = {}
+    if kind in LIT_KINDS:
+        limits["saturated_share"] = Limit(settings.saturated_share)
+    if kind in ("charuco", "bright"):
+        limits["contrast_dn"] = Limit(settings.least_contrast_dn, is_least=True)
+        if sharpness := [of_frame["sharpness"] for of_frame in earlier if "sharpness" in of_frame]:
+            limits["sharpness"] = Limit(settings.sharpness_share * float(np.median(sharpness)), is_least=True)
+    if kind == "charuco":
+        limits["board_corners"] = Limit(settings.board_corners, is_least=True)
+    if kind == "flat":
+        limits["median_dn"] = Limit(settings.least_flat_dn, is_least=True)
+    if kind in DARK_KINDS:
+        limits["leak_dn"] = Limit(settings.leak_dn)
+    return limits
+
+
+def _warnings(values: Mapping[str, float], limits: Mapping[str, Limit]) -> tuple[str, ...]:
+    return tuple(
+        quantity.warning.format(value=values[name], limit=limits[name].value)
+        for name, quantity in QUANTITIES.items()
+        if quantity.warning is not None and name in values and name in limits and not limits[name].holds(values[name])
+    )
 
 
 # If this many frames at the beginning of a sweep see no board, that is not due to the corner where the grid begins.

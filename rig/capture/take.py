@@ -11,12 +11,13 @@ import msgspec
 from faintfield.rig.cameras.protocol import Decode, Exposure, Pixels
 from faintfield.rig.cameras.settings import CoolingSettings
 from faintfield.rig.capture.checks import LIT_KINDS, Findings, Settling, board_warnings, check_frame, measure_settling
-from faintfield.rig.capture.guide import MAX_UNATTENDED_TRIES, Answer, Dialogue, Prompt
+from faintfield.rig.capture.guide import MAX_UNATTENDED_TRIES, Answer, Dialogue, Prompt, ShownFrame
 from faintfield.rig.capture.survey import read_temperature
 from faintfield.rig.errors import CameraError, CameraTimeout, DriftUnknown, PositionDrifted
 from faintfield.rig.plan import PlannedFrame
 from faintfield.rig.session.journal import CommittedFrame, FrameRecord
 from faintfield.rig.stages.drift import DriftWatch
+from faintfield.rig.stages.protocol import Point
 
 
 class DriftChecks:
@@ -54,6 +55,10 @@ class DriftChecks:
             return
         self.nodes = 0
         self._pace.here = None
+        self._dialogue.stage = "homes, to check for drift"
+        last = self.watch.unchecked[-1]
+        if isinstance(last, CommittedFrame):
+            self._dialogue.show_status(self._session.frames[last.frame], "checking that the stage kept its position")
         try:
             drift = self.watch.check()
         except PositionDrifted as failure:
@@ -63,6 +68,7 @@ class DriftChecks:
             self.begin()
         else:
             self._session.journal.event("drift_check", away_mm=drift.away_mm)
+            self._dialogue.stage = "homed, its position checked"
 
     def ask_to_retake(self, failure: PositionDrifted | DriftUnknown, title: str, failures: int, reason: str) -> None:
         """Record which frames are suspect, and ask whether to take them again, or to stop (`CaptureStopped`)."""
@@ -111,14 +117,41 @@ class FrameTaker:
         if settings.settle_temperature_c is not None and frame.step != self._cooled_step:
             self._wait_for_temperature(frame, settings, settings.settle_temperature_c)
         self._cooled_step = frame.step
+        self._dialogue.stage = "moves to node {}, {}".format(*frame.stop.node)
         self._dialogue.show_status(frame, "moving")
         self._go_to(frame)
+        self._dialogue.stage = _at(frame.stop.target)
+        self._dialogue.camera = f"exposes for {frame.exposure_s:g} s"
         self._dialogue.show_status(frame, "exposing")
         try:
             self._expose(frame)
         except CameraError:
             self._cooled_step = None  # a camera that failed was perhaps switched off
             raise
+
+    def take_test(self, frame: PlannedFrame) -> None:
+        """Expose as for `frame` and show the picture; nothing of it is recorded.
+
+        Raises `StageError`, `NotHomed` or `CameraError`.
+        """
+        self._dialogue.stage = "moves to node {}, {}, for a test frame".format(*frame.stop.node)
+        self._dialogue.show_status(frame, "taking a test frame")
+        self._go_to(frame, test=True)
+        self._dialogue.stage = _at(frame.stop.target)
+        self._dialogue.camera = f"exposes a test frame for {frame.exposure_s:g} s"
+        self._dialogue.show_status(frame, "taking a test frame")
+        exposure, pixels = self._expose_unkept(frame.exposure_s)
+        record = FrameRecord(frame.stop.target, frame.exposure_s, dict(exposure.metadata))
+        self._note_temperature(record.temperature_c)
+        findings = self._check(frame, pixels)
+        self._dialogue.warnings = tuple(f"test frame: {warning}" for warning in findings.warnings)
+        if pixels is not None:
+            shown = ShownFrame(frame, pixels, findings, record.temperature_c, recorded=False)
+            self._dialogue.operator.show_frame(shown)
+
+    def _note_temperature(self, temperature_c: float | None) -> None:
+        words = "" if temperature_c is None else f", sensor at {temperature_c:.1f} °C"
+        self._dialogue.camera = f"ready{words}"
 
     def _wait_for_temperature(self, frame: PlannedFrame, settings: CoolingSettings, target_c: float) -> None:
         """Wait until the sensor is at its temperature: dark current doubles over a few kelvins."""
@@ -154,14 +187,14 @@ class FrameTaker:
             "temperature", frame=frame.number, temperature_c=temperature_c, waited_s=round(now_s - begun_s, 3)
         )
 
-    def _go_to(self, frame: PlannedFrame) -> None:
+    def _go_to(self, frame: PlannedFrame, *, test: bool = False) -> None:
         target = frame.stop.target
         if self._pace.here == target:
             return
         self._pace.depart()
         self._rig.stage.move_to(*target)
         self._drift.nodes += 1
-        measures = self._measures and frame.kind in LIT_KINDS
+        measures = self._measures and frame.kind in LIT_KINDS and not test
         if measures:
             self._measure_settling(frame)
         self._rig.clock.sleep_s(self._pace.rest_s[frame.kind])
@@ -197,8 +230,9 @@ class FrameTaker:
             for warning in board_warnings(frame, session.frames, corners, self._settings.checks.board_corners):
                 self._dialogue.warn(warning)
         self._pace.finish_frame(begun_s, frame.exposure_s)
+        self._note_temperature(record.temperature_c)
         if pixels is not None:
-            self._dialogue.operator.show_frame(frame, pixels, findings.values)
+            self._dialogue.operator.show_frame(ShownFrame(frame, pixels, findings, record.temperature_c))
 
     def _decode_frame(self, frame: PlannedFrame, path: Path, exposure: Exposure) -> Pixels | None:
         """Return the pixels of a frame, None if it cannot be decoded here; its layout must be that of the session."""
@@ -256,17 +290,24 @@ class FrameTaker:
             self._pace.rest_s[kind] = settings.longest_s if rest_s is None else rest_s
 
     def _take_unkept(self, exposure_s: float) -> Pixels:
-        exposure = self._rig.camera.expose(exposure_s, next(self._unkept_numbers))
-        if exposure.content is None:
-            assert exposure.pixels is not None
-            return exposure.pixels
-        with TemporaryDirectory(prefix="faintfield-") as folder:
-            path = Path(folder) / f"frame{exposure.suffix}"
-            path.write_bytes(exposure.content)
-            pixels = self._decode(path)
+        _, pixels = self._expose_unkept(exposure_s)
         if pixels is None:
             raise CameraError("frames cannot be decoded, so settling is not measured; set settle.measure = false")
         return pixels
+
+    def _expose_unkept(self, exposure_s: float) -> tuple[Exposure, Pixels | None]:
+        """Take a frame that is not kept; its pixels are None if it cannot be decoded here."""
+        exposure = self._rig.camera.expose(exposure_s, next(self._unkept_numbers))
+        if exposure.content is None:
+            return exposure, exposure.pixels
+        with TemporaryDirectory(prefix="faintfield-") as folder:
+            path = Path(folder) / f"frame{exposure.suffix}"
+            path.write_bytes(exposure.content)
+            return exposure, self._decode(path)
+
+
+def _at(target: Point) -> str:
+    return f"at rest at {target.x_mm:.1f}, {target.y_mm:.1f} mm"
 
 
 def _layout(pixels: Pixels | None) -> str | None:
