@@ -13,6 +13,7 @@ from faintfield.pipelines.errors import InputError, UnknownFormat
 from faintfield.pipelines.formats.files import require_room
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.live.capture_page import serve_page
+from faintfield.pipelines.live.light_meter import LightMeter
 from faintfield.pipelines.live.panel import CapturePanel, SessionFrames
 from faintfield.pipelines.live.planes_client import LiveOrder, live_planes
 from faintfield.pipelines.live.terminal import TerminalView
@@ -28,11 +29,18 @@ from faintfield.rig.settings import RigSettings
 
 
 def capture_session(
-    settings: RigSettings, folder: Path, *, unattended: bool, page: bool, planes: LiveOrder | None = None
+    settings: RigSettings,
+    folder: Path,
+    *,
+    unattended: bool,
+    page: bool,
+    planes: LiveOrder | None = None,
+    meter: LightMeter | None = None,
 ) -> int:
     """Begin or resume the session in `folder` and take its missing frames; return the number of frames taken.
 
     Unattended, every prompt gets its usual answer. The `page` shows `planes` of the frames so far, if they are ordered.
+    The `meter` reads the light of the dark scene.
     Raises `RigError` or `DiskFull` if the plan is not possible, the session cannot be used, or the capture stopped
     before its end.
     """
@@ -48,9 +56,10 @@ def capture_session(
         before = len(session.valid())
         if before:
             inform(f"{folder}: {before} of {len(session.frames)} frames are there; going on")
+        frames = SessionFrames(session)
         if page:
-            _open_page(panel, stack, SessionFrames(session), planes)
-        stack.enter_context(TerminalView(panel).show())
+            _open_page(panel, stack, frames, planes, meter)
+        stack.enter_context(TerminalView(panel, frames, meter).show())
         stack.enter_context(_stop_on_interrupt(panel))
         try:
             Capture(session, open_rig(settings, session.journal, read_pixels), panel, read_pixels).run()
@@ -77,13 +86,15 @@ def _plan_session(settings: RigSettings, folder: Path) -> FrozenPlan:
     return FrozenPlan(rig.plan, settings)
 
 
-def _open_page(panel: CapturePanel, stack: ExitStack, frames: SessionFrames, order: LiveOrder | None) -> None:
+def _open_page(
+    panel: CapturePanel, stack: ExitStack, frames: SessionFrames, order: LiveOrder | None, meter: LightMeter | None
+) -> None:
     """Serve the page until the stack is closed; if that fails, go on where prompts can be answered otherwise."""
     planes = None if order is None else stack.enter_context(live_planes(order, frames.of_dark_scene))
     if planes is not None:
         panel.on_change.append(planes.note_change)
     try:
-        address = stack.enter_context(serve_page(panel, frames, planes))
+        address = stack.enter_context(serve_page(panel, frames, planes, meter))
     except (OSError, RuntimeError) as failure:
         if not (panel.unattended or console.is_terminal):
             raise CaptureStopped(

@@ -16,7 +16,7 @@ from faintfield.rig.settings import BoardSettings, CheckSettings, SettleSettings
 LIT_KINDS: frozenset[StepKind] = frozenset({"charuco", "bright", "flat"})
 DARK_KINDS: frozenset[StepKind] = frozenset({"noise_reference", "dark"})
 # A dark frame is divided into this many parts per axis to find stray light, and one of the scene to find its light.
-_PARTS = 8
+PARTS = 8
 # Boards are searched in an image reduced to this size in pixels: enough to see that they are in view, and fast.
 _BOARD_SEARCH_PX = 1600
 
@@ -182,7 +182,7 @@ def _scene_values(grey: Pixels, earlier: Sequence[Mapping[str, float]]) -> dict[
     parts = _parts(grey)
     mean, variance = parts.mean(axis=(1, 3)).ravel(), parts.var(axis=(1, 3)).ravel()
     order = np.argsort(mean)
-    darkest, brightest = order[: _PARTS**2 // 8], order[-1]
+    darkest, brightest = order[: PARTS**2 // 8], order[-1]
     darkest_dn, noise_dn2 = float(mean[darkest].mean()), float(variance[darkest].mean())
     power_dn2 = float(variance[brightest] + (mean[brightest] - darkest_dn) ** 2)
     lowest_dn = min([darkest_dn, *(values["darkest_dn"] for values in earlier if "darkest_dn" in values)])
@@ -192,9 +192,9 @@ def _scene_values(grey: Pixels, earlier: Sequence[Mapping[str, float]]) -> dict[
 
 def _parts(grey: Pixels) -> NDArray[np.float64]:
     """Return the parts of a frame, (part, row, part, column)."""
-    height, width = (length // _PARTS for length in grey.shape)
-    whole = np.asarray(grey[: height * _PARTS, : width * _PARTS], float)
-    return whole.reshape(_PARTS, height, _PARTS, width)
+    height, width = (length // PARTS for length in grey.shape)
+    whole = np.asarray(grey[: height * PARTS, : width * PARTS], float)
+    return whole.reshape(PARTS, height, PARTS, width)
 
 
 def _count_board_corners(grey: Pixels, boards: Sequence[BoardSettings], white_dn: float) -> int:

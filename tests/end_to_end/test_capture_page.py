@@ -18,9 +18,10 @@ import tifffile
 from faintfield.pipelines import cli
 from faintfield.pipelines.live import capture_page, guided
 from faintfield.pipelines.live.capture_page import serve_page
-from faintfield.pipelines.live.panel import CapturePanel, OpenPrompt, ShownFrame
+from faintfield.pipelines.live.panel import CapturePanel, OpenPrompt
 from faintfield.pipelines.live.terminal import TerminalView
-from faintfield.rig.capture.guide import Prompt, Status
+from faintfield.rig.capture.checks import Findings
+from faintfield.rig.capture.guide import Prompt, ShownFrame, Status
 from faintfield.rig.errors import CameraError, CaptureStopped, RigError
 from faintfield.rig.plan import planned_frames
 from faintfield.rig.session.verify import verify
@@ -137,7 +138,7 @@ def test_no_name_becomes_part_of_page(browser: Tab) -> None:
     panel.asked = OpenPrompt(1, Prompt(hostile, hostile, (hostile,), ("go",), "go"))
     panel.status = Status(hostile, 1, 1, hostile, 0, 1, 1.0, (0, 0), ((0.0,),), (hostile, hostile + "\udcff"))
     frame = planned_frames(frozen_plan(SMALL_RIG).plan)[0]
-    panel.shown = ShownFrame(frame, np.zeros((2, 3), np.uint16), {hostile: 1.0})
+    panel.shown = ShownFrame(frame, np.zeros((2, 3), np.uint16), Findings({hostile: 1.0}))
     with serve_page(panel) as address:
         browser.open(address)
         browser.wait_until("document.getElementById('frame').naturalWidth > 0")

@@ -2,16 +2,18 @@
 
 import numpy as np
 
-from faintfield.pipelines.live.panel import CapturePanel, ShownFrame
+from faintfield.pipelines.live.panel import CapturePanel
 from faintfield.pipelines.live.terminal import _frame_picture, describe_values, display_levels
 from faintfield.rig.cameras.protocol import Pixels
+from faintfield.rig.capture.checks import Findings
+from faintfield.rig.capture.guide import ShownFrame
 from faintfield.rig.plan import PlannedFrame, StepKind, Stop
 from faintfield.rig.stages.protocol import Point
 
 
 def shown(panel: CapturePanel, pixels: Pixels, kind: StepKind, step: int = 0) -> ShownFrame:
     frame = PlannedFrame(0, step, kind, 0, Stop((0, 0), Point(0.0, 0.0)), 0.1, 0)
-    panel.show_frame(frame, pixels, {"snr": 0.16})
+    panel.show_frame(ShownFrame(frame, pixels, Findings({"snr": 0.16})))
     assert panel.shown is not None
     return panel.shown
 
@@ -31,6 +33,6 @@ def test_dark_frames_of_a_step_share_scale() -> None:
     assert first.scale_dn == lit.scale_dn
     levels = [float(display_levels(frame.pixels, 80, frame.scale_dn).mean()) for frame in (first, lit)]
     assert levels[1] > levels[0] + 60
-    assert describe_values(first) == ["SNR 0.16", "black 79 DN, white 142 DN in this step"]
+    assert describe_values(first) == ["SNR of the brightest part 0.16", "black 79 DN, white 142 DN in this step"]
     assert shown(panel, noise + 30.0, "dark", step=1).scale_dn != first.scale_dn
     assert shown(panel, noise, "bright", step=2).scale_dn is None
