@@ -1,5 +1,6 @@
 """Content of the views of a capture, terminal and page: everything that they show is declared here once."""
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
@@ -71,8 +72,12 @@ class Histogram(Struct, frozen=True):
 
 
 class FrameView(Struct, frozen=True):
-    """The last frame, without its picture; `size_px` is its width and height, `scale` black and white in words."""
+    """The last frame, without its picture; each has another `version`.
 
+    `size_px` is its width and height, `scale` black and white in words.
+    """
+
+    version: int
     name: str
     title: str
     step: int
@@ -85,11 +90,11 @@ class FrameView(Struct, frozen=True):
 
 
 class Course(Struct, frozen=True):
-    """A quantity over the frames of a step, so many per point, with its limit."""
+    """A quantity over the frames of a step, so many per point, the last one in words, and its limit."""
 
     label: str
-    unit: str
     values: tuple[float, ...]
+    last: str
     frames_per_point: int
     limit: float | None
 
@@ -160,6 +165,7 @@ class CaptureView:
         meter: LightMeter | None = None,
     ) -> None:
         self._panel, self._session, self._planes, self._meter = panel, session, planes, meter
+        self._versions = itertools.count(1)
         self._frame = _Memory[FrameView]()
         self._plan = _Memory[tuple[StepRow, ...]]()
         self._courses = _Memory[tuple[Course, ...]]()
@@ -174,7 +180,7 @@ class CaptureView:
         frame: FrameView | None = None
         courses: tuple[Course, ...] = ()
         if shown is not None:
-            frame = self._frame.get((shown, sensor), lambda: frame_view(shown, sensor))
+            frame = self._frame.get((shown, sensor), lambda: frame_view(shown, sensor, next(self._versions)))
             if session is not None:
                 courses = self._courses.get((shown, status), lambda: _courses(session, shown))
         homing = prompt is not None and prompt.key == "home"
@@ -252,11 +258,12 @@ def _check_row(name: str, value: float, limit: Limit | None) -> CheckRow:
     return CheckRow(quantity.label, quantity.text(value), words, "pass" if limit.holds(value) else verdict)
 
 
-def frame_view(shown: ShownFrame, sensor: Sensor | None) -> FrameView:
+def frame_view(shown: ShownFrame, sensor: Sensor | None, version: int) -> FrameView:
     """Return name, checks and histogram of a frame."""
     frame = shown.frame
     height, width = shown.pixels.shape[:2]
     return FrameView(
+        version=version,
         name=frame.name if shown.recorded else "test frame, not recorded",
         title=f"Step {frame.step + 1}: {step_name(frame)}, {frame.exposure_s:g} s",
         step=frame.step + 1,
@@ -322,5 +329,6 @@ def _courses(session: SessionFrames, shown: ShownFrame) -> tuple[Course, ...]:
         count = -(-len(values) // _MAX_POINTS) or 1
         points = [quantity.factor * float(np.mean(values[i : i + count])) for i in range(0, len(values), count)]
         limit_value = None if limit is None else quantity.factor * limit.value
-        courses.append(Course(quantity.label, quantity.unit, tuple(points), count, limit_value))
+        last = quantity.text(values[-1]) if values else ""
+        courses.append(Course(quantity.label, tuple(points), last, count, limit_value))
     return tuple(courses)
