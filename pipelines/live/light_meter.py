@@ -13,12 +13,12 @@ from faintfield.recon.metrics import expected_snr_from_powers
 from faintfield.rig.capture.checks import PARTS
 from faintfield.rig.capture.guide import ShownFrame
 
-# Deviations from the plan within so many standard deviations are noise.
-_MIN_DEVIATIONS = 2.0
+# Deviations from the plan within so many standard deviations are noise, and such a part of the light is of no matter.
+_MIN_DEVIATIONS, _TOLERANCE = 3.0, 0.05
 
 
 class LightReading(Struct, frozen=True):
-    """SNR of the brightest part of a frame, with its σ, and the light there in electrons per pixel; those of the plan.
+    """SNR of the brightest part of a frame, and the light there in electrons per pixel, with their σ, and the plan's.
 
     What is not known is None. `advice` says in a sentence what follows.
     """
@@ -26,6 +26,7 @@ class LightReading(Struct, frozen=True):
     snr: float
     snr_sigma: float
     light_e: float | None
+    light_sigma_e: float | None
     planned_snr: float | None
     planned_light_e: float | None
     advice: str
@@ -52,49 +53,38 @@ class LightMeter:
 
     def read(self, shown: ShownFrame) -> LightReading | None:
         """Return the reading of a frame, None unless it is one of the dark scene with noise."""
-        snr = shown.findings.values.get("snr")
-        if shown.frame.kind != "dark_scene" or snr is None:
+        values, exposure_s = shown.findings.values, shown.frame.exposure_s
+        if shown.frame.kind != "dark_scene" or "snr" not in values:
             return None
-        exposure_s = shown.frame.exposure_s
         pixels = math.prod(length // PARTS for length in shown.pixels.shape[:2])
-        # The power of the brightest part and the noise of an eighth of all parts, as sample variances
-        sigma = (1 + max(snr, 0.0)) * (2 / pixels * (1 + 8 / PARTS**2)) ** 0.5
-        noise_e2 = self._noise_e2(exposure_s)
+        # Noise of the brightest part and of the darkest ones, an eighth of all, in standard deviations of a pixel
+        scatter = math.sqrt((1 + 8 / PARTS**2) / pixels)
+        snr = values["snr"]
+        snr_sigma = math.sqrt(2) * scatter * (1 + max(snr, 0.0))
         planned_e = None if self._light_e_per_s is None else self._light_e_per_s * exposure_s
-        planned_snr = light_e = None
-        if noise_e2 is not None:
-            light_e = _light_e(snr, noise_e2)
-            if planned_e is not None:
-                # As in the check, the mean of the dark parts is subtracted, and with it the dark charge
-                planned_snr = expected_snr_from_powers(np.array([planned_e]), 0.0, noise_e2**0.5)
-        advice = self._advice(snr, sigma, planned_snr, noise_e2, planned_e)
-        return LightReading(snr, sigma, light_e, planned_snr, planned_e, advice)
+        known = self._gain_and_noise(exposure_s)
+        if known is None or "light_dn" not in values:
+            advice = f"light in electrons is not known: {self._problem}"
+            return LightReading(snr, snr_sigma, None, None, None, planned_e, advice)
+        gain, noise_e2 = known
+        light_e = values["light_dn"] / gain
+        sigma_e = math.sqrt(2) * scatter * math.sqrt(noise_e2 + max(light_e, 0.0))  # of every other pair of rows
+        planned_snr = None
+        if planned_e is not None and noise_e2:
+            # As in the check, the mean of the dark parts is subtracted, and with it the dark charge
+            planned_snr = expected_snr_from_powers(np.array([planned_e]), 0.0, math.sqrt(noise_e2))
+        advice = _advice(light_e, sigma_e, planned_e)
+        return LightReading(snr, snr_sigma, light_e, sigma_e, planned_snr, planned_e, advice)
 
-    def _advice(
-        self, snr: float, sigma: float, planned_snr: float | None, noise_e2: float | None, planned_e: float | None
-    ) -> str:
-        if noise_e2 is None:
-            return f"no light in electrons: {self._problem}"
-        if planned_snr is None or planned_e is None:
-            return "no light was planned; state that of `faintfield plan` as --light-e to compare"
-        if abs(snr - planned_snr) <= _MIN_DEVIATIONS * sigma:
-            return "as planned, within the noise of one frame"
-        if snr <= _MIN_DEVIATIONS * sigma:
-            return "hardly any light is seen; open the lamp, or look for what hides the scene"
-        factor = planned_e / _light_e(snr, noise_e2)
-        if factor > 1:
-            return f"too dark: give {factor:.2g} times the light"
-        return f"brighter than planned: {1 / factor:.2g} times the light"
-
-    def _noise_e2(self, exposure_s: float) -> float | None:
-        """Return the variance of a frame without light in (e⁻)², None if it is not known."""
+    def _gain_and_noise(self, exposure_s: float) -> tuple[float, float] | None:
+        """Return the gain in DN per electron, and the variance of a frame without light in (e⁻)²."""
         if self.sensor is None:
             return None
-        read_noise_e, dark_e_per_s = self.sensor.read_noise_e.value, self.sensor.dark_current_e_per_s.value
-        if read_noise_e is None or dark_e_per_s is None:
+        gain, read_noise_e = self.sensor.gain_dn_per_e.value, self.sensor.read_noise_e.value
+        dark_e_per_s = self.sensor.dark_current_e_per_s.value
+        if gain is None or read_noise_e is None or dark_e_per_s is None:
             return None
-        variance_e2 = view_noise_e(read_noise_e, self.sensor.gain_dn_per_e.value, 1) ** 2
-        return variance_e2 + max(dark_e_per_s, 0.0) * exposure_s or None
+        return gain, view_noise_e(read_noise_e, gain, 1) ** 2 + max(dark_e_per_s, 0.0) * exposure_s
 
     def _load(self, load_sensor: Callable[[], Sensor]) -> None:
         try:
@@ -106,6 +96,13 @@ class LightMeter:
         self.sensor = sensor
 
 
-def _light_e(snr: float, noise_e2: float) -> float:
-    """Return the light λ that solves SNR = (λ² + λ)/σ², eq. (4) of an even object."""
-    return (math.sqrt(1 + 4 * max(snr, 0.0) * noise_e2) - 1) / 2
+def _advice(light_e: float, sigma_e: float, planned_e: float | None) -> str:
+    if light_e <= _MIN_DEVIATIONS * sigma_e:
+        return "hardly any light is seen; open the lamp, or look for what hides the scene"
+    if planned_e is None:
+        return "no light was planned; state that of `faintfield plan` as --light-e to compare"
+    if abs(light_e - planned_e) <= max(_MIN_DEVIATIONS * sigma_e, _TOLERANCE * planned_e):
+        return "as planned"
+    if light_e < planned_e:
+        return f"too dark: give about {planned_e / light_e:.2g} times the light"
+    return f"brighter than planned: about {light_e / planned_e:.2g} times the light"

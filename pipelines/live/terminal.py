@@ -107,7 +107,7 @@ def describe_light(reading: LightReading) -> str:
     if reading.planned_snr is not None:
         parts.append(f"planned {reading.planned_snr:.2f}")
     if reading.light_e is not None:
-        parts.append(f"{reading.light_e:.2f} e⁻ per pixel and frame")
+        parts.append(f"{reading.light_e:.2f} ± {reading.light_sigma_e:.2f} e⁻ per pixel and frame")
     return f"{', '.join(parts)}; {reading.advice}"
 
 

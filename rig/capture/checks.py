@@ -73,6 +73,7 @@ QUANTITIES: dict[str, Quantity] = {
         "median", "DN", ".0f", warning="median {value:.0f} DN, limit {limit:.0f}; light the diffuser or expose longer"
     ),
     "darkest_dn": Quantity("mean of the darkest parts", "DN", ".1f"),
+    "light_dn": Quantity("light of the brightest part", "DN", ".1f"),
 }
 # The quantities whose course over a step is shown, the main one first.
 MAIN_QUANTITIES: dict[StepKind, tuple[str, ...]] = {
@@ -100,7 +101,7 @@ class Findings(Struct, frozen=True):
     """Measured values of a frame, and their limits, by the names of `QUANTITIES`.
 
     `warnings` are one line each, with the limit and a remedy. `saturation_dn` is the value of a saturated pixel, None
-    if it is not known. The dark scene's `snr`, `darkest_dn` and `stray_dn` are explained at `_scene_values`.
+    if it is not known. The values of the dark scene are explained at `_scene_values`.
     """
 
     values: dict[str, float]
@@ -177,7 +178,8 @@ def _scene_values(grey: Pixels, earlier: Sequence[Mapping[str, float]]) -> dict[
 
     `snr` is eq. (4) of the paper, (<g²> − <n²>) / <n²>: g are the pixels of the brightest part above the mean of the
     darkest ones, n those of the darkest ones. `stray_dn` is how far this mean, `darkest_dn`, lies above the lowest of
-    the step: light that came since.
+    the step: light that came since. `light_dn` is how far the brightest part lies above the darkest ones; these are
+    chosen by every other pair of rows and measured by the rest, as the choice favours noise.
     """
     parts = _parts(grey)
     mean, variance = parts.mean(axis=(1, 3)).ravel(), parts.var(axis=(1, 3)).ravel()
@@ -187,6 +189,11 @@ def _scene_values(grey: Pixels, earlier: Sequence[Mapping[str, float]]) -> dict[
     power_dn2 = float(variance[brightest] + (mean[brightest] - darkest_dn) ** 2)
     lowest_dn = min([darkest_dn, *(values["darkest_dn"] for values in earlier if "darkest_dn" in values)])
     values = {"darkest_dn": darkest_dn, "stray_dn": darkest_dn - lowest_dn}
+    chosen_rows = np.arange(parts.shape[1]) // 2 % 2 == 0
+    if not chosen_rows.all():
+        chosen, measured = (parts[:, rows].mean(axis=(1, 3)).ravel() for rows in (chosen_rows, ~chosen_rows))
+        order = np.argsort(chosen)
+        values["light_dn"] = float(measured[order[-1]] - measured[order[: PARTS**2 // 8]].mean())
     return {"snr": power_dn2 / noise_dn2 - 1, **values} if noise_dn2 else values
 
 
