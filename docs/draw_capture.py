@@ -5,6 +5,8 @@ those that the guide shows are put into docs/pictures. Chromium takes them.
 """
 
 import base64
+import io
+import math
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -12,7 +14,8 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from docs.draw_pictures import keep_picture
+from PIL import Image
+
 from faintfield.pipelines.commands.capture import init
 from faintfield.pipelines.formats.toml_files import read_rig
 from faintfield.pipelines.live.capture_page import serve_page
@@ -39,6 +42,9 @@ _DEPTHS_MM = (400.0, 450.0, 500.0, 550.0, 600.0, 650.0, 700.0)
 _LIGHT_E_PER_S = 13.0
 # What docs/capture.md shows: phase and width.
 _SHOWN = (("prompt", 1400), ("boards", 1024), ("dark_scene", 1400), ("dark_scene", 390))
+# Their longest part, in widths of the screen, and their width.
+_LONGEST = 2.2
+_WIDTH_PX = 1000
 
 
 class _Session:
@@ -205,16 +211,19 @@ def _take_all(folder: Path) -> Callable[[Tab, str], None]:
 def _take_shown(tab: Tab, phase: str) -> None:
     for width_px, height_px in _SCREENS:
         if (phase, width_px) in _SHOWN:
-            keep_picture(_screenshot(tab, width_px, height_px), f"capture_{phase}_{width_px}")
+            taken = _screenshot(tab, width_px, height_px, _LONGEST * width_px)
+            with Image.open(io.BytesIO(taken)) as picture:
+                picture.thumbnail((_WIDTH_PX, 4 * _WIDTH_PX))
+                picture.convert("RGB").save(_PICTURES / f"capture_{phase}_{width_px}.webp", quality=70, method=6)
 
 
-def _screenshot(tab: Tab, width_px: int, height_px: int) -> bytes:
-    """Return the whole page as PNG, on a screen of this size."""
+def _screenshot(tab: Tab, width_px: int, height_px: int, longest_px: float = math.inf) -> bytes:
+    """Return the whole page as PNG, on a screen of this size, or its upper part of this length."""
     tab.resize(width_px, height_px)
     tab.wait_until("[...document.images].filter(it => it.offsetParent).every(it => it.complete)")
     tab.draw()
     whole = tab.evaluate("document.documentElement.scrollHeight")
-    clip = {"x": 0, "y": 0, "width": width_px, "height": max(whole, height_px), "scale": 1}
+    clip = {"x": 0, "y": 0, "width": width_px, "height": min(max(whole, height_px), longest_px), "scale": 1}
     taken = tab.call("Page.captureScreenshot", format="png", captureBeyondViewport=True, clip=clip)
     return base64.b64decode(taken["data"])
 

@@ -159,10 +159,10 @@ def _resize(tab: Tab, height_px: int) -> None:
 
 def _take(tab: Tab, name: str) -> None:
     """Save what the browser shows as a picture of that name."""
-    keep_picture(base64.b64decode(tab.call("Page.captureScreenshot", format="png")["data"]), name)
+    _keep(base64.b64decode(tab.call("Page.captureScreenshot", format="png")["data"]), name)
 
 
-def keep_picture(content: bytes, name: str) -> None:
+def _keep(content: bytes, name: str) -> None:
     """Write a PNG into the folder of pictures, smaller and in 256 colours, which is enough to look at."""
     with Image.open(io.BytesIO(content)) as picture:
         picture.thumbnail((_WIDTH_PX, 4 * _WIDTH_PX))
