@@ -5,6 +5,7 @@ import re
 import select
 import sys
 import termios
+import textwrap
 import threading
 import tty
 from collections.abc import Iterable, Iterator
@@ -25,7 +26,7 @@ from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.capture.guide import Answer, OperatorRequest, ShownFrame, Status, format_duration
 
 # Widths of the frame's picture and histogram in characters.
-_PICTURE_COLUMNS, _HISTOGRAM_COLUMNS = 48, 24
+_PICTURE_COLUMNS, _MIN_PICTURE_COLUMNS, _HISTOGRAM_COLUMNS = 48, 8, 24
 _BARS = " ▁▂▃▄▅▆▇█"
 # Cursor and function keys, whose letters are no keys of ours.
 _ESCAPES = re.compile(rb"\x1b(\[[0-9;]*[~A-Za-z]|O[A-Z]|.)?")
@@ -78,17 +79,18 @@ class TerminalView:
 
     def _picture(self) -> RenderableType:
         """Return the part of the screen that is redrawn."""
-        parts: list[RenderableType] = []
-        if self._panel.shown is not None:
-            shown = self._panel.shown
-            parts += [_frame_picture(shown), Text(_describe_frame(shown), style="dim")]
+        shown, parts = self._panel.shown, list[Text]()
+        if shown is not None:
+            parts.append(Text(_describe_frame(shown, console.width), style="dim"))
             if self._meter is not None and (reading := self._meter.read(shown)) is not None:
                 parts.append(Text(describe_light(reading)))
         if self._panel.status is not None:
             parts.append(Text(_describe_status(self._panel.status)))
         if self._panel.asked is None:
             parts.append(Text(_key_line(("pause", "retake", "skip", "stop"), "  "), style="dim"))
-        return Group(*parts)
+        lines = sum(part.plain.count("\n") + 1 for part in parts)
+        picture = [] if shown is None else [_frame_picture(shown, console.height - lines - 2)]
+        return Group(*picture, *parts)
 
 
 def describe_plan(frames: SessionFrames, status: Status | None) -> list[str]:
@@ -122,9 +124,10 @@ def _describe_status(status: Status) -> str:
     return visible(f"{status.done} of {status.total} frames{to_go};{node}: {status.doing}") + devices
 
 
-def _describe_frame(shown: ShownFrame) -> str:
-    """Return a line with name and histogram of a frame, of logarithmic height, and a second one with its values."""
-    values = visible("  ".join(describe_values(shown)))
+def _describe_frame(shown: ShownFrame, columns: int) -> str:
+    """Return a line with name and histogram of a frame, of logarithmic height, and lines with its values."""
+    words = (visible(value).replace(" ", "\xa0") for value in describe_values(shown))  # a value stays in one line
+    values = textwrap.fill("  ".join(words), columns).replace("\xa0", " ")
     heights = np.log1p(np.histogram(shown.pixels, bins=_HISTOGRAM_COLUMNS)[0])
     bars = "".join(_BARS[round(height / max(heights.max(), 1.0) * (len(_BARS) - 1))] for height in heights)
     name = visible(shown.frame.name) if shown.recorded else "test frame, not recorded"
@@ -156,9 +159,13 @@ def display_levels(pixels: Pixels, width_px: int, scale: tuple[float, float] | N
     return np.asarray(np.clip((small - low) * (255.0 / max(float(high - low), 1.0)), 0, 255), np.uint8)
 
 
-def _frame_picture(shown: ShownFrame) -> Text:
-    """Return a frame in half blocks, red on black, which preserves dark adaptation."""
-    red = display_levels(shown.pixels, _PICTURE_COLUMNS, shown.scale_dn).astype(int) * 3 // 4
+def _frame_picture(shown: ShownFrame, lines: int) -> Text:
+    """Return a frame in half blocks of so many lines at most, red on black, which preserves dark adaptation."""
+    height, width = shown.pixels.shape[:2]
+    columns = min(_PICTURE_COLUMNS, 2 * lines * width // height)
+    if columns < _MIN_PICTURE_COLUMNS:
+        return Text()
+    red = display_levels(shown.pixels, columns, shown.scale_dn).astype(int) * 3 // 4
     text = Text()
     for top, bottom in zip(red[:-1:2], red[1::2], strict=True):
         for upper, lower in zip(top, bottom, strict=True):
