@@ -187,10 +187,13 @@ def test_page_shows_plan_before_first_frame(waiting: tuple[CapturePanel, str], b
     assert browser.evaluate(states) == ["now", "next", "to do"]
     text = browser.text()
     for words in (
-        *("2 Dark-scene set", "Lights out. Cover every lamp", "6 nodes, 0.1 s, about 30 s", "about 2 min to go"),
+        *("Take the boards away", "2 Dark-scene set", "about 2 min to go"),
         *("stage\nhomed", "camera\nready", "No frame yet"),
     ):
         assert words in text
+    browser.evaluate("document.querySelectorAll('#plan summary')[1].click()")
+    for words in ("6 nodes, 0.1 s, about 30 s", "Lights out. Cover every lamp"):
+        assert words in browser.text()
     browser.evaluate("document.body.dispatchEvent(new KeyboardEvent('keydown', {key: 't', bubbles: true}))")
     browser.wait_until("document.getElementById('title').textContent === 'test'")  # the outcome is the answer
     assert panel.outcome == "test"
