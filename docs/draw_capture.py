@@ -87,7 +87,7 @@ class _Session:
             assert client is not None
             self.panel.on_change += [client.note_change, self._wait]
             meter = LightMeter(lambda: known_sensor(self._settings, None), _LIGHT_E_PER_S).wait()
-            address = stack.enter_context(serve_page(self.panel, opened[0], client, meter))
+            address = stack.enter_context(serve_page(self.panel, opened[0], client, meter=meter))
             go.set()
             yield address
 

@@ -33,7 +33,7 @@ from faintfield.pipelines.live.light_meter import LightMeter
 from faintfield.pipelines.live.panel import CapturePanel, SessionFrames
 from faintfield.pipelines.live.planes_client import PlanesClient
 from faintfield.pipelines.live.terminal import display_levels
-from faintfield.pipelines.live.view import CaptureView
+from faintfield.pipelines.live.view import CaptureView, FollowedBoards
 from faintfield.rig.capture.guide import Answer, OperatorRequest, ShownFrame
 
 _HOST = "127.0.0.1"
@@ -68,11 +68,12 @@ def serve_page(
     panel: CapturePanel,
     frames: SessionFrames | None = None,
     planes: PlanesClient | None = None,
+    boards: FollowedBoards | None = None,
     meter: LightMeter | None = None,
 ) -> Iterator[str]:
     """Serve the page of a capture while the block runs; yield its address, which no log records.
 
-    It shows prompts and state of `panel`, the `frames` of the session, live planes, and the light.
+    It shows prompts and state of `panel`, the `frames` of the session, live planes, the board sweeps, and the light.
     """
     token = secrets.token_urlsafe(24)
     conceal(token)
@@ -80,7 +81,7 @@ def serve_page(
     listener = socket.create_server((_HOST, 0))
     server = uvicorn.Server(
         uvicorn.Config(
-            _TokenMiddleware(_pages(panel, frames, planes, meter, audience), token),
+            _TokenMiddleware(_pages(CaptureView(panel, frames, planes, boards, meter), audience), token),
             http=_BoundedConnection,
             h11_max_incomplete_event_size=_MAX_HEADER_BYTES,
             backlog=_MAX_ARRIVALS,
@@ -189,15 +190,9 @@ def _is_own(headers: Headers) -> bool:
     return host.partition(":")[0] == _HOST and headers.get("origin") in (None, f"http://{host}")
 
 
-def _pages(
-    panel: CapturePanel,
-    frames: SessionFrames | None,
-    planes: PlanesClient | None,
-    meter: LightMeter | None,
-    audience: _Audience,
-) -> Router:
+def _pages(view: CaptureView, audience: _Audience) -> Router:
     """Return the addresses behind the token."""
-    view = CaptureView(panel, frames, planes, meter)
+    panel, frames, planes = view.panel, view.session, view.planes
     html = files("faintfield.pipelines.live").joinpath("capture.html").read_text(encoding="utf-8")
 
     async def index(_: Request) -> Response:

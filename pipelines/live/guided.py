@@ -94,7 +94,7 @@ def _open_page(
     if planes is not None:
         panel.on_change.append(planes.note_change)
     try:
-        address = stack.enter_context(serve_page(panel, frames, planes, meter))
+        address = stack.enter_context(serve_page(panel, frames, planes, meter=meter))
     except (OSError, RuntimeError) as failure:
         if not (panel.unattended or console.is_terminal):
             raise CaptureStopped(

@@ -54,7 +54,6 @@ class CapturePanel:
     If it is `unattended`, it gives every prompt its unattended answer; requests are still accepted. Prompt, status and
     frame to show are each replaced as a whole, so any thread may read them; then the functions `on_change` are called
     in the thread of the capture. The `outcome` is how the capture ended, and what comes next; None until then.
-    `boards` is the progress of the board sweeps, which the page shows; None without any.
     """
 
     def __init__(self, *, unattended: bool) -> None:
@@ -62,7 +61,6 @@ class CapturePanel:
         self.status: Status | None = None
         self.shown: ShownFrame | None = None
         self.outcome: str | None = None
-        self.boards: Struct | None = None
         self._scale = -1, (0.0, 0.0)  # of which step, and its black and white
         self.on_change: list[Callable[[], None]] = []
         self.unattended = unattended

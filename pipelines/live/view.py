@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from msgspec import Struct
@@ -129,11 +129,16 @@ class PlanesView(Struct, frozen=True):
     status: LiveStatus | None
 
 
-class PageState(Struct, frozen=True):
-    """Everything that the page shows, except pictures.
+class BoardsView(Struct, frozen=True):
+    """Board sweeps: how the process that follows them ended, if it did, the poses in words, and the progress."""
 
-    `prompt` is the number of the open prompt. `boards` is the progress of the board sweeps, None without any.
-    """
+    ended: str | None
+    poses: str
+    progress: Any
+
+
+class PageState(Struct, frozen=True):
+    """Everything that the page shows, except pictures; `prompt` is the number of the open prompt."""
 
     title: str
     mode: Literal["waiting", "running", "ended"]
@@ -146,13 +151,30 @@ class PageState(Struct, frozen=True):
     frame: FrameView | None
     courses: tuple[Course, ...]
     light: LightReading | None
-    boards: Any
+    boards: BoardsView | None
     planes: PlanesView | None
     outcome: str | None
 
 
+class BoardsProgress(Protocol):
+    """Progress of the board sweeps: the corners of the `last` frame, cells of the detector, sweeps, and a verdict."""
+
+    @property
+    def poses(self) -> str:
+        """Poses of the nodes in words."""
+
+
+class FollowedBoards(Protocol):
+    """The process that follows the board sweeps, whose `progress` is None before its first message."""
+
+    progress: BoardsProgress | None
+
+    def failure(self) -> str | None:
+        """Return that the process has ended, and how; None while it runs."""
+
+
 class CaptureView:
-    """The state of a capture for its page: of the panel, the session, live planes and the light meter.
+    """The state of a capture for its page: of the panel, session, live planes, board sweeps and light meter.
 
     What takes longer is computed again only when frame or status have changed.
     """
@@ -162,9 +184,10 @@ class CaptureView:
         panel: CapturePanel,
         session: SessionFrames | None = None,
         planes: PlanesClient | None = None,
+        boards: FollowedBoards | None = None,
         meter: LightMeter | None = None,
     ) -> None:
-        self._panel, self._session, self._planes, self._meter = panel, session, planes, meter
+        self.panel, self.session, self.planes, self._boards, self._meter = panel, session, planes, boards, meter
         self._versions = itertools.count(1)
         self._frame = _Memory[FrameView]()
         self._plan = _Memory[tuple[StepRow, ...]]()
@@ -172,7 +195,7 @@ class CaptureView:
 
     def state(self) -> PageState:
         """Return the content of the page now."""
-        panel, session = self._panel, self._session
+        panel, session = self.panel, self.session
         asked, status, shown, outcome = panel.asked, panel.status, panel.shown, panel.outcome
         prompt = None if asked is None else asked.prompt
         words: Sequence[Answer | OperatorRequest] = REQUESTS if prompt is None else prompt.answers
@@ -196,8 +219,8 @@ class CaptureView:
             frame=frame,
             courses=courses,
             light=None if shown is None or self._meter is None else self._meter.read(shown),
-            boards=panel.boards,
-            planes=None if self._planes is None else _planes(self._planes),
+            boards=None if self._boards is None else _boards(self._boards),
+            planes=None if self.planes is None else _planes(self.planes),
             outcome=outcome,
         )
 
@@ -216,6 +239,11 @@ class _Memory[T]:
 
 def _planes(planes: PlanesClient) -> PlanesView:
     return PlanesView(planes.failure(), planes.frame_count(), round(planes.silence_s()), planes.status)
+
+
+def _boards(boards: FollowedBoards) -> BoardsView:
+    progress = boards.progress
+    return BoardsView(boards.failure(), "" if progress is None else progress.poses, progress)
 
 
 def step_rows(session: SessionFrames, status: Status | None, homing: bool = False) -> tuple[StepRow, ...]:

@@ -9,6 +9,7 @@ import urllib.parse
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -36,13 +37,29 @@ from tests.patience import HANG_S
 STOP = b'{"word": "stop"}'
 
 
-class Boards(Struct):
-    """Progress of board sweeps, as the page shows it."""
+class Boards:
+    """Progress of board sweeps with the same words everywhere, and a corner in a frame."""
 
-    verdict: str
-    corners: tuple[tuple[float, float], ...]
-    coverage: tuple[tuple[int, ...], ...]
-    notes: tuple[str, ...] = ()
+    class Progress(Struct):
+        poses: str
+        verdict: dict[str, str]
+        doing: str
+        sweeps: tuple[dict[str, Any], ...]
+        last: dict[str, Any]
+        frames: int = 3
+        planned: int = 9
+        cells: tuple[tuple[int, ...], ...] = ((1, 0), (0, 2))
+        covered: float = 0.5
+
+    def __init__(self, words: str, frame: str = "") -> None:
+        sweep = {"sweep": 1, "board": words, "distance_mm": 540.0, "tilt_deg": 22.0, "direction": words}
+        corners = {"frame": frame, "size_px": (16, 12), "points": ((3.0, 4.0),)}
+        self.progress: Any = self.Progress(
+            words, {"words": words}, words, ({**sweep, "corners": 9, "nodes": 1},), corners
+        )
+
+    def failure(self) -> str | None:
+        return None
 
 
 class Running:
@@ -149,13 +166,12 @@ def test_no_name_becomes_part_of_page(browser: Tab) -> None:
     panel.asked = OpenPrompt(1, Prompt(hostile, hostile, (f"{hostile}, a line",), ("go",), "go"))
     warnings = (hostile, hostile + "\udcff")
     panel.status = Status(hostile, 1, 1, hostile, 0, 1, 1.0, (0, 0), ((0.0,),), warnings, hostile, hostile)
-    panel.boards = Boards(hostile, (), ((1, 0),), (hostile,))
     frame = planned_frames(frozen_plan(SMALL_RIG).plan)[0]
     panel.shown = ShownFrame(frame, np.zeros((2, 3), np.uint16), Findings({hostile: 1.0}))
-    with serve_page(panel) as address:
+    with serve_page(panel, boards=Boards(hostile)) as address:
         browser.open(address)
         browser.wait_until("document.getElementById('frame').naturalWidth > 0")
-        assert browser.text().count("<script>") == 9
+        assert browser.text().count("<script>") == 12
         assert browser.evaluate("document.title") == "faintfield capture"
         assert browser.evaluate("document.querySelectorAll('script').length") == 1
 
@@ -173,7 +189,7 @@ def waiting(tmp_path: Path) -> Iterator[tuple[CapturePanel, str]]:
         )
         asking = threading.Thread(target=lambda: panel.end(panel.ask(prompt)))
         asking.start()
-        with serve_page(panel, SessionFrames(session)) as address:
+        with serve_page(panel, SessionFrames(session), boards=Boards("tilt it more", first.name)) as address:
             yield panel, address
             panel.press("stop")
             asking.join(HANG_S)
@@ -219,12 +235,11 @@ def test_text_stands_out_at_every_width(waiting: tuple[CapturePanel, str], brows
     panel, address = waiting
     frame = planned_frames(frozen_plan(SMALL_RIG).plan)[0]
     findings = Findings({"saturated_share": 0.2}, ("too bright",), {"saturated_share": Limit(0.01)}, 65535.0)
-    panel.show_frame(ShownFrame(frame, np.full((12, 16), 9, np.uint16), findings, -20.0, recorded=False))
-    panel.boards = Boards("tilt the board more", ((3.0, 4.0),), ((1, 0), (0, 2)))
+    panel.show_frame(ShownFrame(frame, np.full((12, 16), 9, np.uint16), findings, -20.0))
     browser.open(address)
     browser.wait_until("document.getElementById('frame').naturalWidth > 0")
     for words in (
-        *("Test frame, not recorded", "tilt the board more", "20.00 %", "✗ fail", "at most 1.00 %", "-20.0 °C"),
+        *("tilt it more", "540 mm", "corners cover 50 %", "20.00 %", "✗ fail", "at most 1.00 %", "-20.0 °C"),
         "saturation 65535 DN",
     ):
         assert words in browser.text()
