@@ -53,6 +53,7 @@ results: $(VENV)/installed ## the demo's figures and pictures, put into README.m
 	$(BIN)/faintfield demo $(OUT)
 	$(BIN)/python docs/collect_results.py $(OUT)
 	PYTHONPATH=. $(BIN)/python docs/draw_pictures.py $(OUT)
+	PYTHONPATH=. $(BIN)/python docs/draw_capture.py
 
 lock: ## renew requirements.lock from pyproject.toml; it leaves out the extras for cameras and napari
 	$(PYTHON) -m venv .uv

@@ -1,9 +1,9 @@
 """Make the pictures of README.md and the guide from a finished demo: `python docs/draw_pictures.py demo`.
 
-Run it from the root of the repository. Chromium takes the pictures of the pages. That of a capture shows a session on a
-simulated rig, which is started for it. With `FAINTFIELD_DATA`, the folder of real data that tests read, photographs
-are darkened and reconstructed, too. `python docs/draw_pictures.py demo FOLDER` takes the viewer of its report instead,
-on screens of three widths, bright and dark, and puts the pictures into the folder.
+Run it from the root of the repository. Chromium takes the pictures of the pages. With `FAINTFIELD_DATA`, the folder of
+real data that tests read, photographs are darkened and reconstructed, too. `python docs/draw_pictures.py demo FOLDER`
+takes the viewer of its report instead, on screens of three widths, bright and dark, and puts the pictures into the
+folder. Those of a capture are made by docs/draw_capture.py.
 """
 
 import base64
@@ -11,8 +11,6 @@ import io
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -106,7 +104,7 @@ def _with_scale(depth: NDArray[np.uint8], near_px: float, far_px: float) -> NDAr
 
 
 def draw_pages(demo: Path) -> None:
-    """Take the pages of a reconstruction, a stage and a sensor as a browser shows them, and the one of a capture."""
+    """Take the pages of a reconstruction, a stage and a sensor as a browser shows them."""
     with TemporaryDirectory() as scratch, open_browser(Path(scratch) / "browser") as tab:
         tab.call("Emulation.setScrollbarsHidden", hidden=True)
         for name, page, height_px in _PAGES:
@@ -119,15 +117,6 @@ def draw_pages(demo: Path) -> None:
         tab.call("Emulation.setDeviceMetricsOverride", width=1100, height=1140, deviceScaleFactor=1, mobile=False)
         tab.evaluate("document.getElementById('viewer').scrollIntoView()")
         _take(tab, "viewer")
-        _resize(tab, 600)
-        with _capturing(Path(scratch)) as address:
-            tab.open(address)
-            tab.click("go")  # homing
-            tab.click("skip")
-            tab.wait_until("document.getElementById('title').textContent.includes('Bright')")
-            tab.click("go")
-            tab.wait_until("parseInt(document.getElementById('count').textContent) >= 20")
-            _take(tab, "capture")
 
 
 def draw_viewer(demo: Path, folder: Path) -> None:
@@ -160,37 +149,6 @@ def _show_viewer(tab: Tab, demo: Path, button: str, share: float) -> None:
         "document.getElementById('viewer').scrollIntoView(); "
         "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done())))"
     )
-
-
-@contextmanager
-def _capturing(folder: Path) -> Iterator[str]:
-    """Run a capture of a board sweep and a bright set on a simulated rig, and yield the address of its page."""
-    from faintfield.pipelines.commands.capture import init
-
-    rig = folder / "rig.toml"
-    init(rig)
-    text = rig.read_text()
-    first, second, third = (text.index(f'kind = "{kind}"') for kind in ("charuco", "bright", "dark_scene"))
-    head, bright = text[: text.rindex("[[step]]", 0, first)], text[text.rindex("[[step]]", 0, second) : third]
-    charuco = '[[step]]\nkind = "charuco"\nexposure_s = 0.05\n\n'
-    rig.write_text(head + charuco + bright.removesuffix("[[step]]\n"))
-    command = [
-        sys.executable,
-        "-c",
-        _MAIN,
-        "capture",
-        str(rig),
-        str(folder / "it"),
-        "--page",
-    ]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True, env=os.environ)
-    try:
-        assert process.stderr is not None
-        address = next(line for line in process.stderr if line.startswith("page: "))
-        yield address.removeprefix("page: ").strip()
-    finally:
-        process.kill()
-        process.wait()
 
 
 def _resize(tab: Tab, height_px: int) -> None:

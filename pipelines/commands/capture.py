@@ -129,11 +129,12 @@ def capture(
     noise: Path | None = None,
     geometry: Path | None = None,
     fx_px: Positive | None = None,
+    light_e: Positive | None = None,
 ) -> Capture:
     """Capture a session, step by step; run it again to go on where it stopped.
 
-    Keys: p pause, r take the last frame again, s skip, q stop. Ctrl-C stops after the present frame, a second one at
-    once.
+    Keys: t test frame before a step, p pause, r take the last frame again, s skip, q stop. Ctrl-C stops after the
+    present frame, a second one at once.
 
     Parameters
     ----------
@@ -150,17 +151,27 @@ def capture(
     live_sweep_mm
         The same, at FIRST:LAST:COUNT depths.
     noise
-        For these planes: noise.json or its folder; by default that of the session, or beside the rig.toml.
+        For these planes and the light: noise.json or its folder; by default that of the session, or beside the
+        rig.toml.
     geometry
         For these planes: geometry.json or its folder; by default that of the session, or beside the rig.toml.
     fx_px
         For these planes: focal length in pixels, where there is no geometry.json.
+    light_e
+        Planned light of the dark scene, which is compared with the measured one: as in `faintfield plan`.
     """
     from faintfield.pipelines.workflows.capture import capture_or_resume
 
     known = (noise, geometry, fx_px)
     return capture_or_resume(
-        rig, session, yes=yes, page=page, live_depth_mm=live_depth_mm, live_sweep_mm=live_sweep_mm, known=known
+        rig,
+        session,
+        yes=yes,
+        page=page,
+        live_depth_mm=live_depth_mm,
+        live_sweep_mm=live_sweep_mm,
+        known=known,
+        light_e=light_e,
     )
 
 

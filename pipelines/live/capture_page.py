@@ -16,7 +16,6 @@ from contextlib import contextmanager
 from functools import lru_cache
 from importlib.resources import files
 from json import dumps
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -31,15 +30,16 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from faintfield.pipelines.console import conceal, inform
 from faintfield.pipelines.formats.image_files import encoded
 from faintfield.pipelines.live.boards_client import BoardsClient
-from faintfield.pipelines.live.panel import REQUESTS, CapturePanel, SessionFrames, ShownFrame
+from faintfield.pipelines.live.light_meter import LightMeter
+from faintfield.pipelines.live.panel import CapturePanel, SessionFrames
 from faintfield.pipelines.live.planes_client import PlanesClient
-from faintfield.pipelines.live.terminal import LABELS, describe_values, display_levels
-from faintfield.rig.capture.guide import Answer, OperatorRequest, format_duration
+from faintfield.pipelines.live.terminal import display_levels
+from faintfield.pipelines.live.view import CaptureView
+from faintfield.rig.capture.guide import Answer, OperatorRequest, ShownFrame
 
 _HOST = "127.0.0.1"
 # Width of the frame's picture in pixels.
 _PICTURE_PX = 960
-_HISTOGRAM_BINS = 64
 # Bounds on connections: how many, of which so many may arrive at once; how long one may last; what it may send.
 _MAX_CONNECTIONS = 64
 _MAX_ARRIVALS = 16
@@ -70,11 +70,11 @@ def serve_page(
     frames: SessionFrames | None = None,
     planes: PlanesClient | None = None,
     boards: BoardsClient | None = None,
+    meter: LightMeter | None = None,
 ) -> Iterator[str]:
     """Serve the page of a capture while the block runs; yield its address, which no log records.
 
-    It shows prompts and state of `panel`, the `frames` of the session when a node is clicked, live planes, and the
-    board sweeps.
+    It shows prompts and state of `panel`, the `frames` of the session, live planes, the board sweeps, and the light.
     """
     token = secrets.token_urlsafe(24)
     conceal(token)
@@ -82,7 +82,7 @@ def serve_page(
     listener = socket.create_server((_HOST, 0))
     server = uvicorn.Server(
         uvicorn.Config(
-            _TokenMiddleware(_pages(panel, frames, planes, boards, audience), token),
+            _TokenMiddleware(_pages(CaptureView(panel, frames, planes, boards, meter), audience), token),
             http=_BoundedConnection,
             h11_max_incomplete_event_size=_MAX_HEADER_BYTES,
             backlog=_MAX_ARRIVALS,
@@ -191,14 +191,9 @@ def _is_own(headers: Headers) -> bool:
     return host.partition(":")[0] == _HOST and headers.get("origin") in (None, f"http://{host}")
 
 
-def _pages(
-    panel: CapturePanel,
-    frames: SessionFrames | None,
-    planes: PlanesClient | None,
-    boards: BoardsClient | None,
-    audience: _Audience,
-) -> Router:
+def _pages(view: CaptureView, audience: _Audience) -> Router:
     """Return the addresses behind the token."""
+    panel, frames, planes = view.panel, view.session, view.planes
     html = files("faintfield.pipelines.live").joinpath("capture.html").read_text(encoding="utf-8")
 
     async def index(_: Request) -> Response:
@@ -206,11 +201,7 @@ def _pages(
 
     async def state(request: Request) -> Response:
         audience.note(informed="informed" in request.query_params)
-        parts = {
-            "planes": None if planes is None else _planes(planes),
-            "boards": None if boards is None else _boards(boards),
-        }
-        return _json(_state(panel) | parts)
+        return _json(msgspec.to_builtins(view.state()))
 
     async def picture(_: Request) -> Response:
         shown = panel.shown
@@ -267,55 +258,9 @@ async def _body(request: Request) -> bytes:
     return body
 
 
-# Picture and numbers of the last frame are kept: the page asks for them several times a second.
+# Several pages may ask for the same picture.
 @lru_cache(maxsize=1)
 def _png(shown: ShownFrame) -> bytes:
     """Return the picture of a frame in red, as a PNG file."""
     red = display_levels(shown.pixels, _PICTURE_PX, shown.scale_dn)
     return encoded(np.dstack([red, np.zeros_like(red), np.zeros_like(red)]), ".png")
-
-
-@lru_cache(maxsize=1)
-def _frame(shown: ShownFrame) -> dict[str, Any]:
-    """Return name, values in words and histogram of a frame as a JSON object."""
-    counts, edges = np.histogram(shown.pixels, bins=_HISTOGRAM_BINS)
-    return {
-        "name": shown.frame.name,
-        "values": describe_values(shown),
-        "histogram": np.log1p(counts).tolist(),
-        "range_dn": [float(edges[0]), float(edges[-1])],
-    }
-
-
-def _planes(planes: PlanesClient) -> dict[str, Any]:
-    """Return the state of live planes as a JSON object."""
-    return {
-        "ended": planes.failure(),
-        "offered": planes.frame_count(),
-        "silence_s": round(planes.silence_s()),
-        "status": msgspec.to_builtins(planes.status),
-    }
-
-
-def _boards(boards: BoardsClient) -> dict[str, Any]:
-    """Return the progress of the board sweeps as a JSON object; there is none before the first message."""
-    progress = boards.progress
-    return {
-        "ended": boards.failure(),
-        "poses": "" if progress is None else progress.poses,
-        "progress": None if progress is None else msgspec.to_builtins(progress),
-    }
-
-
-def _state(panel: CapturePanel) -> dict[str, Any]:
-    """Return the content of the page, except the picture, as a JSON object."""
-    asked, status, shown = panel.asked, panel.status, panel.shown
-    buttons = REQUESTS if asked is None else asked.prompt.answers
-    return {
-        "prompt": None if asked is None else {"number": asked.number, **msgspec.to_builtins(asked.prompt)},
-        "status": None if status is None else msgspec.to_builtins(status),
-        "to_go": "" if status is None else format_duration(status.to_go_s),
-        "buttons": [{"word": word, "label": LABELS[word]} for word in buttons],
-        "frame": None if shown is None else _frame(shown),
-        "outcome": panel.outcome,
-    }

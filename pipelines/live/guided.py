@@ -17,6 +17,7 @@ from faintfield.pipelines.formats.results.geometry import DEFAULT_DEPTHS_MM
 from faintfield.pipelines.live.board_progress import BoardOrder
 from faintfield.pipelines.live.boards_client import BoardsClient, followed_boards
 from faintfield.pipelines.live.capture_page import serve_page
+from faintfield.pipelines.live.light_meter import LightMeter
 from faintfield.pipelines.live.panel import CapturePanel, SessionFrames
 from faintfield.pipelines.live.planes_client import NO_POSES, LiveOrder, live_planes
 from faintfield.pipelines.live.terminal import TerminalView
@@ -33,11 +34,18 @@ from faintfield.rig.settings import RigSettings
 
 
 def capture_session(
-    settings: RigSettings, folder: Path, *, unattended: bool, page: bool, planes: LiveOrder | None = None
+    settings: RigSettings,
+    folder: Path,
+    *,
+    unattended: bool,
+    page: bool,
+    planes: LiveOrder | None = None,
+    meter: LightMeter | None = None,
 ) -> int:
     """Begin or resume the session in `folder` and take its missing frames; return the number of frames taken.
 
     Unattended, every prompt gets its usual answer. The `page` shows `planes` of the frames so far, if they are ordered.
+    The `meter` reads the light of the dark scene.
     Raises `RigError` or `DiskFull` if the plan is not possible, the session cannot be used, or the capture stopped
     before its end.
     """
@@ -57,8 +65,8 @@ def capture_session(
         # Without a person at page or terminal, nobody could follow the advice
         boards = _follow_boards(panel, stack, session, frames) if page or not unattended else None
         if page:
-            _open_page(panel, stack, frames, planes, boards)
-        stack.enter_context(TerminalView(panel).show())
+            _open_page(panel, stack, frames, planes, boards, meter)
+        stack.enter_context(TerminalView(panel, frames, meter).show())
         stack.enter_context(_stop_on_interrupt(panel))
         try:
             Capture(session, open_rig(settings, session.journal, read_pixels), panel, read_pixels).run()
@@ -107,6 +115,7 @@ def _open_page(
     frames: SessionFrames,
     order: LiveOrder | None,
     boards: BoardsClient | None,
+    meter: LightMeter | None,
 ) -> None:
     """Serve the page until the stack is closed; if that fails, go on where prompts can be answered otherwise."""
     planes = None
@@ -118,7 +127,7 @@ def _open_page(
         if boards is not None:
             boards.on_poses.append(planes.note_change)
     try:
-        address = stack.enter_context(serve_page(panel, frames, planes, boards))
+        address = stack.enter_context(serve_page(panel, frames, planes, boards, meter))
     except (OSError, RuntimeError) as failure:
         if not (panel.unattended or console.is_terminal):
             raise CaptureStopped(

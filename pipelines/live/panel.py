@@ -5,20 +5,22 @@ queue; keys, clicks and Ctrl-C all write to it.
 """
 
 import itertools
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable
 from contextlib import suppress
 from queue import Empty, SimpleQueue
 from typing import Any, get_args
 
 import numpy as np
 from msgspec import Struct
+from msgspec.structs import replace
 
 from faintfield.pipelines.live.board_progress import BoardFrame, BoardNews
 from faintfield.pipelines.live.planes_client import LiveFrame
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.capture.checks import LIT_KINDS
-from faintfield.rig.capture.guide import Answer, OperatorRequest, Prompt, Status
-from faintfield.rig.plan import PlannedFrame
+from faintfield.rig.capture.guide import Answer, OperatorRequest, Prompt, ShownFrame, Status, preparations
+from faintfield.rig.plan import CaptureStep, PlannedFrame
 from faintfield.rig.session.homings import Homed
 from faintfield.rig.session.journal import CommittedFrame
 from faintfield.rig.session.session import Session
@@ -31,18 +33,6 @@ class OpenPrompt(Struct, frozen=True):
 
     number: int
     prompt: Prompt
-
-
-class ShownFrame(Struct, frozen=True, eq=False):
-    """The frame on display, with its measured values by name; each is equal to itself alone.
-
-    `scale_dn` is black and white of its picture if they stay the same in its step, else None.
-    """
-
-    frame: PlannedFrame
-    pixels: Pixels
-    values: Mapping[str, float]
-    scale_dn: tuple[float, float] | None = None
 
 
 # Black and white of frames without light: so many standard deviations of a pixel below and above the median.
@@ -73,7 +63,7 @@ class CapturePanel:
         self.status: Status | None = None
         self.shown: ShownFrame | None = None
         self.outcome: str | None = None
-        self._scale: tuple[int, tuple[float, float]] | None = None
+        self._scale = -1, (0.0, 0.0)  # of which step, and its black and white
         self.on_change: list[Callable[[], None]] = []
         self.unattended = unattended
         # The word of each button or key, and the number of the prompt that it answers, if any
@@ -112,14 +102,14 @@ class CapturePanel:
         self.status = status
         self._changed()
 
-    def show_frame(self, frame: PlannedFrame, pixels: Pixels, values: Mapping[str, float]) -> None:
+    def show_frame(self, shown: ShownFrame) -> None:
         """Show the frame just taken."""
-        scale_dn = None
-        if frame.kind not in LIT_KINDS:
-            if self._scale is None or self._scale[0] != frame.step:
-                self._scale = frame.step, _dark_scale_dn(pixels)
-            scale_dn = self._scale[1]
-        self.shown = ShownFrame(frame, pixels, values, scale_dn)
+        step, scale_dn = shown.frame.step, None
+        if shown.frame.kind not in LIT_KINDS:
+            scale_dn = self._scale[1] if self._scale[0] == step else _dark_scale_dn(shown.pixels)
+            if shown.recorded:
+                self._scale = step, scale_dn
+        self.shown = replace(shown, scale_dn=scale_dn)
         self._changed()
 
     def end(self, outcome: str) -> None:
@@ -132,13 +122,54 @@ class CapturePanel:
             callback()
 
 
+class StepProgress(Struct, frozen=True):
+    """A step of the plan, by its first frame: the numbers of its frames that are done, left out, and all."""
+
+    index: int
+    first: PlannedFrame
+    frames: str
+    done: int
+    skipped: int
+    total: int
+    preparations: tuple[str, ...]
+
+
 class SessionFrames:
-    """The valid frames of an open session, whose capture goes on in another thread."""
+    """The frames of an open session, whose capture goes on in another thread."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
         self._homings: list[Homed] = []
         self._count = -1
+        self._total = Counter(frame.step for frame in session.frames)
+        self._first = {frame.step: frame for frame in reversed(session.frames)}
+
+    def steps(self) -> list[StepProgress]:
+        """Return the steps of the plan."""
+        frames, plan = self._session.frames, self._session.plan
+        done = Counter(frames[number].step for number in list(self._session.valid()))
+        skipped = Counter(frame.step for frame in self._session.skipped())
+        return [
+            StepProgress(
+                index=index,
+                first=self._first[index],
+                frames=_frames_in_words(step, len(plan.stops_of(step))),
+                done=done[index],
+                skipped=skipped[index],
+                total=self._total[index],
+                preparations=preparations(plan.steps, self._first[index]),
+            )
+            for index, step in enumerate(plan.steps)
+        ]
+
+    def values(self, step: int, name: str) -> list[float]:
+        """Return a checked value of the valid frames of a step, in the order in which they were taken."""
+        frames = sorted(self._session.valid().values(), key=lambda frame: frame.intent)
+        return [
+            frame.record.checks[name]
+            for frame in frames
+            if self._session.frames[frame.frame].step == step and name in frame.record.checks
+        ]
 
     def at(self, step: int, node: tuple[int, int]) -> list[dict[str, Any]]:
         """Return the frames of a step at a node, in the order of the plan, as JSON objects."""
@@ -196,3 +227,10 @@ class SessionFrames:
         with suppress(OSError):
             return self._session.path_of(frame).stat().st_mtime
         return None
+
+
+def _frames_in_words(step: CaptureStep, stops: int) -> str:
+    """Return the frames of a step, such as `49 nodes, 10 x 0.1 s`."""
+    place = "centre node" if step.at == "centre" else f"{stops} nodes" if stops > 1 else "1 node"
+    repeats = f"{step.frames_per_node} x " if step.frames_per_node > 1 else ""
+    return f"{place}, {repeats}{', '.join(f'{exposure_s:g}' for exposure_s in step.exposure_s)} s"

@@ -5,6 +5,7 @@ import re
 import select
 import sys
 import termios
+import textwrap
 import threading
 import tty
 from collections.abc import Iterable, Iterator
@@ -18,36 +19,15 @@ from rich.live import Live
 from rich.text import Text
 
 from faintfield.pipelines.console import console, inform, visible
-from faintfield.pipelines.live.panel import CapturePanel, ShownFrame
+from faintfield.pipelines.live.light_meter import LightMeter, LightReading
+from faintfield.pipelines.live.panel import CapturePanel, SessionFrames
+from faintfield.pipelines.live.view import KEYS, LABELS, check_rows, scale_words, step_rows
 from faintfield.rig.cameras.protocol import Pixels
-from faintfield.rig.capture.guide import Status, format_duration
+from faintfield.rig.capture.guide import Answer, OperatorRequest, ShownFrame, Status, format_duration
 
-LABELS = {
-    "go": "go on",
-    "again": "try again",
-    "keep": "keep as it is",
-    "retake": "take again",
-    "skip": "skip",
-    "stop": "stop",
-    "pause": "pause",
-}
-_KEYS = {"go": "g", "again": "a", "keep": "k", "retake": "r", "skip": "s", "stop": "q", "pause": "p"}
 # Widths of the frame's picture and histogram in characters.
-_PICTURE_COLUMNS, _HISTOGRAM_COLUMNS = 48, 24
+_PICTURE_COLUMNS, _MIN_PICTURE_COLUMNS, _HISTOGRAM_COLUMNS = 48, 8, 24
 _BARS = " ▁▂▃▄▅▆▇█"
-# The measured values of a frame in words.
-_VALUES = {
-    "median_dn": "median {:.5g} DN",
-    "mean_dn": "mean {:.5g} DN",
-    "contrast_dn": "contrast {:.5g} DN",
-    "saturated_share": "saturated {:.2%}",
-    "sharpness": "sharpness {:.3g}",
-    "board_corners": "{:g} board corners",
-    "leak_dn": "parts differ by {:.1f} DN",
-    "snr": "SNR {:.2f}",
-    "darkest_dn": "darkest parts {:.1f} DN",
-    "stray_dn": "stray light {:+.1f} DN",
-}
 # Cursor and function keys, whose letters are no keys of ours.
 _ESCAPES = re.compile(rb"\x1b(\[[0-9;]*[~A-Za-z]|O[A-Z]|.)?")
 
@@ -56,10 +36,12 @@ _LOOK_S = 0.1
 
 
 class TerminalView:
-    """View of a panel in the terminal; without a terminal, a line for each step and warning."""
+    """View of a panel in the terminal, with the plan of a session and the light; lines only, if it is no terminal."""
 
-    def __init__(self, panel: CapturePanel) -> None:
-        self._panel = panel
+    def __init__(
+        self, panel: CapturePanel, frames: SessionFrames | None = None, meter: LightMeter | None = None
+    ) -> None:
+        self._panel, self._frames, self._meter = panel, frames, meter
         self._live = Live(console=console, auto_refresh=False, transient=True)
         self._printed: set[str] = set()
         self._prompt_number = 0
@@ -78,6 +60,9 @@ class TerminalView:
         """Print new prompts and warnings, and update the picture."""
         status, asked = self._panel.status, self._panel.asked
         if asked is not None and asked.number != self._prompt_number:
+            if not self._prompt_number and self._frames is not None:
+                for line in describe_plan(self._frames, status):
+                    inform(line)
             self._prompt_number = asked.number
             prompt = asked.prompt
             keys = f"{_key_line(prompt.answers, '   ')}   (Enter: {LABELS[prompt.answers[0]]})"
@@ -94,39 +79,71 @@ class TerminalView:
 
     def _picture(self) -> RenderableType:
         """Return the part of the screen that is redrawn."""
-        parts: list[RenderableType] = []
-        if self._panel.shown is not None:
-            parts += [_frame_picture(self._panel.shown), Text(_describe_frame(self._panel.shown), style="dim")]
+        shown, parts = self._panel.shown, list[Text]()
+        if shown is not None:
+            parts.append(Text(_describe_frame(shown, console.width), style="dim"))
+            if self._meter is not None and (reading := self._meter.read(shown)) is not None:
+                parts.append(Text(describe_light(reading)))
         if self._panel.status is not None:
             parts.append(Text(_describe_status(self._panel.status)))
         if self._panel.asked is None:
             parts.append(Text(_key_line(("pause", "retake", "skip", "stop"), "  "), style="dim"))
-        return Group(*parts)
+        lines = sum(part.plain.count("\n") + 1 for part in parts)
+        picture = [] if shown is None else [_frame_picture(shown, console.height - lines - 2)]
+        return Group(*picture, *parts)
 
 
-def _key_line(buttons: Iterable[str], gap: str) -> str:
-    return gap.join(f"[{_KEYS[button]}] {LABELS[button]}" for button in buttons)
+def describe_plan(frames: SessionFrames, status: Status | None) -> list[str]:
+    """Return the plan of a session, a line per step."""
+    lines = ["The plan:"]
+    for row in step_rows(frames, status, homing=True):
+        to_go = f", {row.to_go}" if row.to_go else ""
+        state = f"   ({row.state})" if row.state != "to do" else ""
+        lines.append(f"  {row.number:2}  {row.title}: {row.frames}{to_go}{state}")
+    return lines
+
+
+def describe_light(reading: LightReading) -> str:
+    """Return a reading of the light meter in a line."""
+    parts = [f"light: SNR {reading.snr:.2f} ± {reading.snr_sigma:.2f}"]
+    if reading.planned_snr is not None:
+        parts.append(f"planned {reading.planned_snr:.2f}")
+    if reading.light_e is not None:
+        parts.append(f"{reading.light_e:.2f} ± {reading.light_sigma_e:.2f} e⁻ per pixel and frame")
+    return f"{', '.join(parts)}; {reading.advice}"
+
+
+def _key_line(buttons: Iterable[Answer | OperatorRequest], gap: str) -> str:
+    return gap.join(f"[{KEYS[button]}] {LABELS[button]}" for button in buttons)
 
 
 def _describe_status(status: Status) -> str:
     node = "" if status.node is None else f" node {status.node[0]},{status.node[1]}"
     to_go = f", {format_duration(status.to_go_s)} to go" if status.done < status.total else ""
-    return visible(f"{status.done} of {status.total} frames{to_go};{node}: {status.doing}")
+    devices = "\n" + visible(f"stage: {status.stage}; camera: {status.camera}") if status.stage else ""
+    return visible(f"{status.done} of {status.total} frames{to_go};{node}: {status.doing}") + devices
 
 
-def _describe_frame(shown: ShownFrame) -> str:
-    """Return a line with name and histogram of a frame, of logarithmic height, and a second one with its values."""
-    values = visible("  ".join(describe_values(shown)))
+def _describe_frame(shown: ShownFrame, columns: int) -> str:
+    """Return a line with name and histogram of a frame, of logarithmic height, and lines with its values."""
+    words = (visible(value).replace(" ", "\xa0") for value in describe_values(shown))  # a value stays in one line
+    values = textwrap.fill("  ".join(words), columns).replace("\xa0", " ")
     heights = np.log1p(np.histogram(shown.pixels, bins=_HISTOGRAM_COLUMNS)[0])
     bars = "".join(_BARS[round(height / max(heights.max(), 1.0) * (len(_BARS) - 1))] for height in heights)
-    return f"{visible(shown.frame.name)}  {bars}\n{values}"
+    name = visible(shown.frame.name) if shown.recorded else "test frame, not recorded"
+    return f"{name}  {bars}\n{values}"
 
 
 def describe_values(shown: ShownFrame) -> list[str]:
-    """Return the measured values of a frame in words, and black and white of its picture if they are fixed."""
-    values = [_VALUES.get(name, f"{visible(name)} {{:g}}").format(value) for name, value in shown.values.items()]
+    """Return the checks of a frame in words, the temperature, and black and white of its picture if they are fixed."""
+    values = []
+    for row in check_rows(shown):
+        verdict = row.verdict.upper() if row.verdict == "fail" else row.verdict
+        values.append(f"{row.label} {row.value}" + (f" ({row.limit}: {verdict})" if verdict else ""))
+    if shown.temperature_c is not None:
+        values.append(f"sensor at {shown.temperature_c:.1f} °C")
     if shown.scale_dn is not None:
-        values.append("black {:.0f} DN, white {:.0f} DN in this step".format(*shown.scale_dn))
+        values.append(scale_words(shown))
     return values
 
 
@@ -142,9 +159,13 @@ def display_levels(pixels: Pixels, width_px: int, scale: tuple[float, float] | N
     return np.asarray(np.clip((small - low) * (255.0 / max(float(high - low), 1.0)), 0, 255), np.uint8)
 
 
-def _frame_picture(shown: ShownFrame) -> Text:
-    """Return a frame in half blocks, red on black, which preserves dark adaptation."""
-    red = display_levels(shown.pixels, _PICTURE_COLUMNS, shown.scale_dn).astype(int) * 3 // 4
+def _frame_picture(shown: ShownFrame, lines: int) -> Text:
+    """Return a frame in half blocks of so many lines at most, red on black, which preserves dark adaptation."""
+    height, width = shown.pixels.shape[:2]
+    columns = min(_PICTURE_COLUMNS, 2 * lines * width // height)
+    if columns < _MIN_PICTURE_COLUMNS:
+        return Text()
+    red = display_levels(shown.pixels, columns, shown.scale_dn).astype(int) * 3 // 4
     text = Text()
     for top, bottom in zip(red[:-1:2], red[1::2], strict=True):
         for upper, lower in zip(top, bottom, strict=True):
@@ -161,7 +182,7 @@ def _keys(panel: CapturePanel) -> Iterator[None]:
         return
     before = termios.tcgetattr(sys.stdin)
     ended = threading.Event()
-    buttons = {key: button for button, key in _KEYS.items()}
+    buttons = {key: button for button, key in KEYS.items()}
 
     def listen() -> None:
         while not ended.is_set():

@@ -1,5 +1,6 @@
 """Knowledge of a rig before a capture: its sensor, its lens, the light of the scene, and how fast it is."""
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -79,6 +80,12 @@ def known_sensor(settings: RigSettings, noise: Path | None, **options: float | N
         name: value if isinstance(value, Estimate) else Estimate(value) for name, value in (numbers | stated).items()
     }
     return Sensor(f"options and {source}" if stated else source, **known, record=record, path=noise, model=model)
+
+
+def view_noise_e(read_noise_e: float, gain_dn_per_e: float | None, frames: int) -> float:
+    """Return the standard deviation of read noise and of rounding to DN in the sum of so many frames, in electrons."""
+    rounding_e2 = 0.0 if gain_dn_per_e is None else 1 / (12 * gain_dn_per_e**2)
+    return math.sqrt(frames * (read_noise_e**2 + rounding_e2))
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from faintfield.pipelines.planning.known import (
     known_pace,
     known_sensor,
     planned_light,
+    view_noise_e,
 )
 from faintfield.pipelines.planning.options import PlanOptions
 from faintfield.pipelines.planning.prediction import (
@@ -190,9 +191,7 @@ class Predictor:
 
         def of_view(light_e_per_s: float, read_noise_e: float, dark_e_per_s: float) -> float:
             dark_e = max(dark_e_per_s, 0.0) * view.exposure_s
-            gain = self.sensor.gain_dn_per_e.value
-            rounding_e2 = 0.0 if gain is None else 1 / (12 * gain**2)
-            noise_e = (view.frames * (read_noise_e**2 + rounding_e2)) ** 0.5
+            noise_e = view_noise_e(read_noise_e, self.sensor.gain_dn_per_e.value, view.frames)
             return compute(light_e_per_s * view.exposure_s, dark_e, noise_e)
 
         return _with(of_view, self.light.e_per_s, self.sensor.read_noise_e, self.sensor.dark_current_e_per_s)

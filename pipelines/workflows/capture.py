@@ -7,10 +7,16 @@ import msgspec
 
 from faintfield.pipelines.console import console
 from faintfield.pipelines.errors import WrongUsage
+from faintfield.pipelines.formats.results.noise import NOISE_FILE
 from faintfield.pipelines.formats.toml_files import read_rig
 from faintfield.pipelines.live.guided import capture_session
+from faintfield.pipelines.live.light_meter import LightMeter
 from faintfield.pipelines.live.planes_client import MAX_DEPTHS, LiveOrder
+from faintfield.pipelines.planning.known import calibration_file, known_sensor
+from faintfield.pipelines.planning.options import PlanOptions
+from faintfield.pipelines.planning.predict import scene_view
 from faintfield.pipelines.reconstruction.options import sweep_values
+from faintfield.rig.settings import RigSettings
 
 # Noise, geometry and focal length for the live planes.
 type Known = tuple[Path | None, Path | None, float | None]
@@ -33,6 +39,7 @@ def capture_or_resume(
     live_depth_mm: list[float] | None,
     live_sweep_mm: str | None,
     known: Known,
+    light_e: float | None,
 ) -> Captured:
     """Capture a session, or go on with it."""
     settings = read_rig(rig)
@@ -43,18 +50,31 @@ def capture_or_resume(
         depths += sweep_values("--live-sweep-mm", live_sweep_mm, "400:900:16")
         if min(depths) <= 0:
             raise WrongUsage(f"--live-sweep-mm {live_sweep_mm}: planes lie before the camera; give positive depths")
-    planes = _live_order(rig, session, depths, known)
+    planes = _live_order(rig, session, depths, known, light_e)
     if planes is not None and not page:
         raise WrongUsage("live planes are shown on the page, and there is none; give --page, too")
-    taken = capture_session(settings, session, unattended=yes, page=page, planes=planes)
+    meter = None if yes and not page else _light_meter(settings, rig, session, known[0], light_e)
+    taken = capture_session(settings, session, unattended=yes, page=page, planes=planes, meter=meter)
     return Captured(str(session), complete=True, taken=taken)
 
 
-def _live_order(rig: Path, session: Path, depths: list[float], known: Known) -> LiveOrder | None:
+def _light_meter(
+    settings: RigSettings, rig: Path, session: Path, noise: Path | None, light_e: float | None
+) -> LightMeter:
+    """Return the light meter for a planned light in electrons per frame of the dark scene's first exposure."""
+    light_e_per_s = None if light_e is None else light_e / scene_view(settings, PlanOptions())[0]
+    return LightMeter(
+        lambda: known_sensor(settings, calibration_file(noise, NOISE_FILE, session, rig.parent)), light_e_per_s
+    )
+
+
+def _live_order(rig: Path, session: Path, depths: list[float], known: Known, light_e: float | None) -> LiveOrder | None:
     noise, geometry, fx_px = known
     if not depths:
-        if any(value is not None for value in known):
-            raise WrongUsage("--noise, --geometry and --fx-px are of live planes; give --live-depth-mm, too")
+        if (geometry, fx_px) != (None, None):
+            raise WrongUsage("--geometry and --fx-px are of live planes; give --live-depth-mm, too")
+        if noise is not None and light_e is None:
+            raise WrongUsage("--noise is of live planes and of the light; give --live-depth-mm or --light-e, too")
         return None
     if len(depths) > MAX_DEPTHS:
         raise WrongUsage(f"{len(depths)} live planes are asked for, at most {MAX_DEPTHS} are computed; give fewer")

@@ -16,23 +16,101 @@ from faintfield.rig.settings import BoardSettings, CheckSettings, SettleSettings
 LIT_KINDS: frozenset[StepKind] = frozenset({"charuco", "bright", "flat"})
 DARK_KINDS: frozenset[StepKind] = frozenset({"noise_reference", "dark"})
 # A dark frame is divided into this many parts per axis to find stray light, and one of the scene to find its light.
-_PARTS = 8
+PARTS = 8
 # Boards are searched in an image reduced to this size in pixels: enough to see that they are in view, and fast.
 _BOARD_SEARCH_PX = 1600
 # Types of pixels that OpenCV knows.
 _OPENCV_TYPES = ("uint8", "uint16", "float32", "float64")
 
 
-class Findings(Struct, frozen=True):
-    """Measured values of a frame by name, and warnings, one line each, with the limit and a remedy.
+class Quantity(Struct, frozen=True):
+    """A measured quantity in words, with its unit; `digits` formats the value times `factor`.
 
-    The names are `median_dn`, `contrast_dn`, `saturated_share`, `sharpness`, `board_corners` and `leak_dn`; and for the
-    dark scene `snr`, `darkest_dn` and `stray_dn`, see `_scene_values`. Where the rig switches the lights there is
-    `mean_dn`, too.
+    `warning` tells of a value beyond its limit, and what to do; without it such a value is no fault by itself.
+    """
+
+    label: str
+    unit: str
+    digits: str
+    factor: float = 1.0
+    warning: str | None = None
+
+    def text(self, value: float) -> str:
+        """Return a value in words.
+
+        >>> QUANTITIES["saturated_share"].text(0.0123)
+        '1.23 %'
+        """
+        return f"{value * self.factor:{self.digits}} {self.unit}".strip()
+
+
+# The quantities that frames are checked for, by name, in the order in which they are shown.
+QUANTITIES: dict[str, Quantity] = {
+    "snr": Quantity("SNR of the brightest part", "", ".2f"),
+    "stray_dn": Quantity("stray light since the darkest frame", "DN", "+.1f"),
+    "leak_dn": Quantity(
+        "difference of parts, by stray light",
+        "DN",
+        ".1f",
+        warning="parts differ by {value:.1f} DN, limit {limit:g}; look for stray light",
+    ),
+    "board_corners": Quantity("board corners", "", "g"),
+    "saturated_share": Quantity(
+        "saturated pixels",
+        "%",
+        ".2f",
+        100.0,
+        "{value:.1%} of the pixels are saturated, limit {limit:.1%}; expose shorter",
+    ),
+    "contrast_dn": Quantity(
+        "contrast", "DN", ".0f", warning="contrast {value:.0f} DN, limit {limit:.0f}; add light or expose longer"
+    ),
+    "sharpness": Quantity(
+        "sharpness",
+        "",
+        ".3f",
+        warning="sharpness {value:.3f}, limit {limit:.3f}; look for vibration or changed focus",
+    ),
+    "median_dn": Quantity(
+        "median", "DN", ".0f", warning="median {value:.0f} DN, limit {limit:.0f}; light the diffuser or expose longer"
+    ),
+    "mean_dn": Quantity("mean", "DN", ".1f"),
+    "darkest_dn": Quantity("mean of the darkest parts", "DN", ".1f"),
+    "light_dn": Quantity("light of the brightest part", "DN", ".1f"),
+}
+# The quantities whose course over a step is shown, the main one first.
+MAIN_QUANTITIES: dict[StepKind, tuple[str, ...]] = {
+    "charuco": ("board_corners",),
+    "bright": ("sharpness",),
+    "dark_scene": ("snr", "stray_dn"),
+    "noise_reference": ("leak_dn",),
+    "dark": ("leak_dn",),
+    "flat": ("median_dn",),
+}
+
+
+class Limit(Struct, frozen=True):
+    """Smallest or largest value that a quantity may have."""
+
+    value: float
+    is_least: bool = False
+
+    def holds(self, value: float) -> bool:
+        """Return whether a value keeps the limit."""
+        return value >= self.value if self.is_least else value <= self.value
+
+
+class Findings(Struct, frozen=True):
+    """Measured values of a frame, and their limits, by the names of `QUANTITIES`.
+
+    `warnings` are one line each, with the limit and a remedy. `saturation_dn` is the value of a saturated pixel, None
+    if it is not known. The values of the dark scene are explained at `_scene_values`.
     """
 
     values: dict[str, float]
-    warnings: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
+    limits: dict[str, Limit] = {}
+    saturation_dn: float | None = None
 
 
 def check_frame(
@@ -52,9 +130,10 @@ def check_frame(
     # numpy sorts integers of at most 16 bits by radix, much faster than it finds their quantiles
     ordered_dn = np.sort(grey, axis=None, kind="stable" if grey.dtype.itemsize <= 2 else None)
     values: dict[str, float] = {"median_dn": _quantile(ordered_dn, 0.5)}
+    largest_dn = float(np.iinfo(pixels.dtype).max) if pixels.dtype.kind in "iu" else None
+    saturation_dn = limits.saturation_dn or largest_dn
     if kind in LIT_KINDS:
-        largest_dn = np.iinfo(pixels.dtype).max if pixels.dtype.kind in "iu" else np.inf
-        values["saturated_share"] = float(np.mean(pixels >= (limits.saturation_dn or largest_dn)))
+        values["saturated_share"] = 0.0 if saturation_dn is None else float(np.mean(pixels >= saturation_dn))
     if kind in ("charuco", "bright"):
         values["contrast_dn"] = _quantile(ordered_dn, 0.99) - _quantile(ordered_dn, 0.01)
         values["sharpness"] = _sharpness(grey)
@@ -64,7 +143,9 @@ def check_frame(
         values["leak_dn"] = _leak_dn(grey)
     if kind == "dark_scene":
         values |= _scene_values(grey, earlier)
-    return Findings({name: round(value, 5) for name, value in values.items()}, _warnings(kind, values, limits, earlier))
+    kept = _limits(kind, limits, earlier)
+    rounded = {name: round(value, 5) for name, value in values.items()}
+    return Findings(rounded, _warnings(values, kept), kept, saturation_dn)
 
 
 def mean_and_error(pixels: Pixels) -> tuple[float, float]:
@@ -96,7 +177,7 @@ def _leak_dn(grey: Pixels) -> float:
     """Return by how many DN the means of 8 x 8 parts of a frame differ, beyond the range expected from noise."""
     mean, sigma = _moments_of_parts(grey)
     # The expected range of 64 normal numbers is 4.7 standard deviations
-    noise = 4.7 * float(np.median(sigma)) / np.sqrt((grey.shape[0] // _PARTS) * (grey.shape[1] // _PARTS))
+    noise = 4.7 * float(np.median(sigma)) / np.sqrt((grey.shape[0] // PARTS) * (grey.shape[1] // PARTS))
     return max(0.0, float(np.ptp(mean) - noise))
 
 
@@ -105,25 +186,31 @@ def _scene_values(grey: Pixels, earlier: Sequence[Mapping[str, float]]) -> dict[
 
     `snr` is eq. (4) of the paper, (<g²> − <n²>) / <n²>: g are the pixels of the brightest part above the mean of the
     darkest ones, n those of the darkest ones. `stray_dn` is how far this mean, `darkest_dn`, lies above the lowest of
-    the step: light that came since.
+    the step: light that came since. `light_dn` is how far the brightest part lies above the darkest ones; these are
+    chosen by every other pair of rows and measured by the rest, as the choice favours noise.
     """
     mean, sigma = _moments_of_parts(grey)
     variance = sigma**2
     order = np.argsort(mean)
-    darkest, brightest = order[: _PARTS**2 // 8], order[-1]
+    darkest, brightest = order[: PARTS**2 // 8], order[-1]
     darkest_dn, noise_dn2 = float(mean[darkest].mean()), float(variance[darkest].mean())
     power_dn2 = float(variance[brightest] + (mean[brightest] - darkest_dn) ** 2)
     lowest_dn = min([darkest_dn, *(values["darkest_dn"] for values in earlier if "darkest_dn" in values)])
     values = {"darkest_dn": darkest_dn, "stray_dn": darkest_dn - lowest_dn}
+    if len(grey) >= 4 * PARTS:
+        chosen_rows = np.arange(len(grey)) // 2 % 2 == 0
+        chosen_dn, measured_dn = (_moments_of_parts(grey[rows])[0] for rows in (chosen_rows, ~chosen_rows))
+        order = np.argsort(chosen_dn)
+        values["light_dn"] = float(measured_dn[order[-1]] - measured_dn[order[: PARTS**2 // 8]].mean())
     return {"snr": power_dn2 / noise_dn2 - 1, **values} if noise_dn2 else values
 
 
 def _moments_of_parts(grey: Pixels) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return mean and standard deviation of the 8 x 8 parts of a frame, row by row."""
     native = np.asarray(grey, grey.dtype.newbyteorder("=") if grey.dtype.name in _OPENCV_TYPES else float)
-    height, width = (length // _PARTS for length in grey.shape)
+    height, width = (length // PARTS for length in grey.shape)
     # One part at a time, without a copy of the frame as floats: that takes a quarter of numpy's time
-    corners = [(row * height, column * width) for row in range(_PARTS) for column in range(_PARTS)]
+    corners = [(row * height, column * width) for row in range(PARTS) for column in range(PARTS)]
     moments = [cv2.meanStdDev(native[row : row + height, column : column + width]) for row, column in corners]
     mean, sigma = np.array(moments, float).reshape(-1, 2).T
     return mean, sigma
@@ -140,30 +227,29 @@ def _count_board_corners(grey: Pixels, boards: Sequence[BoardSettings], white_dn
     return count
 
 
-def _warnings(
-    kind: StepKind, values: dict[str, float], limits: CheckSettings, earlier: Sequence[Mapping[str, float]]
-) -> tuple[str, ...]:
-    warnings = []
-    share = values.get("saturated_share", 0.0)
-    if share > limits.saturated_share:
-        warnings.append(f"{share:.1%} of the pixels are saturated, limit {limits.saturated_share:.1%}; expose shorter")
-    if values.get("contrast_dn", np.inf) < limits.least_contrast_dn:
-        warnings.append(
-            f"contrast {values['contrast_dn']:.0f} DN, limit {limits.least_contrast_dn:.0f}; add light or expose longer"
-        )
-    if kind == "flat" and values["median_dn"] < limits.least_flat_dn:
-        warnings.append(
-            f"median {values['median_dn']:.0f} DN, limit {limits.least_flat_dn:.0f}; "
-            "light the diffuser or expose longer"
-        )
-    earlier_sharpness = [of_frame["sharpness"] for of_frame in earlier if "sharpness" in of_frame]
-    if earlier_sharpness and values.get("sharpness", np.inf) < (
-        limit := limits.sharpness_share * float(np.median(earlier_sharpness))
-    ):
-        warnings.append(f"sharpness {values['sharpness']:.3f}, limit {limit:.3f}; look for vibration or changed focus")
-    if values.get("leak_dn", 0.0) > limits.leak_dn:
-        warnings.append(f"parts differ by {values['leak_dn']:.1f} DN, limit {limits.leak_dn:g}; look for stray light")
-    return tuple(warnings)
+def _limits(kind: StepKind, settings: CheckSettings, earlier: Sequence[Mapping[str, float]]) -> dict[str, Limit]:
+    limits = {}
+    if kind in LIT_KINDS:
+        limits["saturated_share"] = Limit(settings.saturated_share)
+    if kind in ("charuco", "bright"):
+        limits["contrast_dn"] = Limit(settings.least_contrast_dn, is_least=True)
+        if sharpness := [of_frame["sharpness"] for of_frame in earlier if "sharpness" in of_frame]:
+            limits["sharpness"] = Limit(settings.sharpness_share * float(np.median(sharpness)), is_least=True)
+    if kind == "charuco":
+        limits["board_corners"] = Limit(settings.board_corners, is_least=True)
+    if kind == "flat":
+        limits["median_dn"] = Limit(settings.least_flat_dn, is_least=True)
+    if kind in DARK_KINDS:
+        limits["leak_dn"] = Limit(settings.leak_dn)
+    return limits
+
+
+def _warnings(values: Mapping[str, float], limits: Mapping[str, Limit]) -> tuple[str, ...]:
+    return tuple(
+        quantity.warning.format(value=values[name], limit=limits[name].value)
+        for name, quantity in QUANTITIES.items()
+        if quantity.warning is not None and name in values and name in limits and not limits[name].holds(values[name])
+    )
 
 
 # If this many frames at the beginning of a sweep see no board, that is not due to the corner where the grid begins.

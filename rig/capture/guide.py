@@ -1,13 +1,14 @@
 """Guide the operator through a capture: what to do before each step, questions, answers, warnings, remaining time."""
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from statistics import median
 from typing import TYPE_CHECKING, Literal, NoReturn, Protocol
 
 from msgspec import Struct
 
 from faintfield.rig.cameras.protocol import Pixels
+from faintfield.rig.capture.checks import Findings
 from faintfield.rig.clock import Clock
 from faintfield.rig.errors import CaptureStopped
 from faintfield.rig.plan import CaptureStep, PlannedFrame, StepKind
@@ -19,7 +20,7 @@ from faintfield.rig.stages.protocol import Point, StageSettings
 if TYPE_CHECKING:  # views of a capture need no drivers
     from faintfield.rig.devices import Rig
 
-type Answer = Literal["go", "again", "keep", "retake", "skip", "stop"]
+type Answer = Literal["go", "test", "again", "keep", "retake", "skip", "stop"]
 type OperatorRequest = Literal["pause", "skip", "retake", "stop"]
 
 _TO_DO: dict[StepKind, tuple[str, ...]] = {
@@ -92,7 +93,8 @@ class Status(Struct, frozen=True):
     """State of the capture, whose present step is the one of number `step`, from 1.
 
     `done` of `total` frames are taken; the rest takes `to_go_s` without prompts. `node` is where the stage is or goes,
-    and `grid` has the share of this step's frames that is done, per row and column; −1 where the step has none.
+    and `grid` has the share of this step's frames that is done, per row and column; −1 where the step has none. `stage`
+    and `camera` are their states in words; the missing frames of each step take `step_to_go_s`.
     """
 
     doing: str
@@ -105,6 +107,24 @@ class Status(Struct, frozen=True):
     node: tuple[int, int] | None
     grid: tuple[tuple[float, ...], ...]
     warnings: tuple[str, ...]
+    stage: str = ""
+    camera: str = ""
+    step_to_go_s: tuple[float, ...] = ()
+
+
+class ShownFrame(Struct, frozen=True, eq=False):
+    """A frame just taken, what was found in it, and the temperature of the sensor if the camera reports it.
+
+    Unless `recorded` it is a test frame, taken as `frame` will be. `scale_dn` is black and white of its picture if they
+    stay the same in its step, else None. Each is equal to itself alone.
+    """
+
+    frame: PlannedFrame
+    pixels: Pixels
+    findings: Findings
+    temperature_c: float | None = None
+    recorded: bool = True
+    scale_dn: tuple[float, float] | None = None
 
 
 class OperatorInterface(Protocol):
@@ -119,7 +139,7 @@ class OperatorInterface(Protocol):
     def show_status(self, status: Status) -> None:
         """Show the state of the capture."""
 
-    def show_frame(self, frame: PlannedFrame, pixels: Pixels, values: Mapping[str, float]) -> None:
+    def show_frame(self, shown: ShownFrame) -> None:
         """Show the frame just taken."""
 
 
@@ -133,27 +153,35 @@ def needs_hand(steps: Sequence[CaptureStep], number: int) -> bool:
     return step.lights is None or step.kind in by_hand or (number > 0 and steps[number - 1].kind in by_hand)
 
 
-def step_prompt(frame: PlannedFrame, steps: int, frames: int, duration_s: float, *, rig_lit: bool = False) -> Prompt:
-    """Return the prompt before a step, whose first of `frames` frames is `frame`; they take `duration_s`.
-
-    With `rig_lit` the rig switches the lights, so that the prompt says nothing about them.
-    """
-    to_do = _TO_DO_AGAIN.get(frame.kind, _TO_DO[frame.kind]) if frame.sweep else _TO_DO[frame.kind]
-    if rig_lit and not (frame.sweep and frame.kind == "charuco"):
-        to_do = _TO_DO_BUT_LIGHTS.get(frame.kind, (_OBJECTS,))
+def step_prompt(steps: Sequence[CaptureStep], frame: PlannedFrame, frames: int, duration_s: float) -> Prompt:
+    """Return the prompt before a step, whose first of `frames` frames is `frame`; they take `duration_s`."""
+    test = "A test frame, at the first node, shows whether all is in view, sharp and well exposed; it is not recorded."
     motion = f"Then {frames} frames follow, {format_duration(duration_s)}. The stage moves by itself: keep clear of it."
     return Prompt(
         key="step",
-        title=_step_title(frame, steps),
-        lines=(*to_do, motion, _CHECK[frame.kind]),
-        answers=("go", "skip", "stop"),
+        title=_step_title(frame, len(steps)),
+        lines=(*preparations(steps, frame), test, motion, _CHECK[frame.kind]),
+        answers=("go", "test", "skip", "stop"),
         unattended="go",
     )
 
 
+def preparations(steps: Sequence[CaptureStep], frame: PlannedFrame) -> tuple[str, ...]:
+    """Return what to do by hand before the step of a frame; of lights only where the rig does not switch them."""
+    if not needs_hand(steps, frame.step):
+        return ()
+    if steps[frame.step].lights is not None and not (frame.sweep and frame.kind == "charuco"):
+        return _TO_DO_BUT_LIGHTS.get(frame.kind, (_OBJECTS,))
+    return _TO_DO_AGAIN.get(frame.kind, _TO_DO[frame.kind]) if frame.sweep else _TO_DO[frame.kind]
+
+
+def step_name(frame: PlannedFrame) -> str:
+    """Return the name of the step of a frame, such as `Board sweep 2`."""
+    return TITLES[frame.kind] + (f" {frame.sweep + 1}" if frame.kind in ("charuco", "flat") else "")
+
+
 def _step_title(frame: PlannedFrame, steps: int) -> str:
-    sweep = f" {frame.sweep + 1}" if frame.kind in ("charuco", "flat") else ""
-    return f"Step {frame.step + 1} of {steps}: {TITLES[frame.kind]}{sweep}"
+    return f"Step {frame.step + 1} of {steps}: {step_name(frame)}"
 
 
 def format_duration(duration_s: float) -> str:
@@ -218,20 +246,24 @@ class Pace:
 
     def remaining_s(self, frames: list[PlannedFrame], drift_checks: int) -> float:
         """Return how long `frames`, in this order, and a number of drift checks will take, without prompts."""
+        return sum(self.step_durations_s(frames).values()) + drift_checks * self.check_s
+
+    def step_durations_s(self, frames: list[PlannedFrame]) -> dict[int, float]:
+        """Return how long `frames`, in this order, will take in each step, without prompts and drift checks."""
         stop_s = median(self._stop_s or [_STOP_S])
         first_s = median(self._frame_s[False] or [self._guess_s])
         again_s = median(self._frame_s[True] or [first_s])
-        total_s = drift_checks * self.check_s
+        steps_s: defaultdict[int, float] = defaultdict(float)
         here, last_step = self.here, None
         for frame in frames:
             target = frame.stop.target
             arrives = target != here or frame.step != last_step
             if arrives:
-                total_s += stop_s + self.rest_s[frame.kind]
-                total_s += self._motion_s(here, target) if here is not None else 0.0
-            total_s += frame.exposure_s + (first_s if arrives else again_s)
+                steps_s[frame.step] += stop_s + self.rest_s[frame.kind]
+                steps_s[frame.step] += self._motion_s(here, target) if here is not None else 0.0
+            steps_s[frame.step] += frame.exposure_s + (first_s if arrives else again_s)
             here, last_step = target, frame.step
-        return total_s
+        return steps_s
 
     def _motion_s(self, start: Point, target: Point) -> float:
         stage = self._stage
@@ -247,7 +279,8 @@ MAX_UNATTENDED_TRIES = 3
 class Dialogue:
     """The capture's side of the conversation with the operator, which the journal of the session keeps.
 
-    `pace` estimates the remaining time; `warnings` are the latest ones, shown with the status.
+    `pace` estimates the remaining time. Shown with the status are the latest `warnings`, and the states of `stage` and
+    `camera` in words.
     """
 
     def __init__(self, session: Session, rig: "Rig", operator: OperatorInterface) -> None:
@@ -256,6 +289,7 @@ class Dialogue:
         self.pace = Pace(rig.stage, rig.clock, session.plan.settle_s, session.plan.readout_s)
         self.operator = operator
         self.warnings: tuple[str, ...] = ()
+        self.stage = self.camera = "not connected"
 
     def ask(self, prompt: Prompt) -> Answer:
         """Ask the operator, and record question and answer."""
@@ -285,7 +319,10 @@ class Dialogue:
         """Show the state of the capture, which is `doing` something for `frame`, while another one is recorded."""
         session = self.session
         missing, steps = [left for left in session.missing() if left != recording], session.plan.steps
-        to_check = {frame.step for frame in missing if steps[frame.step].at == "grid"}
+        steps_s = self.pace.step_durations_s(missing)
+        if session.frozen.rig.drift.check:
+            for step in steps_s:
+                steps_s[step] += self.pace.check_s if steps[step].at == "grid" else 0.0
         status = Status(
             doing=doing,
             step=frame.step + 1,
@@ -293,10 +330,13 @@ class Dialogue:
             title=_step_title(frame, len(steps)),
             done=len(session.valid()),
             total=len(session.frames),
-            to_go_s=self.pace.remaining_s(missing, len(to_check) if session.frozen.rig.drift.check else 0),
+            to_go_s=sum(steps_s.values()),
             node=frame.stop.node,
             grid=self._shares_done(frame.step),
             warnings=self.warnings,
+            stage=self.stage,
+            camera=self.camera,
+            step_to_go_s=tuple(steps_s.get(step, 0.0) for step in range(len(steps))),
         )
         self.operator.show_status(status)
 

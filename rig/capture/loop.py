@@ -95,9 +95,14 @@ class Capture:
             "connected", camera=msgspec.to_builtins(report), stage=msgspec.to_builtins(identity, str_keys=True)
         )
         check_plan(session.plan, rig.stage, report)
+        self._dialogue.stage, self._dialogue.camera = "connected, its position is not known", "ready"
+        self._dialogue.show_status(session.missing()[0], "waiting for your answer")
         if not self._may_home("The stage moves to its switches, to find its position.", "Keep clear of it."):
             self._dialogue.stop()
+        self._dialogue.stage = "homes"
+        self._dialogue.show_status(session.missing()[0], "homing")
         self._begin_drift_checks()
+        self._dialogue.stage = "homed"
 
     def _begin_drift_checks(self) -> None:
         """Home, and measure what drift is judged by; again while delayed answers prevent it, up to a bound."""
@@ -117,12 +122,15 @@ class Capture:
         if needs_hand(session.plan.steps, first.step):
             self._dialogue.show_status(first, "waiting for your answer")
             duration_s = self._dialogue.pace.remaining_s(frames, 0)
-            lit = session.plan.steps[first.step].lights is not None
-            prompt = step_prompt(first, len(session.plan.steps), len(frames), duration_s, rig_lit=lit)
-            if self._dialogue.ask_or_stop(prompt) == "skip":
+            prompt = step_prompt(session.plan.steps, first, len(frames), duration_s)
+            while (answer := self._dialogue.ask_or_stop(prompt)) == "test":
+                self._rig.arrange(first.kind, first.sweep)
+                self._take_test(first)
+            if answer == "skip":
                 for frame in frames:
                     session.skip(frame)
                 return
+            self._dialogue.warnings = ()  # those of test frames
         self._rig.arrange(first.kind, first.sweep)
         for frame, following in zip(frames, [*frames[1:], None], strict=True):
             if frame not in session.skipped():
@@ -169,6 +177,14 @@ class Capture:
             else:
                 return
 
+    def _take_test(self, frame: PlannedFrame) -> None:
+        self._failures = 0
+        try:
+            self._taker.take_test(frame)
+        except (StageError, NotHomed, CameraError, LightError) as failure:
+            self._handle_failure(frame, failure)
+        self._dialogue.show_status(frame, "waiting for your answer")
+
     def _handle_request(self, frame: PlannedFrame) -> None:
         request = self._dialogue.operator.take_request()
         if request is None:
@@ -196,6 +212,8 @@ class Capture:
         self._dialogue.pace.here = None
         self._record_failure(f"{device}_failed", frame, failure)
         self._dialogue.warn(f"{frame.name}: {failure}")
+        setattr(self._dialogue, device, "failed")
+        self._dialogue.show_status(frame, f"the {device} failed")
         unattended: Answer = "again" if self._failures < MAX_UNATTENDED_TRIES else "stop"
         answers: tuple[Answer, ...] = ("again", "skip", "stop")
         answer = self._dialogue.ask(Prompt(device, f"The {device} failed", (str(failure),), answers, unattended))

@@ -8,11 +8,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import msgspec
+from msgspec.structs import replace
 
 from faintfield.rig.cameras.protocol import Decode, Exposure, Pixels, UntriggeredCamera
 from faintfield.rig.cameras.settings import CoolingSettings
 from faintfield.rig.capture.checks import LIT_KINDS, Findings, Settling, board_warnings, check_frame, measure_settling
-from faintfield.rig.capture.guide import MAX_UNATTENDED_TRIES, Answer, Dialogue, Prompt
+from faintfield.rig.capture.guide import MAX_UNATTENDED_TRIES, Answer, Dialogue, Prompt, ShownFrame
 from faintfield.rig.capture.lighting import Lighting
 from faintfield.rig.capture.survey import read_temperature
 from faintfield.rig.errors import (
@@ -71,6 +72,10 @@ class DriftChecks:
             return
         self.nodes = 0
         self._pace.here = None
+        self._dialogue.stage = "homes, to check for drift"
+        last = self.watch.unchecked[-1]
+        if isinstance(last, CommittedFrame):
+            self._dialogue.show_status(self._session.frames[last.frame], "checking that the stage kept its position")
         try:
             drift = self.watch.check()
         except PositionDrifted as failure:
@@ -80,6 +85,7 @@ class DriftChecks:
             self.begin()
         else:
             self._session.journal.event("drift_check", away_mm=drift.away_mm)
+            self._dialogue.stage = "homed, its position checked"
 
     def ask_to_retake(self, failure: PositionDrifted | DriftUnknown, title: str, failures: int, reason: str) -> None:
         """Record which frames are suspect, and ask whether to take them again, or to stop (`CaptureStopped`)."""
@@ -139,10 +145,12 @@ class FrameTaker:
         try:
             self._lighting.prepare(frame, self._look)
             if self._pace.here != frame.stop.target:
+                self._dialogue.stage = _towards(frame)
                 self._dialogue.show_status(frame, "moving")
             self._go_to(frame)
             if self._arrived or self.last is None or self.last.step != frame.step:
                 self._await_silence(frame)
+            self._dialogue.camera = f"exposes for {frame.exposure_s:g} s"
             self._dialogue.show_status(frame, "exposing")
             self._expose(frame, following)
         except CameraError:
@@ -157,6 +165,30 @@ class FrameTaker:
         if isinstance(self._rig.camera, UntriggeredCamera):
             self._dialogue.show_status(frame, "waiting for silence of the camera, trigger nothing yet")
             self._rig.camera.await_silence(frame.exposure_s)
+
+    def take_test(self, frame: PlannedFrame) -> None:
+        """Expose as for `frame` and show the picture; nothing of it is recorded.
+
+        Raises `StageError`, `NotHomed`, `CameraError` or `LightError`.
+        """
+        self._lighting.prepare(frame, self._look)
+        self._dialogue.stage = f"{_towards(frame)}, for a test frame"
+        self._dialogue.show_status(frame, "taking a test frame")
+        self._go_to(frame, test=True)
+        self._dialogue.camera = f"exposes a test frame for {frame.exposure_s:g} s"
+        self._dialogue.show_status(frame, "taking a test frame")
+        exposure, pixels = self._expose_unkept(frame.exposure_s)
+        record = FrameRecord(frame.stop.target, frame.exposure_s, dict(exposure.metadata))
+        self._note_temperature(record.temperature_c)
+        findings = self._check(frame, pixels)
+        self._dialogue.warnings = tuple(f"test frame: {warning}" for warning in findings.warnings)
+        if pixels is not None:
+            shown = ShownFrame(frame, pixels, findings, record.temperature_c, recorded=False)
+            self._dialogue.operator.show_frame(shown)
+
+    def _note_temperature(self, temperature_c: float | None) -> None:
+        words = "" if temperature_c is None else f", sensor at {temperature_c:.1f} °C"
+        self._dialogue.camera = f"ready{words}"
 
     def _wait_for_temperature(self, frame: PlannedFrame, settings: CoolingSettings, target_c: float) -> None:
         """Wait until the sensor is at its temperature: dark current doubles over a few kelvins."""
@@ -192,7 +224,7 @@ class FrameTaker:
             "temperature", frame=frame.number, temperature_c=temperature_c, waited_s=round(now_s - begun_s, 3)
         )
 
-    def _go_to(self, frame: PlannedFrame) -> None:
+    def _go_to(self, frame: PlannedFrame, *, test: bool = False) -> None:
         target = frame.stop.target
         failure, self._failure_ahead = self._failure_ahead, None
         if failure is not None:
@@ -201,8 +233,9 @@ class FrameTaker:
             return
         self._pace.depart()
         self._rig.stage.move_to(*target)
+        self._dialogue.stage = _at(target)
         self._arrived = True
-        measures = self._measures and frame.kind in LIT_KINDS
+        measures = self._measures and frame.kind in LIT_KINDS and not test
         if measures:
             self._measure_settling(frame)
         self._rig.clock.sleep_s(self._pace.rest_s[frame.kind])
@@ -224,7 +257,7 @@ class FrameTaker:
         with ThreadPoolExecutor(1, "record of a frame") as recorder:
             recording = recorder.submit(self._record, frame, intent, position.point, exposure)
             begun_s += self._go_ahead(frame, following)
-            committed, pixels = recording.result()
+            committed, pixels, findings = recording.result()
         record = committed.record
         self._drift.add(committed)
         self.last = frame
@@ -239,8 +272,9 @@ class FrameTaker:
             for warning in board_warnings(frame, session.frames, corners, self._settings.checks.board_corners):
                 self._dialogue.warn(warning)
         self._pace.finish_frame(begun_s, frame.exposure_s)
+        self._note_temperature(record.temperature_c)
         if pixels is not None:
-            self._dialogue.operator.show_frame(frame, pixels, record.checks)
+            self._dialogue.operator.show_frame(ShownFrame(frame, pixels, findings, record.temperature_c))
 
     def _go_ahead(self, frame: PlannedFrame, following: PlannedFrame | None) -> float:
         """Move to the node of the following frame, unless there is something to do before; return the time taken."""
@@ -249,6 +283,7 @@ class FrameTaker:
         if self._measures and following.kind in LIT_KINDS:
             return 0.0
         begun_s = self._rig.clock.now_s()
+        self._dialogue.stage, self._dialogue.camera = _towards(following), "ready"
         self._dialogue.show_status(following, "moving", recording=frame)
         try:
             self._go_to(following)
@@ -258,7 +293,7 @@ class FrameTaker:
 
     def _record(
         self, frame: PlannedFrame, intent: int, position: Point, exposure: Exposure
-    ) -> tuple[CommittedFrame, Pixels | None]:
+    ) -> tuple[CommittedFrame, Pixels | None, Findings]:
         """Write, check and commit a frame; set one aside that is none of this session, and raise `CameraError`."""
         session = self._session
         written = session.write(frame, intent, exposure)
@@ -273,7 +308,7 @@ class FrameTaker:
             *(position, frame.exposure_s, dict(exposure.metadata), findings.values, findings.warnings),
             lights=None if lights is None else tuple(sorted(lights)),
         )
-        return session.commit(frame, written, record), pixels
+        return session.commit(frame, written, record), pixels, findings
 
     def _decode_frame(self, frame: PlannedFrame, path: Path, exposure: Exposure) -> Pixels | None:
         """Return the pixels of a frame, None if it cannot be decoded here; its layout must be that of the session.
@@ -318,7 +353,7 @@ class FrameTaker:
         ]
         light = self._lighting.judge(frame, pixels, earlier)
         findings = check_frame(pixels, frame.kind, self._settings.checks, self._settings.board, earlier)
-        return Findings(findings.values | light.values, findings.warnings + light.warnings)
+        return replace(findings, values=findings.values | light.values, warnings=findings.warnings + light.warnings)
 
     def _measure_settling(self, frame: PlannedFrame) -> None:
         settings = self._settings.settle
@@ -343,21 +378,32 @@ class FrameTaker:
             self._pace.rest_s[kind] = settings.longest_s if rest_s is None else rest_s
 
     def _take_unkept(self, exposure_s: float) -> Pixels:
-        pixels = self._look(exposure_s)
+        _, pixels = self._expose_unkept(exposure_s)
         if pixels is None:
             raise CameraError("frames cannot be decoded, so settling is not measured; set settle.measure = false")
         return pixels
 
     def _look(self, exposure_s: float) -> Pixels | None:
         """Return a frame that is not kept, None if it cannot be decoded here."""
+        return self._expose_unkept(exposure_s)[1]
+
+    def _expose_unkept(self, exposure_s: float) -> tuple[Exposure, Pixels | None]:
+        """Take a frame that is not kept; its pixels are None if it cannot be decoded here."""
         exposure = self._rig.camera.expose(exposure_s, next(self._unkept_numbers))
         if exposure.content is None:
-            assert exposure.pixels is not None
-            return exposure.pixels
+            return exposure, exposure.pixels
         with TemporaryDirectory(prefix="faintfield-") as folder:
             path = Path(folder) / f"frame{exposure.suffix}"
             path.write_bytes(exposure.content)
-            return self._decode(path)
+            return exposure, self._decode(path)
+
+
+def _towards(frame: PlannedFrame) -> str:
+    return "moves to node {}, {}".format(*frame.stop.node)
+
+
+def _at(target: Point) -> str:
+    return f"at rest at {target.x_mm:.1f}, {target.y_mm:.1f} mm"
 
 
 def _layout(pixels: Pixels | None) -> str | None:

@@ -23,7 +23,8 @@ from faintfield.pipelines.live.board_progress import (
 from faintfield.pipelines.live.boards_client import BoardsClient, followed_boards
 from faintfield.pipelines.live.capture_page import serve_page
 from faintfield.pipelines.live.panel import CapturePanel
-from faintfield.rig.capture.guide import Status
+from faintfield.rig.capture.checks import Findings
+from faintfield.rig.capture.guide import ShownFrame, Status
 from faintfield.rig.plan import PlannedFrame, Stop
 from faintfield.rig.session.homings import read_homing_groups
 from faintfield.rig.session.verify import verify
@@ -101,7 +102,7 @@ def test_page_draws_corners_over_frame(browser: Tab) -> None:
     panel = CapturePanel(unattended=True)
     panel.show_status(Status("exposing", 1, 1, "Board sweep 1", 1, 9, 1.0, (0, 0), ((0.5,),), ()))
     frame = PlannedFrame(0, 0, "charuco", 0, Stop((0, 0), Point(0.0, 0.0)), 0.1, 0)
-    panel.show_frame(frame, np.full((120, 160), 100, np.uint16), {})
+    panel.show_frame(ShownFrame(frame, np.full((120, 160), 100, np.uint16), Findings({})))
     cells = ((0,) * 8,) * 5 + ((0,) * 7 + (9,),)
     progress = BoardProgress(
         "up to date",
@@ -132,6 +133,7 @@ def test_page_draws_corners_over_frame(browser: Tab) -> None:
         filled = "[...document.querySelectorAll('#cells rect')].map(it => it.getAttribute('fill-opacity') !== '0')"
         assert browser.evaluate(f"{filled}.indexOf(true)") == 47
         # Corners of another frame than the one that is shown are not drawn over it
-        panel.show_frame(PlannedFrame(1, 0, "charuco", 0, frame.stop, 0.1, 0), np.zeros((120, 160), np.uint16), {})
+        second = PlannedFrame(1, 0, "charuco", 0, frame.stop, 0.1, 0)
+        panel.show_frame(ShownFrame(second, np.zeros((120, 160), np.uint16), Findings({})))
         browser.wait_until("document.getElementById('corners').hasAttribute('hidden')")
     assert browser.complaints == []

@@ -55,8 +55,15 @@ def test_keys_lead_through_capture(tmp_path: Path) -> None:
     rig, session = write_small_rig(tmp_path / "rig.toml", 2, 2), tmp_path / "session"
     program = "from faintfield.pipelines.cli import main; main()"
     terminal = Terminal(sys.executable, "-c", program, "capture", str(rig), str(session))
+    terminal.wait_for("8  Dark-scene set: 4 nodes, 0.1 s, about ")
     terminal.wait_for("Homing")
     terminal.press("g")
+    terminal.wait_for("Step 1 of 11: Board sweep 1")
+    terminal.wait_for("[t] test frame")
+    terminal.press("t")
+    terminal.wait_for("test frame, not recorded")
+    terminal.wait_for("saturated pixels 0.00 % (at most 1.00 %: pass)")
+    terminal.wait_for("stage: at rest at ")
     terminal.wait_for("Step 1 of 11: Board sweep 1")
     terminal.wait_for("(Enter: go on)")
     for key in ("\x1bOS", "\x1b[A", "ä", "x"):  # F4, an arrow and letters: no keys of ours

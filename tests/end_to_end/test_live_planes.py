@@ -180,7 +180,10 @@ def check_controls(browser: Tab) -> None:
     browser.wait_until("document.querySelector('label[for=depth]').textContent === '400 mm'")
     browser.wait_until("document.getElementById('left-picture').src.includes('plane_000_view')")
     assert not np.array_equal(shown_levels(browser, "left"), at_500_mm)
-    assert "0%" in browser.evaluate("document.getElementById('right-picture').style.clipPath")  # all of it is shown
+    # The best picture stands in full beside the wipe
+    browser.wait_until("document.getElementById('best-words').textContent.startsWith('400 mm: PMLEM so far, 16 nodes')")
+    assert browser.evaluate("document.getElementById('best-picture').src.includes('plane_000_pmlem')")
+    assert browser.box("#best-picture")[0] < browser.box("#wipe-box")[0]
     # The right picture begins where the line of the wipe stands
     browser.set_slider("wipe", 30)
     assert "30%" in browser.evaluate("document.getElementById('right-picture').style.clipPath")

@@ -10,14 +10,14 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from faintfield.rig.cameras.protocol import Decode, Pixels
+from faintfield.rig.cameras.protocol import Decode
 from faintfield.rig.cameras.settings import SimulatedSettings
-from faintfield.rig.capture.guide import Answer, OperatorInterface, OperatorRequest, Prompt, Status
+from faintfield.rig.capture.guide import Answer, OperatorInterface, OperatorRequest, Prompt, ShownFrame, Status
 from faintfield.rig.capture.loop import Capture
 from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import RigError
-from faintfield.rig.plan import Grid, PlannedFrame
+from faintfield.rig.plan import Grid
 from faintfield.rig.session.journal import Journal, JournalEvent
 from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.session import FrozenPlan
@@ -53,6 +53,7 @@ class Operator:
         self.requests = dict(requests or {})
         self.prompts: list[Prompt] = []
         self.statuses: list[Status] = []
+        self.shown: list[ShownFrame] = []
         self.frames: list[int] = []
         self.on_status: Callable[[Status], object] = lambda status: None
 
@@ -70,8 +71,10 @@ class Operator:
         self.statuses.append(status)
         self.on_status(status)
 
-    def show_frame(self, frame: PlannedFrame, pixels: Pixels, values: Mapping[str, float]) -> None:
-        self.frames.append(frame.number)
+    def show_frame(self, shown: ShownFrame) -> None:
+        self.shown.append(shown)
+        if shown.recorded:
+            self.frames.append(shown.frame.number)
 
 
 def frozen_plan(settings: RigSettings) -> FrozenPlan:

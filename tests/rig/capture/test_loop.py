@@ -8,14 +8,14 @@ import pytest
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from faintfield.rig.cameras.protocol import CameraReport
+from faintfield.rig.cameras.protocol import CameraReport, Exposure
 from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.capture.checks import Settling
 from faintfield.rig.capture.guide import Answer, OperatorRequest, Pace
 from faintfield.rig.capture.loop import Capture
 from faintfield.rig.capture.survey import check_plan, survey
 from faintfield.rig.devices import open_rig
-from faintfield.rig.errors import CaptureStopped, OutsideTravel, PlanRefused
+from faintfield.rig.errors import CameraError, CaptureStopped, OutsideTravel, PlanRefused
 from faintfield.rig.plan import Grid, PlannedFrame, Stop
 from faintfield.rig.session.journal import Journal
 from faintfield.rig.session.resume import open_session
@@ -24,7 +24,7 @@ from faintfield.rig.session.verify import verify
 from faintfield.rig.settings import SettleSettings, StepSettings
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
-from faintfield.rig.simulation.lab import SimulatedLab
+from faintfield.rig.simulation.lab import SimulatedCamera, SimulatedLab
 from faintfield.rig.stages.protocol import Point
 from tests.faults.capturing import BOARD, FRAMES, SMALL_RIG, Operator, assert_complete, capture, events, frozen_plan
 from tests.rig.stages.benches import homed
@@ -242,3 +242,47 @@ def test_remaining_time_sums_motions_stops_exposures_checks() -> None:
     assert pace.remaining_s([frame(3, 1, b, 7.0)], 0) == pytest.approx(4.0 + 0.9 + 7.0)
     again = [frame(3, 1, b, 7.0), frame(4, 1, b, 7.0)]
     assert pace.remaining_s(again, 0) == pytest.approx(4.0 + 0.9 + 7.0 + 0.5 + 7.0)
+
+
+def test_test_frame_is_shown_and_not_recorded(tmp_path: Path) -> None:
+    folders = tmp_path / "without", tmp_path / "with"
+    operator = Operator({"step": ["test", "test", "go", "go", "test", "go"]})
+    assert capture(folders[0]) is None
+    assert capture(folders[1], operator) is None
+    tests = [shown for shown in operator.shown if not shown.recorded]
+    assert [(shown.frame.kind, shown.frame.exposure_s) for shown in tests] == [("bright", 0.1)] * 2 + [("dark", 0.1)]
+    assert all(shown.findings.values["median_dn"] > 0 for shown in tests)
+    assert operator.frames == list(range(FRAMES))
+    assert_complete(folders[1])
+    without, with_tests = (sorted(path.name for path in (folder / "frames").iterdir()) for folder in folders)
+    assert with_tests == without
+
+
+def test_failed_test_frame_leads_back_to_prompt(folder: Path) -> None:
+    operator = Operator({"step": ["test"]})
+    expose = SimulatedCamera.expose
+
+    def expose_frames_only(camera: SimulatedCamera, exposure_s: float, number: int) -> Exposure:
+        if number >= 10**9:
+            raise CameraError("no picture; look")
+        return expose(camera, exposure_s, number)
+
+    with mock.patch.object(SimulatedCamera, "expose", expose_frames_only):
+        assert capture(folder, operator) is None
+    assert [prompt.key for prompt in operator.prompts] == ["home", "step", "camera", "step", "step", "step"]
+    assert "failed" in {status.camera for status in operator.statuses}
+    assert_complete(folder)
+
+
+def test_status_states_stage_camera_and_steps(folder: Path) -> None:
+    operator = Operator()
+    assert capture(folder, operator) is None
+    states = [(status.doing, status.stage, status.camera) for status in operator.statuses]
+    assert states[0] == ("waiting for your answer", "connected, its position is not known", "ready")
+    assert states[1] == ("homing", "homes", "ready")
+    assert ("exposing", "at rest at -300.0, -350.0 mm", "exposes for 0.1 s") in states
+    assert ("moving", "moves to node 0, 1", "ready, sensor at -20.0 °C") in states
+    first, last = operator.statuses[0], operator.statuses[-1]
+    assert sum(first.step_to_go_s) == pytest.approx(first.to_go_s)
+    assert min(first.step_to_go_s) > 0
+    assert last.step_to_go_s == (0.0, 0.0, 0.0)
