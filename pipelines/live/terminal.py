@@ -21,9 +21,9 @@ from rich.text import Text
 from faintfield.pipelines.console import console, inform, visible
 from faintfield.pipelines.live.light_meter import LightMeter, LightReading
 from faintfield.pipelines.live.panel import CapturePanel, SessionFrames
-from faintfield.pipelines.live.view import KEYS, LABELS, check_rows, scale_words, step_rows
+from faintfield.pipelines.live.view import KEYS, button_label, check_rows, scale_words, step_rows
 from faintfield.rig.cameras.protocol import Pixels
-from faintfield.rig.capture.guide import Answer, OperatorRequest, ShownFrame, Status, format_duration
+from faintfield.rig.capture.guide import Answer, OperatorRequest, Prompt, ShownFrame, Status, format_duration
 
 # Widths of the frame's picture and histogram in characters.
 _PICTURE_COLUMNS, _MIN_PICTURE_COLUMNS, _HISTOGRAM_COLUMNS = 48, 8, 24
@@ -65,7 +65,7 @@ class TerminalView:
                     inform(line)
             self._prompt_number = asked.number
             prompt = asked.prompt
-            keys = f"{_key_line(prompt.answers, '   ')}   (Enter: {LABELS[prompt.answers[0]]})"
+            keys = f"{_key_line(prompt.answers, '   ', prompt)}   (Enter: {button_label(prompt.answers[0], prompt)})"
             for line in ("", prompt.title, *(f"  {line}" for line in (*prompt.lines, keys))):
                 inform(line)
         if status is not None:
@@ -113,8 +113,8 @@ def describe_light(reading: LightReading) -> str:
     return f"{', '.join(parts)}; {reading.advice}"
 
 
-def _key_line(buttons: Iterable[Answer | OperatorRequest], gap: str) -> str:
-    return gap.join(f"[{KEYS[button]}] {LABELS[button]}" for button in buttons)
+def _key_line(buttons: Iterable[Answer | OperatorRequest], gap: str, prompt: Prompt | None = None) -> str:
+    return gap.join(f"[{KEYS[button]}] {button_label(button, prompt)}" for button in buttons)
 
 
 def _describe_status(status: Status) -> str:
