@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import Struct
 
 from faintfield.pipelines.live.light_meter import LightMeter, LightReading
-from faintfield.pipelines.live.panel import REQUESTS, CapturePanel, SessionFrames
+from faintfield.pipelines.live.panel import REQUESTS, CapturePanel, SessionFrames, sampled
 from faintfield.pipelines.live.planes_client import LiveStatus, PlanesClient
 from faintfield.pipelines.planning.known import Sensor
 from faintfield.rig.capture.checks import LIT_KINDS, MAIN_QUANTITIES, QUANTITIES, Limit, Quantity
@@ -42,8 +42,6 @@ def button_label(word: Answer | OperatorRequest, prompt: Prompt | None) -> str:
 
 
 _HISTOGRAM_BINS = 64
-# About so many pixels are counted for a histogram, one of an odd number each, which meets all colours of a mosaic.
-_SAMPLES = 1_000_000
 # Range of the histogram of a frame without light, beyond its black and white, in parts of their distance.
 _BEYOND = 0.25
 # A course over a step has at most so many points, each the mean of as many frames.
@@ -318,7 +316,7 @@ def scale_words(shown: ShownFrame) -> str:
 
 def _histogram(shown: ShownFrame, sensor: Sensor | None) -> Histogram:
     """Return the histogram of a frame: up to saturation, or of dark frames about their black and white."""
-    samples = shown.pixels.ravel()[:: max(1, shown.pixels.size // _SAMPLES) | 1].astype(float)
+    samples = sampled(shown.pixels)
     findings, marks = shown.findings, []
     if shown.frame.kind in LIT_KINDS:
         low, high = min(0.0, float(samples.min())), findings.saturation_dn or max(float(samples.max()), 1.0)
