@@ -168,9 +168,11 @@ class BoardsProgress(Protocol):
 
 
 class FollowedBoards(Protocol):
-    """The process that follows the board sweeps, whose `progress` is None before its first message."""
+    """The process that follows the board sweeps."""
 
-    progress: BoardsProgress | None
+    @property
+    def progress(self) -> BoardsProgress | None:
+        """The latest progress, None before the first message."""
 
     def failure(self) -> str | None:
         """Return that the process has ended, and how; None while it runs."""
