@@ -14,6 +14,7 @@ from typing import Any, get_args
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
+from numpy.typing import NDArray
 
 from faintfield.pipelines.live.board_progress import BoardFrame, BoardNews
 from faintfield.pipelines.live.planes_client import LiveFrame
@@ -37,13 +38,18 @@ class OpenPrompt(Struct, frozen=True):
 
 # Black and white of frames without light: so many standard deviations of a pixel below and above the median.
 _BELOW, _ABOVE = 3.0, 6.0
-# About so many pixels are enough for both.
+# About so many pixels are enough for statistics of a frame.
 _SAMPLES = 1_000_000
+
+
+def sampled(pixels: Pixels) -> NDArray[np.float64]:
+    """Return about a million pixels of a frame, one of an odd number each, which meets all colours of a mosaic."""
+    return np.asarray(pixels.ravel()[:: max(1, pixels.size // _SAMPLES) | 1], float)
 
 
 def _dark_scale_dn(pixels: Pixels) -> tuple[float, float]:
     """Return black and white for the frames of a step without light, of which this is the first."""
-    samples = pixels.ravel()[:: max(1, pixels.size // _SAMPLES)].astype(float)
+    samples = sampled(pixels)
     middle = float(np.median(samples))
     # The median deviation of a normal law is 0.6745 standard deviations; whole numbers may make it 0
     sigma = max(float(np.median(np.abs(samples - middle))) / 0.6745, 1.0)

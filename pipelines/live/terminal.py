@@ -10,6 +10,7 @@ import threading
 import tty
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -20,10 +21,10 @@ from rich.text import Text
 
 from faintfield.pipelines.console import console, inform, visible
 from faintfield.pipelines.live.light_meter import LightMeter, LightReading
-from faintfield.pipelines.live.panel import CapturePanel, SessionFrames
-from faintfield.pipelines.live.view import KEYS, LABELS, check_rows, scale_words, step_rows
+from faintfield.pipelines.live.panel import CapturePanel, SessionFrames, sampled
+from faintfield.pipelines.live.view import KEYS, button_label, check_rows, scale_words, step_rows
 from faintfield.rig.cameras.protocol import Pixels
-from faintfield.rig.capture.guide import Answer, OperatorRequest, ShownFrame, Status, format_duration
+from faintfield.rig.capture.guide import Answer, OperatorRequest, Prompt, ShownFrame, Status, format_duration
 
 # Widths of the frame's picture and histogram in characters.
 _PICTURE_COLUMNS, _MIN_PICTURE_COLUMNS, _HISTOGRAM_COLUMNS = 48, 8, 24
@@ -65,7 +66,7 @@ class TerminalView:
                     inform(line)
             self._prompt_number = asked.number
             prompt = asked.prompt
-            keys = f"{_key_line(prompt.answers, '   ')}   (Enter: {LABELS[prompt.answers[0]]})"
+            keys = f"{_key_line(prompt.answers, '   ', prompt)}   (Enter: {button_label(prompt.answers[0], prompt)})"
             for line in ("", prompt.title, *(f"  {line}" for line in (*prompt.lines, keys))):
                 inform(line)
         if status is not None:
@@ -113,8 +114,8 @@ def describe_light(reading: LightReading) -> str:
     return f"{', '.join(parts)}; {reading.advice}"
 
 
-def _key_line(buttons: Iterable[Answer | OperatorRequest], gap: str) -> str:
-    return gap.join(f"[{KEYS[button]}] {LABELS[button]}" for button in buttons)
+def _key_line(buttons: Iterable[Answer | OperatorRequest], gap: str, prompt: Prompt | None = None) -> str:
+    return gap.join(f"[{KEYS[button]}] {button_label(button, prompt)}" for button in buttons)
 
 
 def _describe_status(status: Status) -> str:
@@ -124,11 +125,12 @@ def _describe_status(status: Status) -> str:
     return visible(f"{status.done} of {status.total} frames{to_go};{node}: {status.doing}") + devices
 
 
+@lru_cache(maxsize=1)
 def _describe_frame(shown: ShownFrame, columns: int) -> str:
     """Return a line with name and histogram of a frame, of logarithmic height, and lines with its values."""
     words = (visible(value).replace(" ", "\xa0") for value in describe_values(shown))  # a value stays in one line
     values = textwrap.fill("  ".join(words), columns).replace("\xa0", " ")
-    heights = np.log1p(np.histogram(shown.pixels, bins=_HISTOGRAM_COLUMNS)[0])
+    heights = np.log1p(np.histogram(sampled(shown.pixels), bins=_HISTOGRAM_COLUMNS)[0])
     bars = "".join(_BARS[round(height / max(heights.max(), 1.0) * (len(_BARS) - 1))] for height in heights)
     name = visible(shown.frame.name) if shown.recorded else "test frame, not recorded"
     return f"{name}  {bars}\n{values}"
@@ -159,6 +161,8 @@ def display_levels(pixels: Pixels, width_px: int, scale: tuple[float, float] | N
     return np.asarray(np.clip((small - low) * (255.0 / max(float(high - low), 1.0)), 0, 255), np.uint8)
 
 
+# Several states are shown with the same frame.
+@lru_cache(maxsize=2)
 def _frame_picture(shown: ShownFrame, lines: int) -> Text:
     """Return a frame in half blocks of so many lines at most, red on black, which preserves dark adaptation."""
     height, width = shown.pixels.shape[:2]

@@ -10,19 +10,19 @@ from msgspec import Struct
 from faintfield.pipelines.live.board_progress import BoardProgress
 from faintfield.pipelines.live.boards_client import BoardsClient
 from faintfield.pipelines.live.light_meter import LightMeter, LightReading
-from faintfield.pipelines.live.panel import REQUESTS, CapturePanel, SessionFrames
+from faintfield.pipelines.live.panel import REQUESTS, CapturePanel, SessionFrames, sampled
 from faintfield.pipelines.live.planes_client import LiveStatus, PlanesClient
 from faintfield.pipelines.planning.known import Sensor
 from faintfield.rig.capture.checks import LIT_KINDS, MAIN_QUANTITIES, QUANTITIES, Limit, Quantity
-from faintfield.rig.capture.guide import Answer, OperatorRequest, ShownFrame, Status, format_duration, step_name
+from faintfield.rig.capture.guide import Answer, OperatorRequest, Prompt, ShownFrame, Status, format_duration, step_name
 
-LABELS: dict[Answer | OperatorRequest, str] = {
+_LABELS: dict[Answer | OperatorRequest, str] = {
     "go": "go on",
     "test": "test frame",
     "again": "try again",
     "keep": "keep as it is",
     "retake": "take again",
-    "skip": "skip",
+    "skip": "skip frame",
     "stop": "stop",
     "pause": "pause",
 }
@@ -37,10 +37,13 @@ KEYS: dict[Answer | OperatorRequest, str] = {
     "pause": "p",
 }
 
+
+def button_label(word: Answer | OperatorRequest, prompt: Prompt | None) -> str:
+    """Return the label of a button: an answer to a prompt, or a request without one."""
+    return "skip step" if word == "skip" and prompt is not None and prompt.key == "step" else _LABELS[word]
+
+
 _HISTOGRAM_BINS = 64
-# Picture elements that are counted for a histogram; the number that is left out in between is even, as then all colours
-# of a mosaic are counted.
-_SAMPLES = 1_000_000
 # Range of the histogram of a frame without light, beyond its black and white, in parts of their distance.
 _BEYOND = 0.25
 # A course over a step has at most so many points, each the mean of as many frames.
@@ -197,7 +200,7 @@ class CaptureView:
             mode="ended" if outcome else "waiting" if prompt else "running",
             prompt=None if asked is None else asked.number,
             lines=() if prompt is None else prompt.lines,
-            buttons=() if outcome else tuple(Button(word, LABELS[word], KEYS[word]) for word in words),
+            buttons=() if outcome else tuple(Button(word, button_label(word, prompt), KEYS[word]) for word in words),
             plan=() if session is None else self._plan.get((status, asked), lambda: step_rows(session, status, homing)),
             status=status,
             to_go="" if status is None else format_duration(status.to_go_s),
@@ -298,7 +301,7 @@ def scale_words(shown: ShownFrame) -> str:
 
 def _histogram(shown: ShownFrame, sensor: Sensor | None) -> Histogram:
     """Return the histogram of a frame: up to saturation, or of dark frames about their black and white."""
-    samples = shown.pixels.ravel()[:: max(1, shown.pixels.size // _SAMPLES) | 1].astype(float)
+    samples = sampled(shown.pixels)
     findings, marks = shown.findings, []
     if shown.frame.kind in LIT_KINDS:
         low, high = min(0.0, float(samples.min())), findings.saturation_dn or max(float(samples.max()), 1.0)

@@ -53,7 +53,10 @@ def capture_or_resume(
     planes = _live_order(rig, session, depths, known, light_e)
     if planes is not None and not page:
         raise WrongUsage("live planes are shown on the page, and there is none; give --page, too")
-    meter = None if yes and not page else _light_meter(settings, rig, session, known[0], light_e)
+    seen = page or console.is_terminal or not yes
+    if light_e is not None and not seen:
+        raise WrongUsage("the light is compared on the page or in a terminal, and there is neither; give --page, too")
+    meter = _light_meter(settings, rig, session, known[0], light_e) if seen else None
     taken = capture_session(settings, session, unattended=yes, page=page, planes=planes, meter=meter)
     return Captured(str(session), complete=True, taken=taken)
 

@@ -279,3 +279,17 @@ def test_check_compares_rig_with_session(small: Shell) -> None:
     assert f"{changed[0]}, from now on" in small.words
     assert small.result("check", small.rig, "--session", small.session)["changed_since_session"] == []
     assert "it is complete, nothing is left to capture" in small.words
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--light-e", "1"], "the light is compared on the page or in a terminal, and there is neither; give --page"),
+        (["--noise", "noise.json"], "--noise is of live planes and of the light; give --live-depth-mm or --light-e"),
+        (["--fx-px", "800"], "--geometry and --fx-px are of live planes; give --live-depth-mm, too"),
+    ],
+)
+def test_options_of_views_need_a_view(options: list[str], words: str, shell: Shell) -> None:
+    assert shell.run("capture", shell.rig, shell.session, "--yes", *options) == 2
+    assert words in shell.words
+    assert not shell.session.exists()

@@ -148,7 +148,7 @@ def test_terminal_and_page_agree(running: Running, browser: Tab, capsys: pytest.
     assert isinstance(failure, CaptureStopped)
     words = capsys.readouterr().err
     assert "Step 1 of 3: Bright set" in words
-    assert "[g] go on   [t] test frame   [s] skip   [q] stop   (Enter: go on)" in words
+    assert "[g] go on   [t] test frame   [s] skip step   [q] stop   (Enter: go on)" in words
     assert [event.detail["answer"] for event in events(running.folder, "prompt")] == ["go", "skip", "stop"]
 
 
