@@ -64,7 +64,7 @@ _EXPOSURE_S = 0.1
 _RANGE_MM = "400:900"
 
 # Sweeps over the nodes with a board at another place each.
-_BOARD_SWEEPS = 4
+_BOARD_SWEEPS = 5
 
 
 @dataclass(frozen=True)

@@ -108,6 +108,16 @@ def test_metric_bounds_curvature_between_planes(occluded: bool) -> None:
     assert 0.5 < np.linalg.eigvalsh(scaled)[-1] <= 1 + 1e-9
 
 
+def test_samples_hardly_seen_follow_neighbours_in_solvers_alone() -> None:
+    operator = shifted_views(4, unseen_columns=4)
+    fit = DataFit(operator, ElementalImages(np.ones(operator.images_shape), 0.1, 9.0), 1.0)
+    samples = np.ones(operator.samples_shape)
+    (of_errors,) = fit.metric_of_each(samples)
+    metric = fit.metric(samples)
+    assert metric.min() == pytest.approx(10 * of_errors.min())
+    np.testing.assert_array_equal(metric, np.maximum(of_errors, metric.min()))
+
+
 def test_left_out_views_do_not_count() -> None:
     posed, kept = two_planes(), np.array([0, 2, 3, 5, 8])
     electrons = posed.images.electrons.copy()

@@ -21,6 +21,8 @@ def test_joint_and_occlusion_lower_the_error(bright_scene: Path, tmp_path: Path,
     assert errors["joint"] < 0.5 * errors["pmlem"]
     assert errors["occlusion"] < 0.8 * errors["joint"]
     together = read_record(out / "occlusion")["planes"]
+    (joint, _) = read_record(out / "joint")["planes"]
+    assert together[0]["passes"] < joint["passes"], "it starts from the planes of joint"
     assert [plane["occlusion"] for plane in together] == [True, True]
     opacity = tifffile.imread(out / "occlusion" / together[0]["opacity_file"])
     texture = tifffile.imread(bright_scene / "truth" / "plane_00500.0.tiff")
