@@ -30,10 +30,19 @@ from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.simulation.lab import SimulatedCamera, SimulatedLab, SimulatedLight
 from faintfield.rig.stages.gantry import Gantry, serial_stage
 from faintfield.rig.stages.micromanager import MicroManagerController, MicroManagerStage
-from faintfield.rig.stages.protocol import SERIAL_PROTOCOLS, SIMULATED, StageSettings
+from faintfield.rig.stages.protocol import SERIAL_PROTOCOLS, SIMULATED, OutputKind, StageSettings
 from faintfield.rig.stages.transport import SerialPort, TrafficLog
 
 SIMULATED_FIRMWARE = {"grbl": SimulatedGrbl, "grblhal": SimulatedGrblHal, "marlin": SimulatedMarlin}
+
+
+# Outputs of the controllers that are known here.
+_GRBL_OUTPUTS: tuple[OutputKind, ...] = ("flood", "mist", "spindle")
+_OUTPUTS: dict[str, tuple[OutputKind, ...]] = {
+    "grbl": _GRBL_OUTPUTS,
+    "grblhal": _GRBL_OUTPUTS,
+    "marlin": ("pin", "fan"),
+}
 
 
 @dataclass(frozen=True)
@@ -64,6 +73,9 @@ def open_rig(settings: RigSettings, traffic: TrafficLog | None = None, decode: D
     bench = _simulated_bench(settings.stage) if settings.stage.simulated else None
     core = _shared_core(settings)
     stage = open_stage(settings.stage, traffic, bench, core)
+    for light in settings.light:
+        if isinstance(light, lights.ControllerSettings):
+            _check_output(light, bench.firmware.protocol if bench is not None else settings.stage.protocol)
     lamps = {light.name: _open_light(light, stage) for light in settings.light}
     if not isinstance(settings.camera, cameras.SimulatedSettings):
         camera = _open_camera(settings.camera, core, decode)
@@ -76,6 +88,16 @@ def open_rig(settings: RigSettings, traffic: TrafficLog | None = None, decode: D
         lights=true_lights(settings.light, lamps, bench),
     )
     return Rig(stage, SimulatedCamera(settings.camera, stage.clock, lab), stage.clock, lab.arrange, lights=lamps)
+
+
+def _check_output(light: lights.ControllerSettings, protocol: str) -> None:
+    """Raise `PlanRefused` if a controller has no such output; those of other packages are found out by trying."""
+    if protocol == "micromanager" or light.output not in _OUTPUTS.get(protocol, (light.output,)):
+        offered = ", ".join(_OUTPUTS.get(protocol, ())) or "no outputs"
+        raise PlanRefused(
+            f"light {light.name}: output = '{light.output}', and a stage of protocol {protocol} has {offered}; choose "
+            "another output or driver"
+        )
 
 
 def _open_light(settings: lights.LightSettings, stage: Gantry) -> Light:

@@ -79,8 +79,9 @@ class BoardWatch:
             view = planned.stop.node, planned.sweep, frame.homing
             wanted[view] = (*wanted.get(view, ()), frame)
         self._wanted, self._skipped = wanted, frozenset(news.skipped)
-        for view in self._found.keys() - wanted.keys():  # its frames are void
-            del self._found[view]
+        if self._found.keys() - wanted.keys():  # frames are void, perhaps for their size
+            self._found.clear()
+            self._size_px = None
 
     def _advance(self) -> bool:
         """Do what matters most; return whether anything was to be done."""
@@ -190,8 +191,10 @@ class BoardWatch:
         """Solve the geometry as `faintfield geometry` does, and write lens and poses beside the session's folder."""
         self._solved = dict(self._wanted)
         self._report(doing="solving lens and poses")
+        if self._size_px is None:
+            self._report(geometry="", refusal="no frame of a board can be decoded here")
+            return
         try:
-            assert self._size_px is not None
             rig = calibrate_geometry(
                 self._boards, self._observations(), self._size_px, self._plan.centre.node, self._settings
             )

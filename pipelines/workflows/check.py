@@ -10,6 +10,7 @@ from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import MissingFile
 from faintfield.pipelines.formats.files import require_room, write_json
 from faintfield.pipelines.formats.toml_files import read_rig, read_stage_settings, stage_settings_path
+from faintfield.pipelines.termination import interrupt_on_termination
 from faintfield.rig.capture.guide import format_capture_duration
 from faintfield.rig.capture.survey import Survey, survey
 from faintfield.rig.devices import open_rig
@@ -37,7 +38,8 @@ def check_rig(rig: Path, remember: bool, session: Path | None) -> RigCheck:
     """Ask stage, camera and disk whether a capture is possible, and print the answers."""
     settings = read_rig(rig)
     since = [] if session is None else _changes_since(session, settings)
-    found = survey(open_rig(settings), settings, lights=True)
+    with interrupt_on_termination():  # lights that are tried go off
+        found = survey(open_rig(settings), settings, lights=True)
     stored = read_stage_settings(rig)
     changed = [] if stored is None else _changed_settings(stored, found.stage.settings)
     require_room(rig, found.plan.wanted_room_bytes())

@@ -143,14 +143,16 @@ class OperatorInterface(Protocol):
         """Show the frame just taken."""
 
 
-def needs_hand(steps: Sequence[CaptureStep], number: int) -> bool:
-    """Return whether something has to be done by hand before a step.
+# Steps with something before the lens that a person puts in place, and takes away.
+BY_HAND: frozenset[StepKind] = frozenset({"charuco", "flat"})
+
+
+def needs_hand(step: CaptureStep, before: StepKind | None) -> bool:
+    """Return whether something has to be done by hand before a step, with the kind of the frames taken `before` it.
 
     A person sees to the lights unless the rig does, puts boards and diffusers in place, and takes them away.
     """
-    by_hand: set[StepKind] = {"charuco", "flat"}
-    step = steps[number]
-    return step.lights is None or step.kind in by_hand or (number > 0 and steps[number - 1].kind in by_hand)
+    return step.lights is None or step.kind in BY_HAND or before in BY_HAND
 
 
 def step_prompt(steps: Sequence[CaptureStep], frame: PlannedFrame, frames: int, duration_s: float) -> Prompt:
@@ -160,7 +162,7 @@ def step_prompt(steps: Sequence[CaptureStep], frame: PlannedFrame, frames: int, 
     return Prompt(
         key="step",
         title=_step_title(frame, len(steps)),
-        lines=(*preparations(steps, frame), test, motion, _CHECK[frame.kind]),
+        lines=(*_to_do(steps[frame.step], frame), test, motion, _CHECK[frame.kind]),
         answers=("go", "test", "skip", "stop"),
         unattended="go",
     )
@@ -168,9 +170,12 @@ def step_prompt(steps: Sequence[CaptureStep], frame: PlannedFrame, frames: int, 
 
 def preparations(steps: Sequence[CaptureStep], frame: PlannedFrame) -> tuple[str, ...]:
     """Return what to do by hand before the step of a frame; of lights only where the rig does not switch them."""
-    if not needs_hand(steps, frame.step):
-        return ()
-    if steps[frame.step].lights is not None and not (frame.sweep and frame.kind == "charuco"):
+    before = steps[frame.step - 1].kind if frame.step else None
+    return _to_do(steps[frame.step], frame) if needs_hand(steps[frame.step], before) else ()
+
+
+def _to_do(step: CaptureStep, frame: PlannedFrame) -> tuple[str, ...]:
+    if step.lights is not None and not (frame.sweep and frame.kind == "charuco"):
         return _TO_DO_BUT_LIGHTS.get(frame.kind, (_OBJECTS,))
     return _TO_DO_AGAIN.get(frame.kind, _TO_DO[frame.kind]) if frame.sweep else _TO_DO[frame.kind]
 
@@ -219,14 +224,13 @@ class Pace:
         self.rest_s = dict.fromkeys(TITLES, rest_s)
         self._departed_s = 0.0
         self._start: Point | None = None
-        self._repeated = False
         self.here: Point | None = None
         self.check_s = 0.0
 
     def depart(self) -> None:
         """Note that the stage leaves its position."""
         self._departed_s, self._start = self._clock.now_s(), self.here
-        self.here, self._repeated = None, False
+        self.here = None
 
     def arrive(self, target: Point, kind: StepKind, *, timed: bool) -> None:
         """Note that the stage is at rest at `target`; learn from the time it took if `timed`."""
@@ -235,14 +239,13 @@ class Pace:
             self._stop_s.append(self._clock.now_s() - self._departed_s - known_s)
         self.here = target
 
-    def finish_frame(self, begun_s: float, exposure_s: float) -> None:
+    def finish_frame(self, begun_s: float, exposure_s: float, *, repeated: bool) -> None:
         """Note that a frame that was begun at `begun_s` is committed.
 
         The first frame at a stop is told from the next ones, which are faster: a controller that was just asked for its
         position is not asked again at once.
         """
-        self._frame_s[self._repeated].append(self._clock.now_s() - begun_s - exposure_s)
-        self._repeated = True
+        self._frame_s[repeated].append(self._clock.now_s() - begun_s - exposure_s)
 
     def remaining_s(self, frames: list[PlannedFrame], drift_checks: int) -> float:
         """Return how long `frames`, in this order, and a number of drift checks will take, without prompts."""

@@ -37,8 +37,8 @@ class Lighting:
         self._used = False
         self._recoveries = -1
         self._step: int | None = None
-        self._dark_dn: dict[float, float] = {}  # by exposure time in s, of the last step with light
-        self._error_dn = 0.0
+        # Mean of a frame without light and its error, by exposure time in s, of the last step with light
+        self._dark_dn: dict[float, tuple[float, float]] = {}
 
     def open(self) -> None:
         """Connect to all lights; they are switched by `prepare`."""
@@ -71,8 +71,8 @@ class Lighting:
             self.verify(frame, frozenset())
             for exposure_s in self._session.plan.steps[frame.step].exposure_s:
                 if (pixels := expose(exposure_s)) is not None:
-                    self._dark_dn[exposure_s], self._error_dn = mean_and_error(pixels)
-            exposures_s, means_dn = [*self._dark_dn], [*self._dark_dn.values()]
+                    self._dark_dn[exposure_s] = mean_and_error(pixels)
+            exposures_s, means_dn = [*self._dark_dn], [mean_dn for mean_dn, _ in self._dark_dn.values()]
             self._session.journal.event("dark_level", frame=frame.number, exposure_s=exposures_s, mean_dn=means_dn)
         self._step = frame.step
         self._set(frame, lights)
@@ -100,16 +100,16 @@ class Lighting:
         mean_dn, _ = mean_and_error(pixels)
         before_dn = [values[MEAN] for values in earlier if MEAN in values]
         usual_dn = statistics.median(before_dn) if before_dn else None
-        dark_dn = self._dark_dn.get(frame.exposure_s)
+        dark_dn, error_dn = self._dark_dn.get(frame.exposure_s, (None, 0.0))
         if frame.kind in DARK_KINDS:
             self._require_dark(frame, mean_dn, dark_dn if usual_dn is None else usual_dn)
         elif lights and dark_dn is not None:
-            self._require_light(frame, mean_dn - dark_dn, 0.0 if usual_dn is None else usual_dn - dark_dn)
-            warnings = self._warn_of_no_light(mean_dn - dark_dn) if usual_dn is None else ()
+            self._require_light(frame, mean_dn - dark_dn, 0.0 if usual_dn is None else usual_dn - dark_dn, error_dn)
+            warnings = self._warn_of_no_light(mean_dn - dark_dn, error_dn) if usual_dn is None else ()
         return Findings({MEAN: round(mean_dn, 5)}, warnings)
 
-    def _warn_of_no_light(self, light_dn: float) -> tuple[str, ...]:
-        limit_dn = _FAINT * math.sqrt(2.0) * self._error_dn
+    def _warn_of_no_light(self, light_dn: float, error_dn: float) -> tuple[str, ...]:
+        limit_dn = _FAINT * math.sqrt(2.0) * error_dn
         if light_dn >= limit_dn:
             return ()
         return (
@@ -125,8 +125,8 @@ class Lighting:
                 f"{limit_dn:g} DN; look which light is on, or raise checks.leak_dn"
             )
 
-    def _require_light(self, frame: PlannedFrame, light_dn: float, usual_dn: float) -> None:
-        sure_dn = max(_SURE_DN, _SURE * self._error_dn)
+    def _require_light(self, frame: PlannedFrame, light_dn: float, usual_dn: float, error_dn: float) -> None:
+        sure_dn = max(_SURE_DN, _SURE * error_dn)
         least_dn = _DARK_SHARE * usual_dn if usual_dn > sure_dn else -math.inf
         if frame.kind in LIT_KINDS:
             least_dn = max(least_dn, sure_dn)

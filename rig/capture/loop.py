@@ -6,6 +6,7 @@ import msgspec
 
 from faintfield.rig.cameras.protocol import Decode
 from faintfield.rig.capture.guide import (
+    BY_HAND,
     MAX_UNATTENDED_TRIES,
     Answer,
     Dialogue,
@@ -28,7 +29,7 @@ from faintfield.rig.errors import (
     RigError,
     StageError,
 )
-from faintfield.rig.plan import PlannedFrame
+from faintfield.rig.plan import PlannedFrame, StepKind
 from faintfield.rig.session.homings import begin_group, unchecked_frames
 from faintfield.rig.session.journal import Suspect
 from faintfield.rig.session.session import Session
@@ -68,8 +69,6 @@ class Capture:
             if self._drift.watch is not None:  # a capture that was killed may have left nothing but the last check
                 self._mark_unchecked("the capture ended")
             self._switch_lights_off()
-            self._session.seal()
-            self._dialogue.show_status(self._session.frames[-1], "complete")
         except BaseException:
             with suppress(RigError):  # that a journal cannot be written to is not why the capture ends
                 self._switch_lights_off()
@@ -80,10 +79,15 @@ class Capture:
             finally:
                 self._rig.camera.close()
                 self._rig.stage.close()
+        self._dialogue.stage = self._dialogue.camera = "not connected"
+        self._dialogue.show_status(self._session.frames[-1], "sealing")
+        self._session.seal()
+        self._dialogue.show_status(self._session.frames[-1], "complete")
 
     def _switch_lights_off(self) -> None:
-        for failure in self._lighting.switch_off():
-            self._dialogue.warn(failure)
+        if failures := self._lighting.switch_off():
+            self._dialogue.warn("; ".join(failures))
+            self._dialogue.show_status(self._taker.last or self._session.frames[0], "ended, with lights that are on")
 
     def _connect(self) -> None:
         rig, session = self._rig, self._session
@@ -116,10 +120,17 @@ class Capture:
             else:
                 return
 
+    def _kind_before(self, first: PlannedFrame) -> StepKind | None:
+        """Return the kind of the frames taken before a step; on a resume, of those before it that need a hand."""
+        if self._taker.last is not None:
+            return self._taker.last.kind
+        earlier = [step.kind for step in self._session.plan.steps[: first.step]]
+        return next((kind for kind in earlier if kind in BY_HAND), None)
+
     def _run_step(self, missing: list[PlannedFrame]) -> None:
         session, first = self._session, missing[0]
         frames = [frame for frame in missing if frame.step == first.step]
-        if needs_hand(session.plan.steps, first.step):
+        if needs_hand(session.plan.steps[first.step], self._kind_before(first)):
             self._dialogue.show_status(first, "waiting for your answer")
             duration_s = self._dialogue.pace.remaining_s(frames, 0)
             prompt = step_prompt(session.plan.steps, first, len(frames), duration_s)
@@ -260,7 +271,7 @@ class Capture:
 
     def _ask_about_skipped(self) -> list[PlannedFrame]:
         skipped = self._session.skipped()
-        if not skipped:
+        if not skipped or self._session.is_decided:
             return []
         lines = (f"{len(skipped)} frames were skipped, the first is {skipped[0].name}.",)
         prompt = Prompt("skipped", "Skipped frames", lines, ("again", "keep", "stop"), "stop")

@@ -4,6 +4,7 @@ import itertools
 import math
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -143,15 +144,11 @@ class FrameTaker:
             self._wait_for_temperature(frame, settings, settings.settle_temperature_c)
         self._cooled_step = frame.step
         try:
-            self._lighting.prepare(frame, self._look)
+            self._lighting.prepare(frame, partial(self._look, frame))
             if self._pace.here != frame.stop.target:
                 self._dialogue.stage = _towards(frame)
                 self._dialogue.show_status(frame, "moving")
             self._go_to(frame)
-            if self._arrived or self.last is None or self.last.step != frame.step:
-                self._await_silence(frame)
-            self._dialogue.camera = f"exposes for {frame.exposure_s:g} s"
-            self._dialogue.show_status(frame, "exposing")
             self._expose(frame, following)
         except CameraError:
             self._cooled_step = None  # a camera that failed was perhaps switched off
@@ -160,23 +157,28 @@ class FrameTaker:
             self._lighting.forget()
             raise
 
-    def _await_silence(self, frame: PlannedFrame) -> None:
+    def _await_silence(self, frame: PlannedFrame, exposure_s: float) -> None:
         """Let a camera that we do not trigger finish what it may have begun before the frame's place and light."""
         if isinstance(self._rig.camera, UntriggeredCamera):
             self._dialogue.show_status(frame, "waiting for silence of the camera, trigger nothing yet")
-            self._rig.camera.await_silence(frame.exposure_s)
+            self._rig.camera.await_silence(exposure_s)
+
+    def _show_exposure(self, frame: PlannedFrame, exposure_s: float, purpose: str = "") -> None:
+        """Tell that the shutter opens now: whoever triggers the camera waits for it."""
+        self._dialogue.camera = f"exposes for {exposure_s:g} s"
+        self._dialogue.show_status(frame, f"exposing{purpose}")
 
     def take_test(self, frame: PlannedFrame) -> None:
         """Expose as for `frame` and show the picture; nothing of it is recorded.
 
         Raises `StageError`, `NotHomed`, `CameraError` or `LightError`.
         """
-        self._lighting.prepare(frame, self._look)
+        self._lighting.prepare(frame, partial(self._look, frame))
         self._dialogue.stage = f"{_towards(frame)}, for a test frame"
         self._dialogue.show_status(frame, "taking a test frame")
         self._go_to(frame, test=True)
-        self._dialogue.camera = f"exposes a test frame for {frame.exposure_s:g} s"
-        self._dialogue.show_status(frame, "taking a test frame")
+        self._await_silence(frame, frame.exposure_s)
+        self._show_exposure(frame, frame.exposure_s, " a test frame")
         exposure, pixels = self._expose_unkept(frame.exposure_s)
         record = FrameRecord(frame.stop.target, frame.exposure_s, dict(exposure.metadata))
         self._note_temperature(record.temperature_c)
@@ -244,12 +246,15 @@ class FrameTaker:
     def _expose(self, frame: PlannedFrame, following: PlannedFrame | None) -> None:
         """Take a frame at the present node; the order of these steps makes a kill at any moment harmless."""
         rig, session = self._rig, self._session
-        begun_s = rig.clock.now_s()
+        begun_s, repeated = rig.clock.now_s(), not self._arrived
+        if self._arrived or self.last is None or self.last.step != frame.step:
+            self._await_silence(frame, frame.exposure_s)
         self._drift.nodes += self._arrived
         self._arrived = False
         intent = session.intend(frame)
         position = rig.stage.verify_at(*frame.stop.target)
         self._lighting.verify(frame)
+        self._show_exposure(frame, frame.exposure_s)
         exposure = rig.camera.expose(frame.exposure_s, intent)
         rig.stage.verify_at(*frame.stop.target)
         self._lighting.verify(frame)
@@ -271,7 +276,7 @@ class FrameTaker:
             }
             for warning in board_warnings(frame, session.frames, corners, self._settings.checks.board_corners):
                 self._dialogue.warn(warning)
-        self._pace.finish_frame(begun_s, frame.exposure_s)
+        self._pace.finish_frame(begun_s, frame.exposure_s, repeated=repeated)
         self._note_temperature(record.temperature_c)
         if pixels is not None:
             self._dialogue.operator.show_frame(ShownFrame(frame, pixels, findings, record.temperature_c))
@@ -383,8 +388,10 @@ class FrameTaker:
             raise CameraError("frames cannot be decoded, so settling is not measured; set settle.measure = false")
         return pixels
 
-    def _look(self, exposure_s: float) -> Pixels | None:
-        """Return a frame that is not kept, None if it cannot be decoded here."""
+    def _look(self, frame: PlannedFrame, exposure_s: float) -> Pixels | None:
+        """Return a frame without light before that of a step, not kept; None if it cannot be decoded here."""
+        self._await_silence(frame, exposure_s)
+        self._show_exposure(frame, exposure_s, " a frame without light")
         return self._expose_unkept(exposure_s)[1]
 
     def _expose_unkept(self, exposure_s: float) -> tuple[Exposure, Pixels | None]:

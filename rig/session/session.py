@@ -16,7 +16,7 @@ from faintfield.rig.files import is_plain_name, read_regular, sha256
 from faintfield.rig.plan import MAX_NUMBER, CapturePlan, PlannedFrame, planned_frames
 from faintfield.rig.session.database import FORMAT
 from faintfield.rig.session.disk import encode_exposure, list_names, set_aside, translate_errors, write_new
-from faintfield.rig.session.journal import CommittedFrame, FrameRecord, Journal
+from faintfield.rig.session.journal import CommittedFrame, FrameRecord, Journal, Sealed
 from faintfield.rig.settings import RigSettings
 
 PLAN, JOURNAL, FRAMES, SUMS, ASIDE = "plan.json", "journal.sqlite", "frames", "SHA256SUMS", "set_aside"
@@ -50,6 +50,7 @@ class Session:
     """A session open for writing, as `rig.session.resume.open_session` yields it.
 
     `rig` has the settings that apply now: those of plan.json, with the changes that were made before it was resumed.
+    With `is_decided` only sealing is left, and the frames that are skipped are left out for good.
     """
 
     def __init__(self, folder: Path, frozen: FrozenPlan, journal: Journal) -> None:
@@ -58,7 +59,9 @@ class Session:
         self.journal = journal
         self.frames = planned_frames(frozen.plan)
         self.rig = frozen.rig
-        self._skipped: set[int] = set()
+        left_out = left_out_by_sealing(journal)
+        self.is_decided = left_out is not None
+        self._skipped = set(left_out or ())
         self._valid = valid_frames(folder, self.frames, journal.committed())
 
     @property
@@ -135,6 +138,12 @@ class Session:
         """
         self.journal.event("sealed", skipped=sorted(self._skipped), frames=len(self._valid))
         write_sums(self.folder, self.journal)
+
+
+def left_out_by_sealing(journal: Journal) -> tuple[int, ...] | None:
+    """Return the frames that a sealing left out which was begun and did not end; None if none was, or work went on."""
+    last = next((event for event in reversed(journal.events()) if event.kind != "resumed"), None)
+    return journal.details("sealed", Sealed)[-1].skipped if last is not None and last.kind == "sealed" else None
 
 
 def write_sums(folder: Path, journal: Journal) -> None:

@@ -21,6 +21,7 @@ from faintfield.rig.session.session import (
     disagreements,
     exposure_name,
     is_sealed,
+    left_out_by_sealing,
     open_journal,
     read_plan,
     read_plan_and_hash,
@@ -130,12 +131,12 @@ def repair(folder: Path, progress: Callable[[Iterable[Path]], Iterable[Path]] = 
     if verdict.missing or verdict.problems != ((WAL_NOT_COVERED,) if verdict.sealed else ()):
         return verdict
     with lock_session(folder), open_journal(folder, read_plan(folder)) as journal:
-        last = journal.events()[-1:]
-        if not last or last[0].kind != "sealed":
+        left_out = left_out_by_sealing(journal)
+        if left_out is None:
             return verdict
         if is_sealed(folder):
             set_aside(folder / SUMS, folder / ASIDE)
-        journal.event("sealed", skipped=last[0].detail["skipped"], frames=verdict.present)
+        journal.event("sealed", skipped=left_out, frames=verdict.present)
         write_sums(folder, journal)
     return verify(folder, progress)
 

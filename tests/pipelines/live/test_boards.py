@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 from msgspec.structs import replace
 
 from faintfield.calib.board import Board
@@ -142,6 +143,24 @@ def test_unreadable_frame_is_named_and_passed_over(session: Path, tmp_path: Path
     told = followed(tmp_path / "session", tmp_path, BoardNews(tuple(frames[:6])))
     assert told[-1].frames == 6
     assert frames[4].file in told[-1].problem
+
+
+def test_frame_of_another_size_that_is_void_does_no_harm(session: Path, tmp_path: Path) -> None:
+    shutil.copytree(session, tmp_path / "session")
+    odd, *frames = frames_of(session)
+    tifffile.imwrite(tmp_path / "session" / "frames" / odd.file, np.zeros((10, 16), np.uint16))
+    news = BoardNews((odd,)), BoardNews(tuple(frames), (odd.number,))
+    last = followed(tmp_path / "session", tmp_path, *news)[-1]
+    assert (last.frames, bool(last.geometry)) == (len(frames), True)
+
+
+def test_files_of_unknown_kind_give_reason(session: Path, tmp_path: Path) -> None:
+    shutil.copytree(session, tmp_path / "session")
+    frames = frames_of(session)
+    for frame in frames:
+        (tmp_path / "session" / "frames" / frame.file).write_bytes(b"raw")
+    last = followed(tmp_path / "session", tmp_path, BoardNews(tuple(frames)))[-1]
+    assert last.refusal == "no frame of a board can be decoded here"
 
 
 def judged(standing: Sequence[SimulatedBoard], wanted_px: float, to_come: int = 0) -> tuple[str, bool, float | None]:

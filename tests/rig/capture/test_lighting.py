@@ -5,14 +5,15 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from faintfield.rig.capture.guide import Status
+from faintfield.rig.cameras.protocol import Exposure
+from faintfield.rig.capture.guide import Answer, OperatorRequest, Status
 from faintfield.rig.errors import CaptureStopped, LightError
 from faintfield.rig.session.journal import Journal
 from faintfield.rig.session.session import taken_frames
-from faintfield.rig.settings import DriftSettings
+from faintfield.rig.settings import DriftSettings, StepSettings
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
-from faintfield.rig.simulation.lab import TRUE_LIGHTS
+from faintfield.rig.simulation.lab import TRUE_LIGHTS, SimulatedCamera
 from tests.faults.capturing import Operator, events
 from tests.faults.lit_laboratory import STEPS, Killed, LitLab
 from tests.rig.stages.benches import firmware, on_homing
@@ -39,6 +40,56 @@ def test_only_what_needs_a_hand_is_asked_for(lab: LitLab) -> None:
     assert switched == [
         [], ["board", "shutter"], [], ["room", "shutter"], [], ["scene", "shutter"], [], ["room"], [],
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("answers", "requests", "asked"),
+    [
+        ({"step": ["go", "skip"], "skipped": ["keep"]}, {}, ["Board sweep 1", "Bright set", "Dark-scene set"]),
+        (
+            {"skipped": ["again"]},
+            {1: "skip", 13: "skip"},
+            ["Board sweep 1", "Bright set", "Board sweep 1", "Dark-scene set"],
+        ),
+    ],
+)
+def test_board_is_taken_away_before_any_later_step(
+    lab: LitLab, answers: dict[str, list[Answer]], requests: dict[int, OperatorRequest], asked: list[str]
+) -> None:
+    operator = Operator(answers, requests)
+    assert lab.run(operator) is None
+    titles = [prompt.title.partition(": ")[2] for prompt in operator.prompts if prompt.key == "step"]
+    assert titles == asked
+
+
+def test_light_that_stays_on_is_shown(lab: LitLab) -> None:
+    operator = Operator()
+    lab.on_exposure[12] = lambda: setattr(lab.shutter, "broken", True)
+    assert isinstance(lab.run(operator), LightError)
+    assert any("was not switched off" in warning for warning in operator.statuses[-1].warnings)
+
+
+@pytest.mark.parametrize("test", [False, True])
+def test_watched_camera_is_triggered_for_every_frame(lab: LitLab, monkeypatch: pytest.MonkeyPatch, test: bool) -> None:
+    calls: list[str] = []
+
+    def silent(camera: SimulatedCamera, exposure_s: float) -> None:
+        calls.append("silence")
+
+    def expose(camera: SimulatedCamera, exposure_s: float, number: int) -> Exposure:
+        calls.append("exposure")
+        return exposed(camera, exposure_s, number)
+
+    exposed = SimulatedCamera.expose
+    monkeypatch.setattr(SimulatedCamera, "await_silence", silent, raising=False)
+    monkeypatch.setattr(SimulatedCamera, "expose", expose)
+    lights = None if test else ("room", "shutter")
+    lab.settings = replace(lab.settings, step=(StepSettings("bright", 0.1, lights=lights),))
+    operator = Operator({"step": ["test", "go"]} if test else {})
+    operator.on_status = lambda status: calls.append("told") if status.doing.startswith("exposing") else None
+    lab.run(operator)
+    assert calls[:6] == ["silence", "told", "exposure"] * 2  # of a frame that is not kept, and of the first one
+    assert calls.count("told") == calls.count("exposure") > 2
 
 
 def test_stopped_capture_leaves_no_light_on(lab: LitLab) -> None:

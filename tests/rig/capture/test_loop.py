@@ -235,10 +235,10 @@ def test_remaining_time_sums_motions_stops_exposures_checks() -> None:
     bench.clock.sleep_s(motion_s + 4.0)
     pace.arrive(b, "bright", timed=True)
     assert pace.here == b
-    for exposure_s, besides_s in ((5.0, 0.9), (5.0, 0.4), (7.0, 0.6)):
+    for number, (exposure_s, besides_s) in enumerate(((5.0, 0.9), (5.0, 0.4), (7.0, 0.6))):
         begun_s = bench.clock.now_s()
         bench.clock.sleep_s(exposure_s + besides_s)
-        pace.finish_frame(begun_s, exposure_s)
+        pace.finish_frame(begun_s, exposure_s, repeated=number > 0)
     assert pace.remaining_s([frame(3, 1, b, 7.0)], 0) == pytest.approx(4.0 + 0.9 + 7.0)
     again = [frame(3, 1, b, 7.0), frame(4, 1, b, 7.0)]
     assert pace.remaining_s(again, 0) == pytest.approx(4.0 + 0.9 + 7.0 + 0.5 + 7.0)

@@ -50,6 +50,19 @@ def assert_one_file(folder: Path) -> None:
     assert verify(folder).problems == ()
 
 
+def test_frames_left_out_stay_so_when_sealing_failed(tmp_path: Path) -> None:
+    folder = tmp_path / "session"
+    operator = Operator({"step": ["go", "go", "skip"], "skipped": ["keep"]})
+    with mock.patch.object(journal, "leave_wal_mode", side_effect=SessionUnwritable("held")):
+        for again in (operator, Operator()):
+            with pytest.raises(SessionUnwritable):
+                capture_small(folder, operator=again)
+            assert [prompt.key for prompt in again.prompts].count("skipped") == (again is operator)
+    capture_small(folder)
+    assert_one_file(folder)
+    assert len(verify(folder).left_out) == SKIPPED
+
+
 def test_sealing_waits_until_readers_are_gone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     reader = begin(tmp_path / "session")
     monkeypatch.setattr("faintfield.rig.session.database.time.sleep", lambda s: reader.close())
