@@ -18,8 +18,8 @@ from faintfield.recon.prior.evidence import Noise
 _FILE = "networks/plane_prior.onnx"
 
 # The network halves its pictures three times; tiles and margins are multiples of that, too. What is farther from a
-# sample than the margin hardly changes it. Tiles are large, as margins are computed twice; one takes 0.3 GB.
-_MULTIPLE, _TILE, _MARGIN = 8, 640, 48
+# sample than the margin hardly changes it. Margins are computed twice, but larger tiles take more memory.
+_MULTIPLE, _TILE, _MARGIN = 8, 320, 48
 
 # The network sees light in units of the noise divided by this, so that all its inputs are of the order of one.
 _LIGHT_SCALE = 8.0
