@@ -76,12 +76,12 @@ def require_determined(
             )
 
 
-def require_seen(depth_mm: float, seen: int, others: int) -> None:
+def require_seen(depth_mm: float, seeing_views: int, views: int) -> None:
     """Check that at least half of the views but the reference see something of a plane; raises `NotIdentifiable`."""
-    if 2 * seen < others:
+    if 2 * seeing_views < views:
         raise NotIdentifiable(
-            f"plane at {depth_mm:g} mm: {seen} of the {others} views beside the centre's see anything of it, limit "
-            "half; give --depth-mm in mm from the camera, or nodes that lie nearer to one another"
+            f"plane at {depth_mm:g} mm: {seeing_views} of the {views} views beside the centre's see anything of it, "
+            "limit half; give --depth-mm in mm from the camera, or nodes that lie nearer to one another"
         )
 
 

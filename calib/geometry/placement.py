@@ -1,4 +1,4 @@
-"""Where to put the board next: candidate placements, and which of them lowers the predicted transfer error most."""
+"""Placement of the next board: candidates, and the one that lowers the predicted transfer error most."""
 
 from dataclasses import dataclass
 from itertools import product
@@ -89,13 +89,15 @@ def tilt_of(rt_ref_board: NDArray[np.float64]) -> Tilt:
     return Tilt(deg, "up" if normal[1] > 0 else "down")
 
 
-def board_in_view(geometry: RigGeometry, board: Board, seen: BoardObservation) -> NDArray[np.float64] | None:
+def board_in_view(geometry: RigGeometry, board: Board, observation: BoardObservation) -> NDArray[np.float64] | None:
     """Return rt_ref_board (6,) of a board by one view of a node of known pose; None if it shows too little."""
-    enough = len(seen.corners) >= _MIN_CORNERS_OF_POSE and determines_pose(seen, {board.name: board.corner_shape})
-    if seen.node not in geometry.nodes or not enough:
+    enough = len(observation.corners) >= _MIN_CORNERS_OF_POSE and determines_pose(
+        observation, {board.name: board.corner_shape}
+    )
+    if observation.node not in geometry.nodes or not enough:
         return None
-    rays = geometry.lens.rays_at(seen.pixels)[:, np.newaxis]
-    points = board.corners_mm()[seen.corners]
+    rays = geometry.lens.rays_at(observation.pixels)[:, np.newaxis]
+    points = board.corners_mm()[observation.corners]
     solved, rotations, translations, errors = cv2.solvePnPGeneric(
         points, rays, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
     )
@@ -103,7 +105,7 @@ def board_in_view(geometry: RigGeometry, board: Board, seen: BoardObservation) -
         return None
     best = int(np.argmin(np.ravel(errors)))
     cam_from_board = transform_of(np.append(np.ravel(rotations[best]), np.ravel(translations[best])))
-    ref_from_cam = np.linalg.inv(transform_of(geometry.rt_cam_ref[geometry.nodes.index(seen.node)]))
+    ref_from_cam = np.linalg.inv(transform_of(geometry.rt_cam_ref[geometry.nodes.index(observation.node)]))
     return rt_of(ref_from_cam @ cam_from_board)
 
 

@@ -5,7 +5,6 @@ the capture. It judges after each sweep, and after some frames of a further one;
 the geometry as `faintfield geometry` does.
 """
 
-import sys
 from collections.abc import Mapping
 from multiprocessing.connection import Connection
 
@@ -23,7 +22,7 @@ from faintfield.pipelines.formats.results.geometry import camera_poses
 from faintfield.pipelines.formats.sets.board_set import BoardView, named_boards
 from faintfield.pipelines.live.board_progress import BoardFrame, BoardNews, BoardOrder, BoardProgress, FrameCorners
 from faintfield.pipelines.live.board_verdict import SweepPlan, coverage, judge, nominal_poses, sweeps_seen
-from faintfield.pipelines.live.side_process import end_with_capture
+from faintfield.pipelines.live.side_process import serve
 from faintfield.rig.errors import RigError
 from faintfield.rig.plan import planned_frames
 from faintfield.rig.session.session import FRAMES, PLAN, read_plan
@@ -215,15 +214,7 @@ class BoardWatch:
 def main() -> None:
     """Serve the connection whose number is the argument, until the capture ends."""
     cv2.setNumThreads(1)
-    line = Connection(int(sys.argv[1]))
-    end_with_capture(line)
-    try:
-        BoardWatch(line.recv(), line).run()
-    except (EOFError, ConnectionError):  # the capture has ended
-        return
-    except Exception as failure:
-        line.send(BoardProgress("ended", problem=f"{type(failure).__name__}: {failure}"))
-        raise
+    serve(lambda order, line: BoardWatch(order, line).run(), lambda problem: BoardProgress("ended", problem=problem))
 
 
 if __name__ == "__main__":

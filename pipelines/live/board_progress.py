@@ -93,7 +93,7 @@ class BoardProgress(Struct, frozen=True):
 
     @property
     def poses(self) -> str:
-        """Whether the poses of the nodes are measured, and why not, in words."""
+        """Source of the nodes' poses in words: measured, or why not."""
         if self.geometry:
             return "measured, of the boards of this session"
         return (

@@ -44,7 +44,7 @@ _ENOUGH_BOARDS = 3
 
 @dataclass(frozen=True)
 class SweepPlan:
-    """What is planned: nominal poses (6,) of the nodes, wanted error, depths of planes, sweeps that have not begun.
+    """Nominal poses (6,) of the nodes, wanted error, depths of planes, and sweeps that have not begun, by the plan.
 
     `to_come` are the nodes whose frames of the present sweep are still to be taken.
     """

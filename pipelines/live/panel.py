@@ -159,7 +159,7 @@ class SessionFrames:
             StepProgress(
                 index=index,
                 first=self._first[index],
-                frames=_frames_in_words(step, len(plan.stops_of(step))),
+                frames=_describe_frames(step, len(plan.stops_of(step))),
                 done=done[index],
                 skipped=skipped[index],
                 total=self._total[index],
@@ -235,7 +235,7 @@ class SessionFrames:
         return None
 
 
-def _frames_in_words(step: CaptureStep, stops: int) -> str:
+def _describe_frames(step: CaptureStep, stops: int) -> str:
     """Return the frames of a step, such as `49 nodes, 10 x 0.1 s`."""
     place = "centre node" if step.at == "centre" else f"{stops} nodes" if stops > 1 else "1 node"
     repeats = f"{step.frames_per_node} x " if step.frames_per_node > 1 else ""

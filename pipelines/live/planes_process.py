@@ -4,7 +4,6 @@ It is started by `pipelines.live.planes_client`, reads frames and calibrations, 
 frames that wait are taken newest first; PMLEM runs when none does.
 """
 
-import sys
 from multiprocessing.connection import Connection
 from typing import Literal
 
@@ -28,7 +27,7 @@ from faintfield.pipelines.live.planes_client import (
     PlaneStatus,
 )
 from faintfield.pipelines.live.planes_scene import LiveScene, dark_frames, live_scene
-from faintfield.pipelines.live.side_process import end_with_capture
+from faintfield.pipelines.live.side_process import serve
 from faintfield.pipelines.live.terminal import display_levels
 from faintfield.recon.errors import ReconstructionError
 from faintfield.recon.names import on_compiling
@@ -237,15 +236,7 @@ def stretch(plane: NDArray[np.floating], covered: NDArray[np.bool_]) -> tuple[fl
 def main() -> None:
     """Serve the connection whose number is the argument, until the capture ends."""
     cv2.setNumThreads(1)
-    line = Connection(int(sys.argv[1]))
-    end_with_capture(line)
-    try:
-        LivePlanes(line.recv(), line).run()
-    except (EOFError, ConnectionError):  # the capture has ended
-        return
-    except Exception as failure:
-        line.send(LiveStatus("ended", problems=(f"{type(failure).__name__}: {failure}",)))
-        raise
+    serve(lambda order, line: LivePlanes(order, line).run(), lambda problem: LiveStatus("ended", problems=(problem,)))
 
 
 if __name__ == "__main__":

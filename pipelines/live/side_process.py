@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing import Pipe
@@ -31,7 +32,7 @@ _NICENESS = 19
 _MAX_FAREWELL_S = 5.0
 
 
-class SideProcess:
+class SideProcess(ABC):
     """A process that runs `module` of this package at the lowest priority, as the capture sees it.
 
     It first gets `order`, then the result of `news()` whenever that has changed; `receive` is called with each of its
@@ -61,13 +62,13 @@ class SideProcess:
         threading.Thread(target=self._send, args=(line, order), daemon=True, name=f"news to {name}").start()
         threading.Thread(target=self._listen, args=(line,), daemon=True, name=name).start()
 
+    @abstractmethod
     def news(self) -> object:
         """Return what the process is to know now."""
-        raise NotImplementedError
 
+    @abstractmethod
     def receive(self, message: Any) -> None:
         """Take a message of the process."""
-        raise NotImplementedError
 
     def note_change(self) -> None:
         """Note that frames may have come or gone; costs nothing, as a thread does the rest."""
@@ -131,7 +132,23 @@ def running[Process: SideProcess](start: Callable[[], Process], name: str) -> It
         process.end()
 
 
-def end_with_capture(line: Connection) -> None:
+def serve(follow: Callable[[Any, Connection], None], ended: Callable[[str], object]) -> None:
+    """Serve the connection whose number is the argument of this process, until the capture ends.
+
+    `follow` gets the order and the connection; `ended` returns the message that tells of its failure.
+    """
+    line = Connection(int(sys.argv[1]))
+    _end_with_capture(line)
+    try:
+        follow(line.recv(), line)
+    except (EOFError, ConnectionError):  # the capture has ended
+        return
+    except Exception as failure:
+        line.send(ended(f"{type(failure).__name__}: {failure}"))
+        raise
+
+
+def _end_with_capture(line: Connection) -> None:
     """End this process, in the middle of a step, when the capture has hung up, however it ended."""
 
     def watch() -> None:

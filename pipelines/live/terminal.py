@@ -22,7 +22,7 @@ from rich.text import Text
 from faintfield.pipelines.console import console, inform, visible
 from faintfield.pipelines.live.light_meter import LightMeter, LightReading
 from faintfield.pipelines.live.panel import CapturePanel, SessionFrames, sampled
-from faintfield.pipelines.live.view import KEYS, button_label, check_rows, scale_words, step_rows
+from faintfield.pipelines.live.view import KEYS, button_label, check_rows, describe_scale, step_rows
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.capture.guide import Answer, OperatorRequest, Prompt, ShownFrame, Status, format_duration
 
@@ -145,7 +145,7 @@ def describe_values(shown: ShownFrame) -> list[str]:
     if shown.temperature_c is not None:
         values.append(f"sensor at {shown.temperature_c:.1f} °C")
     if shown.scale_dn is not None:
-        values.append(scale_words(shown))
+        values.append(describe_scale(shown))
     return values
 
 

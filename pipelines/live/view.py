@@ -288,11 +288,11 @@ def frame_view(shown: ShownFrame, sensor: Sensor | None, version: int) -> FrameV
         checks=check_rows(shown),
         histogram=_histogram(shown, sensor),
         temperature="" if shown.temperature_c is None else f"{shown.temperature_c:.1f} °C",
-        scale=scale_words(shown),
+        scale=describe_scale(shown),
     )
 
 
-def scale_words(shown: ShownFrame) -> str:
+def describe_scale(shown: ShownFrame) -> str:
     """Return black and white of the picture of a frame in words."""
     if shown.scale_dn is None:
         return "shown from its darkest to its brightest values"

@@ -349,10 +349,14 @@ def _choose_fineness(sources: Sequence[_Source]) -> tuple[Fineness, int]:
         binned = [source.binned(coarser)[0] for source in sample]
         for fineness in _FINENESSES:
             limit = most if fineness is _FINENESSES[-1] else budget
-            sizes = map_in_threads(lambda numbers: len(pack(numbers, fineness.step(numbers)).png), binned)  # noqa: B023
+            sizes = map_in_threads(partial(_packed_bytes, fineness), binned)
             if sum(sizes) <= limit:
                 return fineness, coarser
         coarser += 1
+
+
+def _packed_bytes(fineness: Fineness, numbers: NDArray[np.floating]) -> int:
+    return len(pack(numbers, fineness.step(numbers)).png)
 
 
 def _binned(numbers: NDArray[np.floating], bins: int) -> NDArray[np.floating]:

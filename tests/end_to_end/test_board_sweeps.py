@@ -3,7 +3,7 @@
 import os
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,6 +14,7 @@ import pytest
 from faintfield.pipelines import cli
 from faintfield.pipelines.live import guided
 from faintfield.pipelines.live.board_progress import (
+    BoardNews,
     BoardOrder,
     BoardProgress,
     BoardVerdict,
@@ -43,8 +44,8 @@ def capture_with_boards(
     clients: list[BoardsClient] = []
 
     @contextmanager
-    def followed(order: BoardOrder, frames: object) -> Iterator[BoardsClient | None]:
-        with followed_boards(order, frames) as client:  # type: ignore[arg-type]
+    def followed(order: BoardOrder, frames: Callable[[], BoardNews]) -> Iterator[BoardsClient | None]:
+        with followed_boards(order, frames) as client:
             assert client is not None
             clients.append(client)
             yield client
