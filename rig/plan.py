@@ -106,11 +106,29 @@ class Stop(Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"a node has a row and a column from 0 to {MAX_FRAMES - 1}; got {self.node}")
 
 
+class Until(Struct, frozen=True, forbid_unknown_fields=True):
+    """End of a step in rounds: the noise that a sample of a plane is to reach, and the largest number of rounds.
+
+    `sigma_e` is the standard deviation of a sample, as wide as a pixel, of the unpenalised estimate, in electrons of
+    one frame of the step's first exposure.
+    """
+
+    sigma_e: float
+    at_most_rounds: int
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.sigma_e < MAX_NUMBER:
+            raise ValueError(f"until.sigma_e = {self.sigma_e:g}; a noise in electrons is positive")
+        if not 1 <= self.at_most_rounds <= MAX_FRAMES:
+            raise ValueError(f"until.at_most_rounds = {self.at_most_rounds}; give 1 to {MAX_FRAMES} rounds")
+
+
 class CaptureStep(Struct, frozen=True, forbid_unknown_fields=True):
     """One step of the experiment: the same exposures at every node, or at the centre node only.
 
     At each stop there are `frames_per_node` frames of each exposure time, in the order of `exposure_s`. Of the lights
-    that the rig switches, `lights` are on and all others off; None leaves all to a person.
+    that the rig switches, `lights` are on and all others off; None leaves all to a person. With `until`, rounds over
+    the whole grid are repeated.
     """
 
     kind: StepKind
@@ -118,15 +136,23 @@ class CaptureStep(Struct, frozen=True, forbid_unknown_fields=True):
     frames_per_node: int = 1
     at: Literal["grid", "centre"] = "grid"
     lights: tuple[str, ...] | None = None
+    until: Until | None = None
 
     def __post_init__(self) -> None:
+        if self.until is not None and (self.kind, self.at) != ("dark_scene", "grid"):
+            raise ValueError(f"until in a {self.kind} step at the {self.at}; only dark_scene steps at the grid have it")
         if not self.exposure_s or not all(time_s > 0.0 for time_s in self.exposure_s) or self.frames_per_node < 1:
             raise ValueError(f"a step needs exposure times above 0 s and at least one frame; got {self}")
         if max(self.exposure_s) > MAX_EXPOSURE_S:
             raise ValueError(f"exposure_s = {max(self.exposure_s):g}; an exposure lasts {MAX_EXPOSURE_S:g} s at most")
 
+    @property
+    def rounds(self) -> int:
+        """Number of times that all stops are visited, at most."""
+        return 1 if self.until is None else self.until.at_most_rounds
+
     def frames_per_stop(self) -> int:
-        """Return the number of frames at each stop."""
+        """Return the number of frames at each stop in one round."""
         return len(self.exposure_s) * self.frames_per_node
 
 
@@ -163,8 +189,8 @@ class CapturePlan(Struct, frozen=True, forbid_unknown_fields=True):
         return self.stops if step.at == "grid" else (self.centre,)
 
     def frame_count(self) -> int:
-        """Return the number of frames."""
-        return sum(len(self.stops_of(step)) * step.frames_per_stop() for step in self.steps)
+        """Return the number of frames; of steps in rounds, the largest."""
+        return sum(step.rounds * len(self.stops_of(step)) * step.frames_per_stop() for step in self.steps)
 
     def disk_bytes(self) -> int:
         """Return the size of all frames on disk."""
@@ -176,7 +202,7 @@ class CapturePlan(Struct, frozen=True, forbid_unknown_fields=True):
 
     def path(self) -> tuple[Point, ...]:
         """Return all points of the stage's path in order, turning points included."""
-        targets = [stop.target for step in self.steps for stop in self.stops_of(step)]
+        targets = [stop.target for step in self.steps for stop in self.stops_of(step) * step.rounds]
         points = targets[:1]
         for target in targets[1:]:
             if target != points[-1]:
@@ -184,11 +210,11 @@ class CapturePlan(Struct, frozen=True, forbid_unknown_fields=True):
         return tuple(points)
 
     def duration_s(self, motion: MotionLimits, feed_mm_per_s: float) -> float:
-        """Return the duration of the capture without prompts, from the controller's rates and accelerations."""
+        """Return the longest duration without prompts, from the controller's rates and accelerations."""
         total_s = path_duration_s(self.path(), motion, feed_mm_per_s)
         for step in self.steps:
             exposing_s = step.frames_per_node * sum(step.exposure_s) + step.frames_per_stop() * self.readout_s
-            total_s += len(self.stops_of(step)) * (_ARRIVAL_S + self.settle_s + exposing_s)
+            total_s += step.rounds * len(self.stops_of(step)) * (_ARRIVAL_S + self.settle_s + exposing_s)
             if step.lights:  # a frame with all lights off, see `rig.capture.lighting`
                 total_s += sum(step.exposure_s) + len(step.exposure_s) * self.readout_s
         return total_s
@@ -204,7 +230,8 @@ class PlannedFrame(Struct, frozen=True):
     """One frame that the plan asks for: the one with index `number`, in the step with index `step`.
 
     `sweep` is the number of earlier steps of the same kind: the sweep of a board, the light level of a flat. `repeat`
-    is the index among the frames of the same exposure time at the same stop.
+    is the index among the frames of the same exposure time at the same stop, in all rounds, and `round` that of the
+    round over the grid.
     """
 
     number: int
@@ -214,6 +241,7 @@ class PlannedFrame(Struct, frozen=True):
     stop: Stop
     exposure_s: float
     repeat: int
+    round: int = 0
 
     @property
     def name(self) -> str:
@@ -227,7 +255,11 @@ def planned_frames(plan: CapturePlan) -> tuple[PlannedFrame, ...]:
     frames: list[PlannedFrame] = []
     seen: Counter[StepKind] = Counter()
     for index, step in enumerate(plan.steps):
-        for stop, exposure_s, repeat in product(plan.stops_of(step), step.exposure_s, range(step.frames_per_node)):
-            frames.append(PlannedFrame(len(frames), index, step.kind, seen[step.kind], stop, exposure_s, repeat))
+        repeats = range(step.frames_per_node)
+        places = product(range(step.rounds), plan.stops_of(step), step.exposure_s, repeats)
+        for of_round, stop, exposure_s, repeat in places:
+            number, repeat_of_all = len(frames), of_round * step.frames_per_node + repeat
+            frame = PlannedFrame(number, index, step.kind, seen[step.kind], stop, exposure_s, repeat_of_all, of_round)
+            frames.append(frame)
         seen[step.kind] += 1
     return tuple(frames)

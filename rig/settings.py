@@ -1,6 +1,7 @@
 """The content of rig.toml, which describes the rig of a capture."""
 
 import math
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -8,7 +9,7 @@ from msgspec import Struct
 
 from faintfield.rig.cameras.settings import CameraSettings, GPhoto2Settings, Mosaic
 from faintfield.rig.lights.settings import LightSettings
-from faintfield.rig.plan import CaptureStep, Grid, StepKind, check_frame_count
+from faintfield.rig.plan import CaptureStep, Grid, StepKind, Until, check_frame_count
 from faintfield.rig.stages.protocol import StageSettings
 
 # Longest rest at a node; all frames of the measurement are held in memory.
@@ -179,6 +180,8 @@ class StepSettings(Struct, frozen=True, forbid_unknown_fields=True):
     lights : tuple of str, optional
         Names of the lights that are on, while all others are off; by default a person sees to the light, and the rig
         switches nothing.
+    until : Until, optional
+        Repeat the whole grid until the planes will have this noise at the light that was measured; for `dark_scene`.
     """
 
     kind: StepKind
@@ -187,6 +190,7 @@ class StepSettings(Struct, frozen=True, forbid_unknown_fields=True):
     at: str | None = None
     photons_per_s: float | None = None
     lights: tuple[str, ...] | None = None
+    until: Until | None = None
 
     def __post_init__(self) -> None:
         if self.at not in (None, "grid", "centre"):
@@ -200,9 +204,8 @@ class StepSettings(Struct, frozen=True, forbid_unknown_fields=True):
         """Return the step of the plan."""
         exposures = self.exposure_s if isinstance(self.exposure_s, tuple) else (self.exposure_s,)
         centred = self.at == "centre" or (self.at is None and self.kind in ("dark", "flat"))
-        return CaptureStep(
-            self.kind, exposures, self.frames_per_node, "centre" if centred else "grid", lights=self.lights
-        )
+        place: Literal["grid", "centre"] = "centre" if centred else "grid"
+        return CaptureStep(self.kind, exposures, self.frames_per_node, place, self.lights, self.until)
 
 
 class SceneSettings(Struct, frozen=True, forbid_unknown_fields=True):
@@ -243,7 +246,8 @@ class RigSettings(Struct, frozen=True, forbid_unknown_fields=True):
             known = ", ".join(map(repr, names)) or "none"
             raise ValueError(f"step.lights has {min(unknown)!r}; the lights of [[light]] are: {known}")
         nodes = self.grid.rows * self.grid.columns
-        check_frame_count(sum(step.frames_per_stop() * (nodes if step.at == "grid" else 1) for step in self.steps()))
+        stops = {"grid": nodes, "centre": 1}
+        check_frame_count(sum(step.rounds * step.frames_per_stop() * stops[step.at] for step in self.steps()))
 
     @property
     def mosaic(self) -> Mosaic | None:

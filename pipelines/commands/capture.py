@@ -151,12 +151,13 @@ def capture(
     live_sweep_mm
         The same, at FIRST:LAST:COUNT depths.
     noise
-        For these planes and the light: noise.json or its folder; by default that of the session, or beside the
-        rig.toml.
+        For these planes, the light and steps with `until`: noise.json or its folder; by default that of the session,
+        or beside the rig.toml.
     geometry
-        For these planes: geometry.json or its folder; by default that of the session, or beside the rig.toml.
+        For these planes and steps with `until`: geometry.json or its folder; by default that of the session, or
+        beside the rig.toml.
     fx_px
-        For these planes: focal length in pixels, where there is no geometry.json.
+        The same: focal length in pixels, where there is no geometry.json.
     light_e
         Planned light of the dark scene, which is compared with the measured one: as in `faintfield plan`.
     """

@@ -23,8 +23,9 @@ from faintfield.pipelines.live.planes_client import NO_POSES, LiveOrder, live_pl
 from faintfield.pipelines.live.terminal import TerminalView
 from faintfield.pipelines.termination import interrupt_on_termination
 from faintfield.rig.cameras.protocol import Pixels
-from faintfield.rig.capture.guide import format_capture_duration
+from faintfield.rig.capture.guide import describe_rounds, format_capture_duration
 from faintfield.rig.capture.loop import Capture
+from faintfield.rig.capture.rounds import NoisePredictor
 from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import CameraError, CaptureStopped, RigError
@@ -41,11 +42,12 @@ def capture_session(
     page: bool,
     planes: LiveOrder | None = None,
     meter: LightMeter | None = None,
+    noise: NoisePredictor | None = None,
 ) -> int:
     """Begin or resume the session in `folder` and take its missing frames; return the number of frames taken.
 
     Unattended, every prompt gets its usual answer. The `page` shows `planes` of the frames so far, if they are ordered.
-    The `meter` reads the light of the dark scene.
+    The `meter` reads the light of the dark scene; steps in rounds end by the `noise` that is predicted.
     Raises `RigError` or `DiskFull` if the plan is not possible, the session cannot be used, or the capture stopped
     before its end.
     """
@@ -60,7 +62,7 @@ def capture_session(
             inform(f"{folder}: {change}, from now on")
         before = len(session.valid())
         if before:
-            inform(f"{folder}: {before} of {len(session.frames)} frames are there; going on")
+            inform(f"{folder}: {before} of {len(session.wanted())} frames are there; going on")
         frames = SessionFrames(session)
         # Without a person at page or terminal, nobody could follow the advice
         boards = _follow_boards(panel, stack, session, frames) if page or not unattended else None
@@ -69,12 +71,14 @@ def capture_session(
         stack.enter_context(TerminalView(panel, frames, meter).show())
         stack.enter_context(_stop_on_interrupt(panel))
         try:
-            Capture(session, open_rig(settings, session.journal, read_pixels), panel, read_pixels).run()
+            Capture(session, open_rig(settings, session.journal, read_pixels), panel, read_pixels, noise).run()
         except RigError as failure:
             panel.end(str(failure))
             raise
         panel.end(f"Complete. Next: faintfield run {folder}")
         count = len(session.valid()) - before
+        for ended in session.rounds_ended.values():
+            inform(f"{folder}: {describe_rounds(ended)}")
     inform(f"{folder}: complete, {count} frames taken; next: faintfield run {folder}")
     return count
 
@@ -89,7 +93,8 @@ def _plan_session(settings: RigSettings, folder: Path) -> FrozenPlan:
     for warning in rig.stage.warnings:
         inform(f"warning: {warning}")
     require_room(folder, rig.plan.wanted_room_bytes())
-    inform(f"{rig.plan.frame_count()} frames, {format_capture_duration(rig.duration_s, settings.stage)}")
+    most = "at most " if any(step.until is not None for step in rig.plan.steps) else ""
+    inform(f"{most}{rig.plan.frame_count()} frames, {format_capture_duration(rig.duration_s, settings.stage)}")
     return FrozenPlan(rig.plan, settings)
 
 

@@ -147,13 +147,13 @@ class SessionFrames:
         self._session = session
         self._homings: list[Homed] = []
         self._count = -1
-        self._total = Counter(frame.step for frame in session.frames)
         self._first = {frame.step: frame for frame in reversed(session.frames)}
 
     def steps(self) -> list[StepProgress]:
         """Return the steps of the plan."""
         frames, plan = self._session.frames, self._session.plan
         done = Counter(frames[number].step for number in list(self._session.valid()))
+        total = Counter(frame.step for frame in self._session.wanted())
         skipped = Counter(frame.step for frame in self._session.skipped())
         return [
             StepProgress(
@@ -162,7 +162,7 @@ class SessionFrames:
                 frames=_describe_frames(step, len(plan.stops_of(step))),
                 done=done[index],
                 skipped=skipped[index],
-                total=self._total[index],
+                total=total[index],
                 preparations=preparations(plan.steps, self._first[index]),
             )
             for index, step in enumerate(plan.steps)
@@ -239,4 +239,6 @@ def _describe_frames(step: CaptureStep, stops: int) -> str:
     """Return the frames of a step, such as `49 nodes, 10 x 0.1 s`."""
     place = "centre node" if step.at == "centre" else f"{stops} nodes" if stops > 1 else "1 node"
     repeats = f"{step.frames_per_node} x " if step.frames_per_node > 1 else ""
-    return f"{place}, {repeats}{', '.join(f'{exposure_s:g}' for exposure_s in step.exposure_s)} s"
+    until = step.until
+    rounds = "" if until is None else f", at most {until.at_most_rounds} rounds, until σ is {until.sigma_e:g} e⁻"
+    return f"{place}, {repeats}{', '.join(f'{exposure_s:g}' for exposure_s in step.exposure_s)} s{rounds}"

@@ -121,8 +121,9 @@ def _key_line(buttons: Iterable[Answer | OperatorRequest], gap: str, prompt: Pro
 def _describe_status(status: Status) -> str:
     node = "" if status.node is None else f" node {status.node[0]},{status.node[1]}"
     to_go = f", {format_duration(status.to_go_s)} to go" if status.done < status.total else ""
+    rounds = f"\n{visible(status.rounds)}" if status.rounds else ""
     devices = "\n" + visible(f"stage: {status.stage}; camera: {status.camera}") if status.stage else ""
-    return visible(f"{status.done} of {status.total} frames{to_go};{node}: {status.doing}") + devices
+    return visible(f"{status.done} of {status.total} frames{to_go};{node}: {status.doing}") + rounds + devices
 
 
 @lru_cache(maxsize=1)

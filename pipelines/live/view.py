@@ -23,6 +23,7 @@ _LABELS: dict[Answer | OperatorRequest, str] = {
     "keep": "keep as it is",
     "retake": "take again",
     "skip": "skip frame",
+    "finish": "finish after this round",
     "stop": "stop",
     "pause": "pause",
 }
@@ -33,6 +34,7 @@ KEYS: dict[Answer | OperatorRequest, str] = {
     "keep": "k",
     "retake": "r",
     "skip": "s",
+    "finish": "f",
     "stop": "q",
     "pause": "p",
 }
@@ -329,10 +331,7 @@ def _offset_dn(sensor: Sensor | None) -> tuple[float, float] | None:
     """Return the offset and the read noise of a sensor in DN, None if they are not known."""
     if sensor is None:
         return None
-    offset = sensor.record.offset_dn.value if sensor.record is not None else None
-    if sensor.model is not None:
-        offset = float(np.median(sensor.model.offset_dn))
-    read_noise_e, gain = sensor.read_noise_e.value, sensor.gain_dn_per_e.value
+    offset, read_noise_e, gain = sensor.offset_dn(), sensor.read_noise_e.value, sensor.gain_dn_per_e.value
     return None if offset is None or read_noise_e is None or gain is None else (offset, read_noise_e * gain)
 
 

@@ -20,6 +20,7 @@ from faintfield.pipelines.planning.options import PlanOptions
 from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import RigError
+from faintfield.rig.plan import Grid, centre_node, grid_nodes
 from faintfield.rig.session.session import FRAMES, has_session, taken_frames
 from faintfield.rig.settings import RigSettings
 from faintfield.rig.simulation.lab import lab_experiment
@@ -60,6 +61,25 @@ class Sensor:
     path: Path | None = None
     model: NoiseModel | None = None
 
+    def offset_dn(self) -> float | None:
+        """Return the mean or median offset in DN, None if it is not known."""
+        if self.model is not None:
+            return float(np.median(self.model.offset_dn))
+        return None if self.record is None else self.record.offset_dn.value
+
+
+def pixel_share(settings: RigSettings, sensor: Sensor) -> float:
+    """Return the part of the pixels that have the scarcest colour."""
+    measured = sensor.record.mosaic if sensor.record is not None else None
+    filters = "".join(settings.mosaic or measured or "X")
+    return min(filters.count(letter) for letter in filters) / len(filters)
+
+
+def grid_centres_mm(grid: Grid) -> NDArray[np.float64]:
+    """Return the places (view, 2) of the cameras of a grid relative to the reference camera, right and down."""
+    nodes = np.array(grid_nodes(grid.rows, grid.columns)) - centre_node(grid.rows, grid.columns)
+    return np.asarray(grid.pitch_mm * nodes[:, ::-1], np.float64)
+
 
 def known_sensor(settings: RigSettings, noise: Path | None, **options: float | None) -> Sensor:
     """Return the sensor by `options`, named as attributes of `Sensor`, else measured (`noise`), else simulated."""
@@ -82,7 +102,7 @@ def known_sensor(settings: RigSettings, noise: Path | None, **options: float | N
     return Sensor(f"options and {source}" if stated else source, **known, record=record, path=noise, model=model)
 
 
-def view_noise_e(read_noise_e: float, gain_dn_per_e: float | None, frames: int) -> float:
+def view_noise_e(read_noise_e: float, gain_dn_per_e: float | None, frames: float) -> float:
     """Return the standard deviation of read noise and of rounding to DN in the sum of so many frames, in electrons."""
     rounding_e2 = 0.0 if gain_dn_per_e is None else 1 / (12 * gain_dn_per_e**2)
     return math.sqrt(frames * (read_noise_e**2 + rounding_e2))

@@ -24,9 +24,11 @@ from faintfield.pipelines.planning.known import (
     Light,
     Sensor,
     calibration_file,
+    grid_centres_mm,
     known_lens,
     known_pace,
     known_sensor,
+    pixel_share,
     planned_light,
     view_noise_e,
 )
@@ -47,7 +49,7 @@ from faintfield.recon.prediction import (
     smallest_contrast,
 )
 from faintfield.rig.errors import KeepOutCrossed, OutsideTravel
-from faintfield.rig.plan import MAX_EXPOSURE_S, CapturePlan, Grid, centre_node, check_frame_count, grid_nodes
+from faintfield.rig.plan import MAX_EXPOSURE_S, CapturePlan, Grid, centre_node, check_frame_count
 from faintfield.rig.settings import RigSettings
 from faintfield.rig.stages.protocol import Point
 
@@ -149,9 +151,7 @@ class Predictor:
     @cached_property
     def pixel_share(self) -> float:
         """Part of the pixels that have the scarcest colour."""
-        measured = self.sensor.record.mosaic if self.sensor.record is not None else None
-        filters = "".join(self.settings.mosaic or measured or "X")
-        return min(filters.count(letter) for letter in filters) / len(filters)
+        return pixel_share(self.settings, self.sensor)
 
     def record(self, rig: str) -> PredictionRecord:
         """Return the whole prediction."""
@@ -267,8 +267,7 @@ class Predictor:
 
     def _views(self, grid: Grid, depth_mm: float | None) -> tuple[Array, Array]:
         """Return the cameras' places (view, 2) relative to the reference camera, and the response of each view."""
-        nodes = np.array(grid_nodes(grid.rows, grid.columns)) - centre_node(grid.rows, grid.columns)
-        centres_mm = grid.pitch_mm * nodes[:, ::-1].astype(float)
+        centres_mm = grid_centres_mm(grid)
         return centres_mm, self.lens.responses(centres_mm, depth_mm)
 
     def _seen_by_all_mm(self, grid: Grid, mm_per_px: float | None) -> tuple[float, float] | None:

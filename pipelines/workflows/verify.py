@@ -16,6 +16,7 @@ from faintfield.pipelines.formats.results.verification import (
     records_of,
     verify_results,
 )
+from faintfield.rig.capture.guide import describe_rounds
 from faintfield.rig.errors import SessionCorrupt
 from faintfield.rig.session.session import JOURNAL, has_session, taken_frames
 from faintfield.rig.session.verify import WAL_NOT_COVERED, Verdict, repair, verify
@@ -89,6 +90,8 @@ def _report_session(folder: Path, verdict: Verdict) -> None:
     ):
         if count:
             inform(f"  {count} {what}")
+    for ended in verdict.rounds:
+        inform(f"  {describe_rounds(ended)}")
 
 
 def _report_results(path: Path, verdict: ResultVerdict) -> None:

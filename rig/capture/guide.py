@@ -9,9 +9,11 @@ from msgspec import Struct
 
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.capture.checks import Findings
+from faintfield.rig.capture.rounds import NoisePredictor, Progress, Rounds
 from faintfield.rig.clock import Clock
 from faintfield.rig.errors import CaptureStopped
 from faintfield.rig.plan import CaptureStep, PlannedFrame, StepKind
+from faintfield.rig.session.journal import RoundsEnded
 from faintfield.rig.session.session import Session
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.motion import one_sided_duration_s
@@ -20,7 +22,7 @@ from faintfield.rig.stages.protocol import Point, StageSettings
 if TYPE_CHECKING:  # views of a capture need no drivers
     from faintfield.rig.devices import Rig
 
-type Answer = Literal["go", "test", "again", "keep", "retake", "skip", "stop"]
+type Answer = Literal["go", "test", "again", "keep", "retake", "skip", "finish", "stop"]
 type OperatorRequest = Literal["pause", "skip", "retake", "stop"]
 
 _TO_DO: dict[StepKind, tuple[str, ...]] = {
@@ -94,7 +96,8 @@ class Status(Struct, frozen=True):
 
     `done` of `total` frames are taken; the rest takes `to_go_s` without prompts. `node` is where the stage is or goes,
     and `grid` has the share of this step's frames that is done, per row and column; −1 where the step has none. `stage`
-    and `camera` are their states in words; the missing frames of each step take `step_to_go_s`.
+    and `camera` are their states in words; the missing frames of each step take `step_to_go_s`. `rounds` says how far a
+    step in rounds is, else it is empty.
     """
 
     doing: str
@@ -110,6 +113,7 @@ class Status(Struct, frozen=True):
     stage: str = ""
     camera: str = ""
     step_to_go_s: tuple[float, ...] = ()
+    rounds: str = ""
 
 
 class ShownFrame(Struct, frozen=True, eq=False):
@@ -158,7 +162,10 @@ def needs_hand(step: CaptureStep, before: StepKind | None) -> bool:
 def step_prompt(steps: Sequence[CaptureStep], frame: PlannedFrame, frames: int, duration_s: float) -> Prompt:
     """Return the prompt before a step, whose first of `frames` frames is `frame`; they take `duration_s`."""
     test = "A test frame, at the first node, shows whether all is in view, sharp and well exposed; it is not recorded."
-    motion = f"Then {frames} frames follow, {format_duration(duration_s)}. The stage moves by itself: keep clear of it."
+    until = steps[frame.step].until
+    rounds = "" if until is None else f"rounds over the grid until the noise is {until.sigma_e:g} e⁻, at most "
+    frames_follow = f"Then {rounds}{frames} frames follow, {format_duration(duration_s)}."
+    motion = f"{frames_follow} The stage moves by itself: keep clear of it."
     return Prompt(
         key="step",
         title=_step_title(frame, len(steps)),
@@ -195,6 +202,26 @@ def format_duration(duration_s: float) -> str:
         return f"about {max(1, round(duration_s))} s"
     minutes = round(duration_s / 60)
     return f"about {minutes} min" if minutes < 90 else f"about {minutes // 60} h {minutes % 60:02d} min"
+
+
+def describe_progress(progress: Progress, to_go_s: float) -> str:
+    """Return how far a step in rounds is, such as `σ now 0.21 e⁻, wanted 0.1: 3 more rounds, about 41 min`."""
+    until, more = progress.until, progress.enough - progress.done
+    if progress.final_e is None:
+        return f"σ is not known, wanted {until.sigma_e:g} e⁻: all {until.at_most_rounds} rounds are taken"
+    now = "" if progress.sigma_e is None else f"now {progress.sigma_e:.2g} e⁻, "
+    if not progress.reaches:
+        now += f"{progress.final_e:.2g} e⁻ after all {until.at_most_rounds} rounds, "
+    rounds = "no more rounds" if more <= 0 else f"{more} more {'round' if more == 1 else 'rounds'}"
+    time = f", {format_duration(to_go_s)}" if more > 0 else ""
+    return f"σ {now}wanted {until.sigma_e:g}: {rounds}{time}"
+
+
+def describe_rounds(ended: RoundsEnded) -> str:
+    """Return how a step in rounds ended, such as `step 4 ended after 3 rounds, at a predicted σ of 0.098 e⁻`."""
+    rounds = "1 round" if ended.rounds == 1 else f"{ended.rounds} rounds"
+    noise = "" if ended.sigma_e is None else f", at a predicted σ of {ended.sigma_e:.2g} e⁻"
+    return f"step {ended.step + 1} ended after {rounds}{noise}{', by the operator' * ended.by_operator}"
 
 
 def format_capture_duration(duration_s: float, stage: StageSettings) -> str:
@@ -282,12 +309,15 @@ MAX_UNATTENDED_TRIES = 3
 class Dialogue:
     """The capture's side of the conversation with the operator, which the journal of the session keeps.
 
-    `pace` estimates the remaining time. Shown with the status are the latest `warnings`, and the states of `stage` and
-    `camera` in words.
+    `pace` estimates the remaining time, and `rounds` how many rounds are needed. Shown with the status are the latest
+    `warnings`, and the states of `stage` and `camera` in words.
     """
 
-    def __init__(self, session: Session, rig: "Rig", operator: OperatorInterface) -> None:
+    def __init__(
+        self, session: Session, rig: "Rig", operator: OperatorInterface, noise: NoisePredictor | None = None
+    ) -> None:
         self.session = session
+        self.rounds = Rounds(session, noise)
         self.rig = rig
         self.pace = Pace(rig.stage, rig.clock, session.plan.settle_s, session.plan.readout_s)
         self.operator = operator
@@ -315,13 +345,14 @@ class Dialogue:
     def stop(self) -> NoReturn:
         """Raise `CaptureStopped` on behalf of the operator."""
         self.session.journal.event("stopped")
-        done, total = len(self.session.valid()), len(self.session.frames)
+        done, total = len(self.session.valid()), len(self.session.wanted())
         raise CaptureStopped(f"stopped with {done} of {total} frames taken; run the same command to go on")
 
     def show_status(self, frame: PlannedFrame, doing: str, recording: PlannedFrame | None = None) -> None:
         """Show the state of the capture, which is `doing` something for `frame`, while another one is recorded."""
         session = self.session
-        missing, steps = [left for left in session.missing() if left != recording], session.plan.steps
+        missing = self.rounds.expected([left for left in session.missing() if left != recording])
+        steps, progress = session.plan.steps, self.rounds.progress(frame.step)
         steps_s = self.pace.step_durations_s(missing)
         if session.frozen.rig.drift.check:
             for step in steps_s:
@@ -332,7 +363,7 @@ class Dialogue:
             steps=len(steps),
             title=_step_title(frame, len(steps)),
             done=len(session.valid()),
-            total=len(session.frames),
+            total=len(session.wanted()),
             to_go_s=sum(steps_s.values()),
             node=frame.stop.node,
             grid=self._shares_done(frame.step),
@@ -340,6 +371,7 @@ class Dialogue:
             stage=self.stage,
             camera=self.camera,
             step_to_go_s=tuple(steps_s.get(step, 0.0) for step in range(len(steps))),
+            rounds="" if progress is None else describe_progress(progress, steps_s.get(frame.step, 0.0)),
         )
         self.operator.show_status(status)
 
@@ -347,7 +379,7 @@ class Dialogue:
         """Return the share of a step's frames that is done, per row and column; −1 where the step has none."""
         grid, valid = self.session.frozen.rig.grid, self.session.valid()
         done: defaultdict[tuple[int, int], list[bool]] = defaultdict(list)
-        for frame in self.session.frames:
+        for frame in self.session.wanted():
             if frame.step == step:
                 done[frame.stop.node].append(frame.number in valid)
         nodes = [[done.get((row, column)) for column in range(grid.columns)] for row in range(grid.rows)]

@@ -16,6 +16,7 @@ from faintfield.rig.capture.guide import (
     step_prompt,
 )
 from faintfield.rig.capture.lighting import Lighting
+from faintfield.rig.capture.rounds import NoisePredictor
 from faintfield.rig.capture.survey import check_plan
 from faintfield.rig.capture.take import DriftChecks, FrameTaker
 from faintfield.rig.devices import Rig
@@ -41,13 +42,21 @@ _DEVICES = {CameraError: "camera", LightError: "light"}
 class Capture:
     """Takes the missing frames of an open session, with a rig that is not yet connected; call `run` once.
 
-    `decode` reads the pixels of a frame's file for checks and display; it returns None if it cannot.
+    `decode` reads the pixels of a frame's file for checks and display; it returns None if it cannot. Steps in rounds
+    end when the `noise` that is predicted reaches the wanted one; without a predictor they take all rounds.
     """
 
-    def __init__(self, session: Session, rig: Rig, operator: OperatorInterface, decode: Decode) -> None:
+    def __init__(
+        self,
+        session: Session,
+        rig: Rig,
+        operator: OperatorInterface,
+        decode: Decode,
+        noise: NoisePredictor | None = None,
+    ) -> None:
         self._session = session
         self._rig = rig
-        self._dialogue = Dialogue(session, rig, operator)
+        self._dialogue = Dialogue(session, rig, operator, noise)
         self._drift = DriftChecks(self._dialogue)
         self._lighting = Lighting(session, rig)
         self._taker = FrameTaker(self._dialogue, self._drift, self._lighting, decode)
@@ -64,8 +73,8 @@ class Capture:
         try:
             if self._session.missing():
                 self._connect()
-            while missing := self._session.missing() or self._ask_about_skipped():
-                self._run_step(missing)
+            while missing := self._missing() or self._ask_about_skipped():
+                self._run_round(missing)
             if self._drift.watch is not None:  # a capture that was killed may have left nothing but the last check
                 self._mark_unchecked("the capture ended")
             self._switch_lights_off()
@@ -83,6 +92,10 @@ class Capture:
         self._dialogue.show_status(self._session.frames[-1], "sealing")
         self._session.seal()
         self._dialogue.show_status(self._session.frames[-1], "complete")
+
+    def _missing(self) -> list[PlannedFrame]:
+        self._dialogue.rounds.end_steps()
+        return self._session.missing()
 
     def _switch_lights_off(self) -> None:
         if failures := self._lighting.switch_off():
@@ -127,18 +140,23 @@ class Capture:
         earlier = [step.kind for step in self._session.plan.steps[: first.step]]
         return next((kind for kind in earlier if kind in BY_HAND), None)
 
-    def _run_step(self, missing: list[PlannedFrame]) -> None:
+    def _run_round(self, missing: list[PlannedFrame]) -> None:
+        """Take the missing frames of a step, or of one round of it, whose first comes first."""
         session, first = self._session, missing[0]
-        frames = [frame for frame in missing if frame.step == first.step]
-        if needs_hand(session.plan.steps[first.step], self._kind_before(first)):
+        of_step = [frame for frame in missing if frame.step == first.step]
+        frames = [frame for frame in of_step if frame.round == first.round]
+        last = self._taker.last
+        goes_on = first.round > 0 and last is not None and last.step == first.step
+        if needs_hand(session.plan.steps[first.step], self._kind_before(first)) and not goes_on:
             self._dialogue.show_status(first, "waiting for your answer")
-            duration_s = self._dialogue.pace.remaining_s(frames, 0)
-            prompt = step_prompt(session.plan.steps, first, len(frames), duration_s)
+            expected = self._dialogue.rounds.expected(of_step)
+            duration_s = self._dialogue.pace.remaining_s(expected, 0)
+            prompt = step_prompt(session.plan.steps, first, len(expected), duration_s)
             while (answer := self._dialogue.ask_or_stop(prompt)) == "test":
                 self._rig.arrange(first.kind, first.sweep)
                 self._take_test(first)
             if answer == "skip":
-                for frame in frames:
+                for frame in of_step:
                     session.skip(frame)
                 return
             self._dialogue.warnings = ()  # those of test frames
@@ -206,9 +224,14 @@ class Capture:
             self._dialogue.stop()
         if request == "pause":
             self._dialogue.show_status(frame, "paused")
-            lines = (f"The next frame is {frame.name}.",)
-            prompt = Prompt("paused", "Paused", lines, ("go", "retake", "skip", "stop"), "go")
-            choice = self._dialogue.ask_or_stop(prompt)
+            lines: tuple[str, ...] = (f"The next frame is {frame.name}.",)
+            answers: tuple[Answer, ...] = ("go", "retake", "skip", "stop")
+            if self._dialogue.rounds.progress(frame.step) is not None:
+                answers = ("go", "retake", "skip", "finish", "stop")
+                lines += ("The step can finish with this round.",)
+            choice = self._dialogue.ask_or_stop(Prompt("paused", "Paused", lines, answers, "go"))
+        if choice == "finish":
+            self._dialogue.rounds.end_after_this(frame.step)
         if choice == "skip":
             self._session.skip(frame)
         if choice == "retake" and self._taker.last is not None:

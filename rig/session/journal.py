@@ -119,6 +119,19 @@ class Sealed(Struct, frozen=True):
     skipped: tuple[int, ...]
 
 
+class RoundsEnded(Struct, frozen=True):
+    """Detail of the event `rounds_ended`: a step, by its index, needs no more than these rounds.
+
+    `sigma_e` is the predicted noise of a sample after them, in electrons, None if it is not known; `by_operator` says
+    that a person ended the step.
+    """
+
+    step: int
+    rounds: _Number
+    sigma_e: float | None
+    by_operator: bool = False
+
+
 class Journal:
     """An open journal, which is also the `TrafficLog` of the stage; `read_only` opens it on a write-protected medium.
 

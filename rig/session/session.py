@@ -16,10 +16,13 @@ from faintfield.rig.files import is_plain_name, read_regular, sha256
 from faintfield.rig.plan import MAX_NUMBER, CapturePlan, PlannedFrame, planned_frames
 from faintfield.rig.session.database import FORMAT
 from faintfield.rig.session.disk import encode_exposure, list_names, set_aside, translate_errors, write_new
-from faintfield.rig.session.journal import CommittedFrame, FrameRecord, Journal, Sealed
+from faintfield.rig.session.journal import CommittedFrame, FrameRecord, Journal, RoundsEnded, Sealed
 from faintfield.rig.settings import RigSettings
 
 PLAN, JOURNAL, FRAMES, SUMS, ASIDE = "plan.json", "journal.sqlite", "frames", "SHA256SUMS", "set_aside"
+
+# Kind of the journal's event for a step that needs no further rounds.
+ROUNDS_ENDED = "rounds_ended"
 
 # Size in bytes of the plan of MAX_FRAMES stops, and more.
 _MAX_PLAN_BYTES = 32_000_000
@@ -63,6 +66,7 @@ class Session:
         self.is_decided = left_out is not None
         self._skipped = set(left_out or ())
         self._valid = valid_frames(folder, self.frames, journal.committed())
+        self.rounds_ended = {ended.step: ended for ended in journal.details(ROUNDS_ENDED, RoundsEnded)}
 
     @property
     def plan(self) -> CapturePlan:
@@ -73,13 +77,23 @@ class Session:
         """Return the valid frames by their index in the plan."""
         return self._valid
 
+    def wanted(self) -> list[PlannedFrame]:
+        """Return the frames of the plan, in order, without those of rounds that are not needed."""
+        return wanted_frames(self.frames, self.rounds_ended.values())
+
     def missing(self) -> list[PlannedFrame]:
         """Return the frames still to be taken, in order, without those skipped since the session was opened."""
-        return [frame for frame in self.frames if frame.number not in self._valid and frame.number not in self._skipped]
+        there = self._valid.keys() | self._skipped
+        return [frame for frame in self.wanted() if frame.number not in there]
+
+    def end_rounds(self, ended: RoundsEnded) -> None:
+        """Record that a step needs no further rounds: their frames are not wanted any more."""
+        self.journal.add_events(ROUNDS_ENDED, [ended])
+        self.rounds_ended[ended.step] = ended
 
     def skipped(self) -> list[PlannedFrame]:
         """Return the frames that were skipped since the session was opened."""
-        return [self.frames[number] for number in sorted(self._skipped)]
+        return [frame for frame in self.wanted() if frame.number in self._skipped]
 
     def skip(self, frame: PlannedFrame) -> None:
         """Leave a frame out until it is asked for again."""
@@ -136,7 +150,8 @@ class Session:
         Skipped frames are left out for good, as the journal records. Raises `SessionUnwritable` if another program has
         the journal open; the session can then be resumed.
         """
-        self.journal.event("sealed", skipped=sorted(self._skipped), frames=len(self._valid))
+        skipped = [frame.number for frame in self.skipped()]
+        self.journal.event("sealed", skipped=skipped, frames=len(self._valid))
         write_sums(self.folder, self.journal)
 
 
@@ -224,6 +239,13 @@ def disagreements(frames: Sequence[PlannedFrame], committed: Iterable[CommittedF
             yield f"{FRAMES}/{frame.file}: has another exposure time than in the plan"
         elif frame.void is None and taken.setdefault(frame.frame, frame.file) != frame.file:
             yield f"{FRAMES}/{frame.file}: is the same frame as {taken[frame.frame]}"
+
+
+def wanted_frames(frames: Iterable[PlannedFrame], rounds_ended: Iterable[RoundsEnded]) -> list[PlannedFrame]:
+    """Return the frames without those of rounds that are not needed."""
+    if not (rounds := {ended.step: ended.rounds for ended in rounds_ended}):
+        return list(frames)
+    return [frame for frame in frames if frame.round < rounds.get(frame.step, frame.round + 1)]
 
 
 def exposure_name(frame: PlannedFrame, intent: int) -> str:

@@ -11,12 +11,13 @@ from faintfield.rig.files import read_regular, sha256
 from faintfield.rig.plan import planned_frames
 from faintfield.rig.session.database import wal_bytes
 from faintfield.rig.session.disk import list_names, lock_session, set_aside, translate_errors
-from faintfield.rig.session.journal import Begun, CommittedFrame, Sealed, Suspect
+from faintfield.rig.session.journal import Begun, CommittedFrame, RoundsEnded, Sealed, Suspect
 from faintfield.rig.session.session import (
     ASIDE,
     FRAMES,
     JOURNAL,
     PLAN,
+    ROUNDS_ENDED,
     SUMS,
     disagreements,
     exposure_name,
@@ -25,6 +26,7 @@ from faintfield.rig.session.session import (
     open_journal,
     read_plan,
     read_plan_and_hash,
+    wanted_frames,
     write_sums,
 )
 
@@ -54,13 +56,15 @@ class Verdict(Struct, frozen=True):
         Files in `frames/` of exposures that were cut short. This is ordinary: the next capture sets them aside and
         takes their frames.
     planned, present, superseded : int
-        Number of frames in the plan, of those whose file is present and unchanged, and of files replaced by a later
-        take.
+        Number of frames in the plan, without those of rounds that were not needed; of those whose file is present and
+        unchanged; and of files replaced by a later take.
     missing, left_out, suspect : tuple of str
         Names of the frames still to be taken, of those that the operator left out, and of those that were kept although
         the next check of the stage failed, or the stage was homed before it.
     sealed : bool
         Whether the session is complete.
+    rounds : tuple of RoundsEnded
+        Steps that ended before their last round.
     """
 
     problems: tuple[str, ...]
@@ -72,6 +76,7 @@ class Verdict(Struct, frozen=True):
     superseded: int
     suspect: tuple[str, ...]
     sealed: bool
+    rounds: tuple[RoundsEnded, ...] = ()
 
 
 def verify(folder: Path, progress: Callable[[Iterable[Path]], Iterable[Path]] = iter) -> Verdict:
@@ -88,6 +93,7 @@ def verify(folder: Path, progress: Callable[[Iterable[Path]], Iterable[Path]] = 
             begun = [event.plan_sha256 for event in journal.details("begun", Begun)]
             sealed = [event.skipped for event in journal.details("sealed", Sealed)]
             suspects = {intent for event in journal.details("suspect", Suspect) for intent in event.intents}
+            rounds_ended = tuple(journal.details(ROUNDS_ENDED, RoundsEnded))
             uncommitted = journal.uncommitted()
         names = list_names(folder / FRAMES)
         digests: _Digests = {path.name: _digest(path) for path in progress([folder / FRAMES / name for name in names])}
@@ -104,20 +110,22 @@ def verify(folder: Path, progress: Callable[[Iterable[Path]], Iterable[Path]] = 
             problems += _compare_sums(folder, committed, digests)
         valid = {frame.frame: frame for frame in committed if frame.void is None}
         left_out = {number for numbers in sealed[-1:] for number in numbers}
-        open_frames = [frame for frame in frames if frame.number not in valid]
+        wanted = wanted_frames(frames, rounds_ended)
+        open_frames = [frame for frame in wanted if frame.number not in valid]
         missing = tuple(frame.name for frame in open_frames if frame.number not in left_out)
         if is_sealed(folder):
             problems += [f"{name}: is missing although the session is complete" for name in missing]
         return Verdict(
             problems=tuple(problems),
             interrupted=interrupted,
-            planned=len(frames),
+            planned=len(wanted),
             present=sum(digests.get(frame.file) == frame.sha256 for frame in valid.values()),
             missing=missing,
             left_out=tuple(frame.name for frame in open_frames if frame.number in left_out),
             superseded=sum(frame.void is not None and frame.file in digests for frame in committed),
             suspect=tuple(frame.file for frame in valid.values() if frame.intent in suspects),
             sealed=is_sealed(folder),
+            rounds=rounds_ended,
         )
 
 

@@ -1,5 +1,6 @@
 """The frames of one kind of a session as an elemental set, in the session's own files."""
 
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -83,16 +84,36 @@ def files_of_scene(folder: Path, kind: SceneKind = "dark_scene") -> list[str]:
 
 
 def _frames_of_views(folder: Path, plan: CapturePlan, kind: SceneKind) -> tuple[float, list[tuple[Stop, list[str]]]]:
-    """Return the exposure of a view, and its frames' names at every node that has all of them, in raster order."""
+    """Return the exposure of a view, and its frames' names at every node that has all of them, in raster order.
+
+    Of steps in rounds, those are the frames of the first rounds, as many as give the most light in all views together.
+    """
     planned = [frame for frame in planned_frames(plan) if frame.kind == kind]
-    at_centre = [frame.exposure_s for frame in planned if frame.stop == plan.centre]
-    taken: dict[tuple[int, int], tuple[Stop, list[str]]] = {}
+    at_centre = [frame for frame in planned if frame.stop == plan.centre]
+    wanted = Counter(frame.round for frame in at_centre)
+    stops: dict[tuple[int, int], Stop] = {}
+    taken: defaultdict[tuple[int, int], defaultdict[int, list[str]]] = defaultdict(lambda: defaultdict(list))
     for frame, _, path in taken_frames(folder):
         if frame.kind == kind:
             if not is_file(path):
                 raise MissingFile(f"{path}: is in the journal but missing; restore it from a copy")
-            taken.setdefault(frame.stop.node, (frame.stop, []))[1].append(str(path.relative_to(folder)))
-    whole = [taken[node] for node in sorted(taken) if len(taken[node][1]) == len(at_centre)]
+            stops[frame.stop.node] = frame.stop
+            taken[frame.stop.node][frame.round].append(str(path.relative_to(folder)))
+
+    def nodes_with(rounds: int) -> list[tuple[int, int]]:
+        return [
+            node
+            for node, names in sorted(taken.items())
+            if all(len(names[number]) == wanted[number] for number in range(rounds))
+        ]
+
+    def exposure_s(rounds: int) -> float:
+        return sum(frame.exposure_s for frame in at_centre if frame.round < rounds)
+
+    rounds = max(range(1, len(wanted) + 1), key=lambda count: exposure_s(count) * len(nodes_with(count)), default=0)
+    whole = [
+        (stops[node], [name for number in range(rounds) for name in taken[node][number]]) for node in nodes_with(rounds)
+    ]
     if not at_centre or plan.centre not in [stop for stop, _ in whole]:
         raise BadValue(
             f"{folder}: has no {_NAMES[kind]} frame of the centre node {list(plan.centre.node)}, whose camera is the "
@@ -100,7 +121,11 @@ def _frames_of_views(folder: Path, plan: CapturePlan, kind: SceneKind) -> tuple[
         )
     if lacking := len({frame.stop.node for frame in planned}) - len(whole):
         inform(f"{folder}: {lacking} nodes lack {_NAMES[kind]} frames and are left out; capture again to take them")
-    return sum(at_centre), whole
+    if further := sum(
+        len(names) for of_node in taken.values() for number, names in of_node.items() if number >= rounds
+    ):
+        inform(f"{folder}: {further} frames of a round that is not whole are left out; capture again to complete it")
+    return exposure_s(rounds), whole
 
 
 def _at_centre(folder: Path, kind: StepKind) -> list[tuple[Path, float]]:
