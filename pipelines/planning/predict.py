@@ -2,6 +2,7 @@
 
 import math
 import re
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -49,7 +50,7 @@ from faintfield.recon.prediction import (
     smallest_contrast,
 )
 from faintfield.rig.errors import KeepOutCrossed, OutsideTravel
-from faintfield.rig.plan import MAX_EXPOSURE_S, CapturePlan, Grid, centre_node, check_frame_count
+from faintfield.rig.plan import MAX_EXPOSURE_S, CapturePlan, Grid, Until, centre_node, check_frame_count
 from faintfield.rig.settings import RigSettings
 from faintfield.rig.stages.protocol import Point
 
@@ -68,6 +69,10 @@ class View(NamedTuple):
 
     exposure_s: float
     frames: int
+
+    def times(self, rounds: int) -> "View":
+        """Return the frames of so many rounds."""
+        return View(rounds * self.exposure_s, rounds * self.frames)
 
 
 def predict_capture(rig: Path, options: PlanOptions) -> PredictionRecord:
@@ -116,7 +121,7 @@ def parse_grids(texts: Sequence[str]) -> list[tuple[int, int]]:
 
 
 def scene_view(settings: RigSettings, options: PlanOptions) -> tuple[float, View]:
-    """Return the exposure of one frame of the dark scene, and the view that the frames of a node add up to."""
+    """Return the exposure of one frame of the dark scene, and the view that frames of a node and round add up to."""
     frames_s = [
         exposure_s
         for step in settings.steps()
@@ -132,8 +137,8 @@ def scene_view(settings: RigSettings, options: PlanOptions) -> tuple[float, View
 class Predictor:
     """Prediction from what is known of the rig and the scene; for the pace, a reason if it is not known.
 
-    `exposure_s` is that of one frame of the dark scene, `view` all frames of a node. `depths_mm` is empty if no depth
-    is known, `grids` if only the rig's own is asked for.
+    `exposure_s` is that of one frame of the dark scene, `view` the frames of a node in one round. `depths_mm` is empty
+    if no depth is known, `grids` if only the rig's own is asked for.
     """
 
     settings: RigSettings
@@ -155,7 +160,8 @@ class Predictor:
 
     def record(self, rig: str) -> PredictionRecord:
         """Return the whole prediction."""
-        grid, view, exposure_s, sigma_e = self.settings.grid, self.view, self.exposure_s, self.options.sigma_e
+        grid, exposure_s, sigma_e = self.settings.grid, self.exposure_s, self.options.sigma_e
+        view, rounds = self.whole_view, self.rounds
         rows = self._alternatives()
         reaching = [row for row in rows if _reaches(row, sigma_e)]
         return PredictionRecord(
@@ -180,11 +186,47 @@ class Predictor:
             vignetting=None if self.lens.response is not None else "no flats in the noise calibration",
             rose_k=self.options.rose_k,
             depths=[self._depth(depth_mm) for depth_mm in self.depths_mm or (None,)],
-            time_s=self._duration(grid, {})[0],
+            time_s=self._duration(grid, {}, rounds)[0],
             alternatives=rows,
             wanted_sigma_e=sigma_e,
             cheapest=min(reaching, key=lambda row: row.time_s.value or 0.0, default=None),
+            until=self.until,
+            rounds=rounds,
+            reached_e=self._sigma(view, self._fewest(grid), exposure_s),
         )
+
+    @property
+    def until(self) -> Until | None:
+        """When the dark scene needs no more rounds; None if it has no rounds."""
+        return next((step.until for step in self.settings.step if step.until is not None), None)
+
+    @cached_property
+    def rounds(self) -> int:
+        """Number of rounds that the dark scene will take."""
+        return self._rounds(self.view, self._fewest(self.settings.grid))
+
+    @cached_property
+    def whole_view(self) -> View:
+        """Frames of a node in all rounds."""
+        return self.view.times(self.rounds)
+
+    def _rounds(self, view: View, response: Array) -> int:
+        """Return the number of rounds, of this view each, that reach the wanted noise; all if that is not known."""
+        until = self.until
+        if until is None:
+            return 1
+
+        def minus_sigma_e(rounds: int) -> float:
+            sigma_e = self._sigma(view.times(rounds), response, self.exposure_s).value
+            return -math.inf if sigma_e is None else -sigma_e
+
+        most = until.at_most_rounds
+        return min(1 + bisect_left(range(1, most + 1), -until.sigma_e, key=minus_sigma_e), most)
+
+    def _fewest(self, grid: Grid) -> Array:
+        """Return the response of each view at the depth that the fewest views see."""
+        responses = [self._views(grid, depth_mm)[1] for depth_mm in self.depths_mm or (None,)]
+        return min(responses, key=lambda response: float(np.square(response).sum()))
 
     def _from_light(self, view: View, compute: Callable[[float, float, float], float]) -> Estimate:
         """Return a number computed from light, dark electrons and read noise of a view, all in electrons."""
@@ -213,7 +255,7 @@ class Predictor:
             depth_mm=depth_mm,
             views=int(np.count_nonzero(response)),
             seen_by_all_mm=self._seen_by_all_mm(grid, scale.value),
-            sigma_e=self._sigma(self.view, response),
+            sigma_e=self._sigma(self.whole_view, response),
             mm_per_px=scale,
             blur_mm=_with(lambda blur, mm: blur * mm, blur, scale),
             depth_step_mm=step,
@@ -221,7 +263,7 @@ class Predictor:
         )
 
     def _feature(self, centres_mm: Array, response: Array, side_px: float, depth: Estimate) -> FeaturePrediction:
-        contrast = self._contrast(self.view, response, side_px)
+        contrast = self._contrast(self.whole_view, response, side_px)
         unknown = next((quantity for quantity in (depth, self.lens.f_px) if quantity.value is None), None)
         if unknown is None and len(np.unique(centres_mm[response > 0], axis=0)) < 2:
             unknown = Estimate(None, why="one view tells no depth")
@@ -236,7 +278,7 @@ class Predictor:
             side_px=side_px,
             side_mm=_with(lambda z, f: side_px * (z / f), depth, self.lens.f_px),
             smallest_contrast=contrast,
-            depth_sigma_mm=unknown or self._from_information(self.view, response, depth_sigma),
+            depth_sigma_mm=unknown or self._from_information(self.whole_view, response, depth_sigma),
         )
 
     def _contrast(self, view: View, response: Array, side_px: float) -> Estimate:
@@ -297,17 +339,19 @@ class Predictor:
         try:
             check_frame_count(shape[0] * shape[1] * frames)
             grid = _about_the_centre(self.settings.grid, shape)
-            total_s, scene_s, why_not = self._duration(grid, {"exposure_s": (exposure_s,), "frames_per_node": frames})
+            fewest, of_round = self._fewest(grid), View(frames * exposure_s, frames)
+            rounds = self._rounds(of_round, fewest)
+            changes = {"exposure_s": (exposure_s,), "frames_per_node": frames}
+            total_s, scene_s, why_not = self._duration(grid, changes, rounds)
         except ValueError as failure:
             raise WrongUsage(str(failure)) from failure
-        view = View(frames * exposure_s, frames)
-        responses = [self._views(grid, depth_mm)[1] for depth_mm in self.depths_mm or (None,)]
-        fewest = min(responses, key=lambda response: float(np.square(response).sum()))
+        view = of_round.times(rounds)
         return Alternative(
             exposure_s=exposure_s,
             rows=shape[0],
             columns=shape[1],
             frames_per_node=frames,
+            rounds=rounds,
             snr=self._snr(view),
             sigma_e=self._sigma(view, fewest, self.exposure_s),
             smallest_contrast=self._contrast(view, fewest, self.sides_px[0]),
@@ -316,14 +360,15 @@ class Predictor:
             why_not=why_not,
         )
 
-    def _duration(self, grid: Grid, changes: dict[str, Any]) -> tuple[Estimate, Estimate, str | None]:
+    def _duration(self, grid: Grid, changes: dict[str, Any], rounds: int) -> tuple[Estimate, Estimate, str | None]:
         """Return the duration of the session and of its dark scene with `changes`, and why it cannot be done."""
-        settings, pace = self.settings, self.pace
-        steps = [
+        settings, pace, steps = self.settings, self.pace, []
+        for step in settings.steps():
             # The noise reference must be exposed like the dark scene
-            msgspec.structs.replace(step, **changes) if step.kind in ("dark_scene", "noise_reference") else step
-            for step in settings.steps()
-        ]
+            now = msgspec.structs.replace(step, **changes) if step.kind in ("dark_scene", "noise_reference") else step
+            if now.until is not None:
+                now = msgspec.structs.replace(now, until=msgspec.structs.replace(now.until, at_most_rounds=rounds))
+            steps.append(now)
         plan = CapturePlan.of(grid, steps, approach_mm=settings.stage.approach_mm, frame_bytes=0)
         if isinstance(pace, str):
             unknown = Estimate(None, why=pace)

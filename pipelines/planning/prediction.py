@@ -10,6 +10,7 @@ from msgspec import Struct
 from faintfield.calib.estimate import Estimate
 from faintfield.pipelines.console import inform
 from faintfield.rig.capture.guide import format_duration
+from faintfield.rig.plan import Until
 
 # Heads and widths of the table's columns.
 _COLUMNS = (
@@ -51,6 +52,7 @@ class DepthPrediction(Struct, frozen=True, kw_only=True):
 class Alternative(Struct, frozen=True, kw_only=True):
     """One row of the table: another exposure, grid or number of frames, at the depth that the fewest views see.
 
+    A dark scene in rounds takes as many `rounds`, of `frames_per_node` each, as reach its wanted noise.
     `snr` is that of one elemental image by eq. (4). `sigma_e` is in electrons of one frame of the record's
     `exposure_s`, so that rows can be compared. `scene_s` is the duration of the dark scene, `time_s` that of the
     session without prompts.
@@ -60,6 +62,7 @@ class Alternative(Struct, frozen=True, kw_only=True):
     rows: int
     columns: int
     frames_per_node: int
+    rounds: int = 1
     snr: Estimate
     sigma_e: Estimate
     smallest_contrast: Estimate
@@ -74,7 +77,9 @@ class PredictionRecord(Struct, frozen=True, kw_only=True):
     `light_e` and `photons` are expected in the first frame of the dark scene at a node, of `exposure_s`. `snr` and
     `snr_linear` are those of an elemental image of a uniform object, by eq. (4) and eq. (7). `pixel_share` is the part
     of the pixels that have the scarcest colour; by `rose_k` standard deviations a visible square stands out. `cheapest`
-    is the shortest session that reaches `wanted_sigma_e`. `vignetting` says why it is not known.
+    is the shortest session that reaches `wanted_sigma_e`. `vignetting` says why it is not known. A dark scene with
+    `until` will take `rounds`, in all of which there are `frames_per_node`; a sample then has the noise `reached_e`, in
+    electrons of one frame of `exposure_s`.
     """
 
     rig: str
@@ -100,6 +105,9 @@ class PredictionRecord(Struct, frozen=True, kw_only=True):
     alternatives: list[Alternative]
     wanted_sigma_e: float | None = None
     cheapest: Alternative | None = None
+    until: Until | None = None
+    rounds: int = 1
+    reached_e: Estimate | None = None
 
 
 def print_prediction(record: PredictionRecord) -> None:
@@ -110,6 +118,8 @@ def print_prediction(record: PredictionRecord) -> None:
     inform(f"{record.rig}: {shape}, frames at each: {record.frames_per_node}, {_exposures(record)}; {time}")
     noise, dark = _number_text(record.read_noise_e, "e⁻"), _number_text(record.dark_current_e_per_s, "e⁻/s")
     inform(f"noise: read noise {noise}; dark current {dark}; from {record.noise_from}")
+    if record.until is not None and record.reached_e is not None:
+        inform(f"rounds: {_describe_rounds(record.until, record.rounds, record.reached_e)}")
     light = f"{_number_text(record.light_e, 'e⁻')} per pixel in a frame, photons: {_number_text(record.photons)}"
     inform(f"light: {light}; {record.light_from}")
     snrs = f"SNR {_number_text(record.snr)} by eq. (4), {_number_text(record.snr_linear)} by eq. (7)"
@@ -122,6 +132,15 @@ def print_prediction(record: PredictionRecord) -> None:
     if record.vignetting is not None:
         inform(f"vignetting: unknown: {record.vignetting}; none is assumed")
     _print_table(record)
+
+
+def _describe_rounds(until: Until, rounds: int, reached_e: Estimate) -> str:
+    wanted, most = f"the wanted sigma of {until.sigma_e:g} e⁻ of a frame", until.at_most_rounds
+    if reached_e.value is None:
+        return f"all {most}, unless the capture measures that fewer reach {wanted}; sigma is unknown: {reached_e.why}"
+    if reached_e.value > until.sigma_e:
+        return f"all {most} reach {reached_e.value:.3g} e⁻, not {wanted}; expose longer, or raise at_most_rounds"
+    return f"{rounds} of at most {most} reach {reached_e.value:.3g} e⁻, {wanted}"
 
 
 def _print_depth(depth: DepthPrediction, record: PredictionRecord) -> None:
@@ -166,7 +185,8 @@ def _print_table(record: PredictionRecord) -> None:
 
 def _asked(row: Alternative) -> str:
     shape = f"{row.rows} x {row.columns}"
-    return f"{1e3 * row.exposure_s:>7g} ms {shape:>9} {row.frames_per_node:>6}"
+    frames = f"{row.rounds} x {row.frames_per_node}" if row.rounds > 1 else str(row.frames_per_node)
+    return f"{1e3 * row.exposure_s:>7g} ms {shape:>9} {frames:>6}"
 
 
 def _number_text(number: Estimate, unit: str = "") -> str:
