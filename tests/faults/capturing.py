@@ -14,6 +14,7 @@ from faintfield.rig.cameras.protocol import Decode
 from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.capture.guide import Answer, OperatorInterface, OperatorRequest, Prompt, ShownFrame, Status
 from faintfield.rig.capture.loop import Capture
+from faintfield.rig.capture.rounds import NoisePredictor
 from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import RigError
@@ -86,10 +87,11 @@ def capture_small(
     settings: RigSettings = SMALL_RIG,
     operator: OperatorInterface | None = None,
     decode: Decode = lambda path: None,
+    noise: NoisePredictor | None = None,
 ) -> None:
     """Begin or resume a session, and complete it."""
     with open_session(folder, frozen_plan(settings)) as session:
-        Capture(session, open_rig(settings, session.journal), operator or Operator(), decode).run()
+        Capture(session, open_rig(settings, session.journal), operator or Operator(), decode, noise).run()
 
 
 def capture(
@@ -97,10 +99,11 @@ def capture(
     operator: OperatorInterface | None = None,
     settings: RigSettings = SMALL_RIG,
     decode: Decode = lambda path: None,
+    noise: NoisePredictor | None = None,
 ) -> RigError | None:
     """Begin or resume a session; return the failure, None without one."""
     try:
-        capture_small(folder, settings, operator, decode)
+        capture_small(folder, settings, operator, decode, noise)
     except RigError as failure:
         return failure
     return None

@@ -8,10 +8,11 @@ import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.errors import KeepOutCrossed, OutsideTravel
-from faintfield.rig.plan import MAX_FRAMES, CapturePlan, CaptureStep, Grid, centre_node, planned_frames
+from faintfield.rig.plan import MAX_FRAMES, CapturePlan, CaptureStep, Grid, Until, centre_node, planned_frames
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
@@ -80,6 +81,35 @@ def test_frames_follow_the_plan() -> None:
     ]
     assert [(frame.exposure_s, frame.repeat) for frame in frames[-4:]] == [(0.1, 0), (0.1, 1), (1.0, 0), (1.0, 1)]
     assert len({frame.name for frame in frames}) == len(frames)
+
+
+def test_rounds_repeat_grid_after_grid() -> None:
+    until = CaptureStep("dark_scene", (0.1,), 2, until=Until(0.1, 3))
+    grid = Grid(1, 2, 50.0, Point(0.0, 0.0))
+    once, plan = plan_of(grid, (replace(until, until=None),)), plan_of(grid, (until,))
+    frames = planned_frames(plan)
+    assert plan.frame_count() == len(frames) == 3 * once.frame_count() == 12
+    assert [(frame.round, frame.stop.node[1], frame.repeat) for frame in frames] == [
+        (number, column, 2 * number + repeat) for number in range(3) for column in range(2) for repeat in range(2)
+    ]
+    assert len({frame.name for frame in frames}) == len(frames)
+    assert [point for point in plan.path() if point in {stop.target for stop in grid.stops()}] == 3 * [
+        stop.target for stop in grid.stops()
+    ]
+
+
+@pytest.mark.parametrize(
+    ("kind", "at", "sigma_e", "rounds", "message"),
+    [
+        ("bright", "grid", 0.1, 2, "until in a bright step"),
+        ("dark_scene", "centre", 0.1, 2, "until in a dark_scene step at the centre"),
+        ("dark_scene", "grid", 0.0, 2, r"until\.sigma_e = 0; a noise"),
+        ("dark_scene", "grid", 0.1, 0, r"until\.at_most_rounds = 0; give 1 to"),
+    ],
+)
+def test_impossible_rounds_are_refused(kind: Any, at: Any, sigma_e: float, rounds: int, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        CaptureStep(kind, (0.1,), at=at, until=Until(sigma_e, rounds))
 
 
 def test_frames_and_disk_space() -> None:

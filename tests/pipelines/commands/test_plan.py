@@ -140,6 +140,22 @@ def test_cheapest_possible_session_reaches_sigma(rig: Path, predict: Predict) ->
     assert predict(rig, *words[:2], "--sigma-e", 0.01)["cheapest"] is None
 
 
+def test_rounds_follow_wanted_noise(rig: Path, predict: Predict, faintfield: Command) -> None:
+    once = predict(rig, "--light-e", 2.0)
+    one_e = once["alternatives"][0]["sigma_e"]["value"]
+    until = f"exposure_s = 0.1, until = {{ sigma_e = {0.9 * one_e / math.sqrt(2)}, at_most_rounds = MOST }}"
+    text = rig.read_text().replace("exposure_s = 0.1", until, 1)
+    rig.write_text(text.replace("MOST", "8"))
+    prediction = predict(rig, "--light-e", 2.0, "--exposures-ms", 100, 400)
+    assert (prediction["rounds"], [row["rounds"] for row in prediction["alternatives"]]) == (3, [3, 1])
+    assert prediction["reached_e"]["value"] == pytest.approx(one_e / math.sqrt(3), rel=1e-3)
+    assert prediction["frames_per_node"] == 3
+    scene_s = [row["scene_s"]["value"] for row in (prediction["alternatives"][0], once["alternatives"][0])]
+    assert scene_s[0] == pytest.approx(3 * scene_s[1], rel=0.05)
+    rig.write_text(text.replace("MOST", "2"))
+    assert "rounds: all 2 reach" in faintfield("plan", rig, "--light-e", 2.0).stderr
+
+
 def test_scarcest_colour_has_quarter_of_pixels(rig: Path, predict: Predict) -> None:
     grey = predict(rig, "--light-e", 0.97)
     rig.write_text(SIMULATED.replace("MORE", ', mosaic = ["RG", "GB"]'))

@@ -1,0 +1,109 @@
+"""Rounds over the grid until a noise is reached: when they end, and what a session holds then."""
+
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from faintfield.rig.capture.rounds import NoisePredictor
+from faintfield.rig.errors import CaptureStopped
+from faintfield.rig.plan import CaptureStep, Until
+from faintfield.rig.session.journal import FrameRecord, RoundsEnded
+from faintfield.rig.session.session import taken_frames
+from faintfield.rig.session.verify import verify
+from faintfield.rig.settings import StepSettings
+from tests.faults.capturing import DRIFTING, SMALL_RIG, Operator, capture, events
+
+NODES, DARKS = 6, 2
+STEPS = (StepSettings("dark_scene", 0.1, until=Until(0.5, 8)), StepSettings("dark", 0.1, DARKS))
+RIG = replace(SMALL_RIG, step=STEPS)
+
+
+def noise_of(one_round_e: float) -> NoisePredictor:
+    """Return a predictor by which one round has a noise, which falls with the root of the rounds."""
+
+    def predict(step: CaptureStep, records: Sequence[FrameRecord]) -> Callable[[float], float]:
+        assert step.until == Until(0.5, 8)
+        return lambda rounds: one_round_e / math.sqrt(rounds)
+
+    return predict
+
+
+def rounds_of(folder: Path) -> list[int]:
+    return [frame.round for frame, _, _ in taken_frames(folder) if frame.kind == "dark_scene"]
+
+
+@pytest.mark.parametrize(("one_round_e", "rounds"), [(0.4, 1), (0.85, 3), (1.4, 8), (9.0, 8)])
+def test_rounds_end_once_noise_is_reached(tmp_path: Path, one_round_e: float, rounds: int) -> None:
+    operator = Operator()
+    assert capture(tmp_path / "s", operator, RIG, noise=noise_of(one_round_e)) is None
+    assert rounds_of(tmp_path / "s") == [number for number in range(rounds) for _ in range(NODES)]
+    assert [prompt.key for prompt in operator.prompts] == ["home", "step", "step"]
+    verdict = verify(tmp_path / "s")
+    frames = rounds * NODES + DARKS
+    assert (verdict.problems, verdict.missing, verdict.left_out, verdict.sealed) == ((), (), (), True)
+    assert (verdict.planned, verdict.present) == (frames, frames)
+    ended = RoundsEnded(0, rounds, pytest.approx(one_round_e / math.sqrt(rounds)))  # type: ignore[arg-type]
+    assert verdict.rounds == (() if rounds == 8 else (ended,))
+    assert (operator.statuses[-1].done, operator.statuses[-1].total) == (frames, frames)
+
+
+def test_unknown_noise_takes_all_rounds(tmp_path: Path) -> None:
+    operator = Operator()
+    assert capture(tmp_path / "s", operator, RIG, noise=lambda step, records: None) is None
+    assert len(rounds_of(tmp_path / "s")) == 8 * NODES
+    assert "σ is not known, wanted 0.5 e⁻: all 8 rounds are taken" in {status.rounds for status in operator.statuses}
+
+
+def test_interrupted_round_is_completed_on_resume(tmp_path: Path) -> None:
+    noise = noise_of(0.85)
+    assert isinstance(capture(tmp_path / "s", Operator({}, {2 * NODES + 1: "stop"}), RIG, noise=noise), CaptureStopped)
+    assert verify(tmp_path / "s").sealed is False
+    assert capture(tmp_path / "s", settings=RIG, noise=noise_of(0.1)) is None  # the light is brighter now
+    assert len(rounds_of(tmp_path / "s")) == 3 * NODES
+    assert verify(tmp_path / "s").problems == ()
+
+
+def test_reached_noise_is_kept_in_journal(tmp_path: Path) -> None:
+    stops = Operator({}, {3 * NODES: "stop"})  # before the first dark frame
+    assert isinstance(capture(tmp_path / "s", stops, RIG, noise=noise_of(0.85)), CaptureStopped)
+    verdict = verify(tmp_path / "s")
+    assert (len(verdict.missing), verdict.planned) == (DARKS, 3 * NODES + DARKS)
+    assert capture(tmp_path / "s", settings=RIG, noise=noise_of(9.0)) is None
+    assert len(rounds_of(tmp_path / "s")) == 3 * NODES
+
+
+def test_operator_ends_step_with_present_round(tmp_path: Path) -> None:
+    operator = Operator({"paused": ["finish"]}, {NODES + 2: "pause"})
+    assert capture(tmp_path / "s", operator, RIG, noise=noise_of(9.0)) is None
+    assert len(rounds_of(tmp_path / "s")) == 2 * NODES
+    [ended] = verify(tmp_path / "s").rounds
+    assert (ended.rounds, ended.by_operator) == (2, True)
+
+
+def test_skipping_step_skips_all_rounds(tmp_path: Path) -> None:
+    operator = Operator({"step": ["skip"], "skipped": ["keep"]})
+    assert capture(tmp_path / "s", operator, RIG, noise=noise_of(0.85)) is None
+    assert rounds_of(tmp_path / "s") == []
+    assert len(verify(tmp_path / "s").left_out) == 8 * NODES
+
+
+def test_status_states_noise_rounds_and_time(tmp_path: Path) -> None:
+    operator = Operator()
+    assert capture(tmp_path / "s", operator, RIG, noise=noise_of(0.85)) is None
+    words = {status.done: status for status in operator.statuses if status.step == 1 and status.doing == "exposing"}
+    assert words[0].rounds.startswith("σ wanted 0.5: 3 more rounds, about")
+    assert words[NODES].rounds.startswith("σ now 0.85 e⁻, wanted 0.5: 2 more rounds, about")
+    # Only the rounds that will be needed count
+    assert words[0].step_to_go_s[0] == pytest.approx(3 * words[2 * NODES].step_to_go_s[0], rel=0.3)
+    assert words[0].total == 8 * NODES + DARKS
+
+
+def test_every_round_is_checked_for_drift(tmp_path: Path) -> None:
+    settings = replace(DRIFTING, step=STEPS)
+    assert capture(tmp_path / "s", settings=settings, noise=noise_of(0.85)) is None
+    verdict = verify(tmp_path / "s")
+    assert (verdict.suspect, len(rounds_of(tmp_path / "s"))) == ((), 3 * NODES)
+    assert len(events(tmp_path / "s", "drift_check")) == 3
