@@ -18,12 +18,15 @@ from PIL import Image
 
 from faintfield.pipelines.commands.capture import init
 from faintfield.pipelines.formats.toml_files import read_rig
+from faintfield.pipelines.live.board_progress import BoardOrder
+from faintfield.pipelines.live.boards_client import followed_boards
 from faintfield.pipelines.live.capture_page import serve_page
 from faintfield.pipelines.live.guided import read_pixels
 from faintfield.pipelines.live.light_meter import LightMeter
 from faintfield.pipelines.live.panel import CapturePanel, SessionFrames
 from faintfield.pipelines.live.planes_client import LiveOrder, live_planes
 from faintfield.pipelines.planning.known import known_sensor
+from faintfield.pipelines.planning.sample_noise import MeasuredNoise
 from faintfield.rig.cameras.protocol import Exposure
 from faintfield.rig.capture.loop import Capture
 from faintfield.rig.capture.survey import survey
@@ -45,6 +48,8 @@ _SHOWN = (("prompt", 1400), ("boards", 1024), ("dark_scene", 1400), ("dark_scene
 # Their longest part, in widths of the screen, and their width.
 _LONGEST = 2.2
 _WIDTH_PX = 1000
+# Board sweeps, and nodes of the grid.
+_SWEEPS, _NODES = 4, 25
 
 
 class _Session:
@@ -64,15 +69,20 @@ class _Session:
         opened: list[SessionFrames] = []
         begun, go = threading.Event(), threading.Event()
 
+        rig_toml = self._folder.parent / "rig.toml"
+        known = None, None, None
+        noise = MeasuredNoise(self._settings, rig_toml, self._folder, *known, light_e_per_s=_LIGHT_E_PER_S)
+
         def capture() -> None:  # the journal belongs to the thread that opens it
             frozen = FrozenPlan(survey(open_rig(self._settings), self._settings).plan, self._settings)
             with open_session(self._folder, frozen) as session:
                 opened.append(SessionFrames(session))
+                self.panel.on_change.append(opened[0].note_homings)
                 begun.set()
                 go.wait()
                 rig = self._with_failures(open_rig(self._settings, session.journal))
                 try:
-                    Capture(session, rig, self.panel, read_pixels).run()
+                    Capture(session, rig, self.panel, read_pixels, noise.predict).run()
                 except RigError as failure:
                     self.panel.end(str(failure))
                 else:
@@ -81,13 +91,18 @@ class _Session:
         thread = threading.Thread(target=capture, daemon=True)
         thread.start()
         begun.wait()
-        order = LiveOrder(self._folder, self._folder.parent / "rig.toml", _DEPTHS_MM)
+        order = LiveOrder(self._folder, rig_toml, _DEPTHS_MM)
+        out = self._folder.parent / "boards"
+        out.mkdir()
+        board_order = BoardOrder(self._folder, out, (500.0, 700.0), None)
         with ExitStack() as stack:
+            boards = stack.enter_context(followed_boards(board_order, opened[0].of_boards))
             client = stack.enter_context(live_planes(order, opened[0].of_dark_scene))
             assert client is not None
-            self.panel.on_change += [client.note_change, self._wait]
+            assert boards is not None
+            self.panel.on_change += [boards.note_change, client.note_change, self._wait]
             meter = LightMeter(lambda: known_sensor(self._settings, None), _LIGHT_E_PER_S).wait()
-            address = stack.enter_context(serve_page(self.panel, opened[0], client, meter=meter))
+            address = stack.enter_context(serve_page(self.panel, opened[0], client, boards, meter))
             go.set()
             yield address
 
@@ -133,36 +148,49 @@ def draw_phases(take: Callable[[Tab, str], None]) -> None:
             _wait_for(tab, "Board sweep 1")
             take(tab, "test_frame")
             tab.click("go")
-            _take_at(tab, session, 16, take, "boards")
+            session.take(16)
+            tab.wait_until("document.getElementById('count').textContent.startsWith('16 of')")
             session.failing = True
             session.take(25)
             tab.wait_until("document.getElementById('title').textContent.includes('camera failed')")
             take(tab, "failure")
             tab.click("again")
-            for title in ("Board sweep 2", "Bright set"):
+            for number in range(2, _SWEEPS + 1):
                 session.take(10**6)
-                _wait_for(tab, title)
-                take(tab, title.lower().replace(" ", "_"))
-                tab.click("go" if title == "Bright set" else "skip")
+                _wait_for(tab, f"Board sweep {number}")
+                if number == _SWEEPS:
+                    tab.wait_until("document.getElementById('boards-verdict').textContent.includes('px')")
+                    take(tab, "boards_prompt")
+                session.take(_NODES * (number - 1) + 16)
+                tab.click("go")
+                if number == _SWEEPS:
+                    tab.wait_until(
+                        f"document.getElementById('count').textContent.startsWith('{_NODES * (number - 1) + 16} of')"
+                    )
+                    take(tab, "boards")
+            session.take(10**6)
+            _wait_for(tab, "Bright set")
+            take(tab, "bright_set")
+            tab.click("go")
             _wait_for(tab, "Dark-scene set")
             take(tab, "dark_prompt")
             done = tab.evaluate("parseInt(document.getElementById('count').textContent)")
             session.take(done)
             tab.click("go")
             _take_at(tab, session, done + 1, take, "dark_begins")
-            session.take(done + 20)
-            tab.wait_until(f"parseInt(document.getElementById('count').textContent) === {done + 20}")
+            session.take(done + _NODES + 20)
+            tab.wait_until(f"parseInt(document.getElementById('count').textContent) === {done + _NODES + 20}")
             tab.set_slider("depth", 2)
             tab.wait_until("document.getElementById('planes-words').textContent.endsWith('now: up to date')")
-            tab.wait_until("document.getElementById('best-words').textContent.includes('PMLEM so far, 20 nodes')")
+            tab.wait_until(
+                f"document.getElementById('best-words').textContent.includes('PMLEM so far, {_NODES} nodes')"
+            )
             take(tab, "dark_scene")
             session.take(10**6)
             for title in ("Noise reference", "Dark frames", "Flat frames 1"):
                 _wait_for(tab, title)
                 take(tab, title.lower().replace(" ", "_"))
                 tab.click("go")
-            tab.wait_until("document.getElementById('title').textContent.includes('Skipped')")
-            tab.click("keep")
             tab.wait_until("document.getElementById('title').textContent.startsWith('Complete')")
             take(tab, "complete")
         if tab.complaints:
@@ -188,8 +216,9 @@ def _rig(path: Path) -> RigSettings:
     text = text.replace("frames_per_node = 10", "frames_per_node = 1")
     head = text[: text.index("[[step]]")]
     steps = (
-        *('kind = "charuco"\nexposure_s = 0.05',) * 2,
-        *('kind = "bright"\nexposure_s = 0.05', 'kind = "dark_scene"\nexposure_s = 0.1'),
+        *('kind = "charuco"\nexposure_s = 0.05',) * _SWEEPS,
+        'kind = "bright"\nexposure_s = 0.05',
+        'kind = "dark_scene"\nexposure_s = 0.1\nuntil = { sigma_e = 0.4, at_most_rounds = 8 }',
         *('kind = "noise_reference"\nexposure_s = 0.1', 'kind = "dark"\nexposure_s = [0.1, 1.0]\nframes_per_node = 5'),
         'kind = "flat"\nexposure_s = 0.05\nframes_per_node = 5',
     )

@@ -7,6 +7,7 @@ import pytest
 from msgspec.structs import replace
 
 from faintfield.pipelines.formats.sets.session_set import files_of_scene
+from faintfield.rig.capture.guide import OperatorRequest
 from faintfield.rig.plan import Until
 from faintfield.rig.settings import StepSettings
 from tests.faults.capturing import SMALL_RIG, Operator, capture
@@ -33,8 +34,10 @@ def test_whole_rounds_with_most_light_count(
     frames_of_node: dict[int, int],
     message: str,
 ) -> None:
-    operator = Operator({}, {stop_after: "stop"} | ({skip_at: "skip"} if skip_at is not None else {}))
-    capture(tmp_path / "s", operator, RIG)
+    requests: dict[int, OperatorRequest] = {stop_after: "stop"}
+    if skip_at is not None:
+        requests[skip_at] = "skip"
+    capture(tmp_path / "s", Operator({}, requests), RIG)
     names = [name for name in files_of_scene(tmp_path / "s") if name.startswith("frames/")]
     counts = Counter(Counter(name.split("_r")[1][:4] for name in names).values())
     assert counts == frames_of_node
