@@ -118,21 +118,28 @@ class PlaneAccumulator:
         self.frames[frame.intent] = frame
         return read.pixels
 
-    def remove(self, frame: LiveFrame) -> None:
-        """Take a frame away that is not valid any more; raises as `add` does."""
-        read = self._read(frame)
-        del self.frames[frame.intent]
-        for index, running in enumerate(self._running):
-            if (view := self._project(index, read)) is not None:
-                running.remove(view, _half(frame))
+    def remove(self, frames: Sequence[LiveFrame]) -> None:
+        """Take frames of one node away that are not valid any more; raises as `add` does."""
+        for frame in frames:
+            del self.frames[frame.intent]
         if self._sums is not None:
-            sums = self._sums.holds(frame.round)
-            sums.drop(read.view)
-            for kept in [kept for kept in self.frames.values() if kept.node == frame.node]:
-                if self._sums.holds(kept.round) is sums:
-                    self._sums.add(read.view, kept.round, self._read(kept).images)
-            if sums is self._sums.shared:  # its views may be the same before PMLEM runs again
-                self._refined = {index: refined._replace(done=False) for index, refined in self._refined.items()}
+            self._remove_from_sums(self._sums, frames)
+        for frame in frames:
+            read = self._read(frame)
+            for index, running in enumerate(self._running):
+                if (view := self._project(index, read)) is not None:
+                    running.remove(view, _half(frame))
+
+    def _remove_from_sums(self, sums: RoundSums, frames: Sequence[LiveFrame]) -> None:
+        view, parts = self.scene.view_of[frames[0].node], [sums.holds(frame.round) for frame in frames]
+        same_node = [kept for kept in self.frames.values() if kept.node == frames[0].node]
+        rest = [kept for kept in same_node if sums.holds(kept.round) in parts]
+        for frame in frames:
+            sums.drop(view, frame.round)
+        for kept in rest:
+            sums.add(view, kept.round, self._read(kept).images)
+        # Its views may be the same when PMLEM runs again, of other frames
+        self._refined = {index: refined._replace(done=False) for index, refined in self._refined.items()}
 
     def picture(self, index: int, kind: PictureKind) -> Picture | None:
         """Return a picture of a plane, None if there is none yet."""

@@ -4,6 +4,7 @@ It is started by `pipelines.live.planes_client`, reads frames and calibrations, 
 frames that wait are taken newest first; PMLEM runs when none does.
 """
 
+from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from typing import Literal
 
@@ -120,7 +121,7 @@ class LivePlanes:
         void = [frame for intent, frame in planes.frames.items() if intent not in self._wanted]
         new = self._wanted.keys() - planes.frames.keys() - self._unusable
         if void:
-            self._remove(planes, void[0])
+            self._remove(planes, [frame for frame in void if frame.node == void[0].node])
         elif new:
             self._add(planes, self._wanted[max(new)])
         elif self._tasks:
@@ -149,9 +150,9 @@ class LivePlanes:
         self._work(planes, self._shown, "view")
         self._work(planes, self._shown, "mean")
 
-    def _remove(self, planes: PlaneAccumulator, frame: LiveFrame) -> None:
+    def _remove(self, planes: PlaneAccumulator, frames: Sequence[LiveFrame]) -> None:
         try:
-            planes.remove(frame)
+            planes.remove(frames)
         except _FAILURES as failure:
             self._report_problem(failure)
         self._note_change(planes)

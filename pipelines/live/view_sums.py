@@ -27,6 +27,9 @@ class ViewSums:
         """Views that have all of their frames."""
         return tuple(self._order[: self._complete])
 
+    def __len__(self) -> int:
+        return len(self._order)
+
     def add(self, view: int, electrons: Image, valid: Image | None, frames: int = 1) -> None:
         """Add an image (row, column), the sum of some frames, to its node."""
         if view not in self._counts:
@@ -117,6 +120,13 @@ class RoundSums:
         self.holds(number).add(view, images.electrons[0], None if images.valid is None else images.valid[0])
         if len(self._newest.views) == self._nodes:
             self._begin(self._number + 1)
+
+    def drop(self, view: int, number: int) -> None:
+        """Forget a node in the sums that hold a round; when all are forgotten, the first round begins again."""
+        self.holds(number).drop(view)
+        if self._number and not (len(self._earlier) or len(self._newest)):
+            self._earlier, self._newest, self._number = self._newest, self._earlier, 0
+            self._newest.expect(self._frames[0])
 
     def _begin(self, number: int) -> None:
         """Begin a newer round: the newest is an earlier one from now on."""

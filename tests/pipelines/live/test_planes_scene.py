@@ -80,7 +80,7 @@ def test_frames_in_turn_give_planes_of_the_session(session: Path, bins: int) -> 
     for frame in [frames[7], *frames[:7], *frames[8:]]:
         planes.add(frame)
     # A frame that becomes void and is taken again, of the same file
-    planes.remove(void)
+    planes.remove([void])
     assert planes.complete == 8
     planes.add(msgspec.structs.replace(void, intent=999))
     assert (planes.complete, len(planes.nodes), len(planes.frames)) == (9, 9, 18)
@@ -197,8 +197,8 @@ def test_late_and_void_frames_of_earlier_rounds(session: Path) -> None:
     void = [frames[3], frames[12]]
     for planes, of_round in ((in_turn, 0), (lagging, 1)):
         assert (planes.complete, planes.rounds) == (9, 2)
-        for frame in void:
-            planes.remove(frame)
+        planes.remove(void[:1])
+        planes.remove(void[1:])
         assert planes.complete == 8
         planes.add(msgspec.structs.replace(void[of_round], intent=900))
         assert planes.complete == 8
@@ -208,6 +208,19 @@ def test_late_and_void_frames_of_earlier_rounds(session: Path) -> None:
     for kind in kinds:
         first, second = (picture_of(planes, kind).plane for planes in (in_turn, lagging))
         np.testing.assert_allclose(second, first, atol=2e-3 * first.max())
+
+
+def test_void_rounds_begin_again_with_first_nodes(session: Path) -> None:
+    """Lost steps make all frames void that were taken since the stage homed."""
+    scene, frames = in_rounds(session)
+    planes = planes_of(session, scene, frames)
+    picture_of(planes, "pmlem")
+    for first, second in zip(frames[:9], frames[9:], strict=True):
+        planes.remove([first, second])
+    assert (planes.complete, len(planes.frames), planes.picture(0, "mean")) == (0, 0, None)
+    for frame in frames[:2]:
+        planes.add(msgspec.structs.replace(frame, intent=100 + frame.intent))
+    assert (planes.complete, planes.rounds, planes.is_refined(0)) == (2, 1, False)
 
 
 def test_sums_are_equal_in_any_order() -> None:
