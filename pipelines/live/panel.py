@@ -217,7 +217,7 @@ class SessionFrames:
     def of_dark_scene(self) -> tuple[LiveFrame, ...]:
         """Return the frames of the dark scene, in the order of the plan."""
         return tuple(
-            LiveFrame(frame.intent, frame.file, planned.stop.node, planned.exposure_s)
+            LiveFrame(frame.intent, frame.file, planned.stop.node, planned.exposure_s, planned.round)
             for frame, planned in self._valid()
             if planned.kind == "dark_scene"
         )

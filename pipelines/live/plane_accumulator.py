@@ -1,6 +1,7 @@
 """Planes of the frames so far: back-projections that each frame is added to at once, and PMLEM in the time left."""
 
 from collections.abc import Callable, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.live.planes_client import LiveFrame, PictureKind
 from faintfield.pipelines.live.planes_scene import LiveScene
+from faintfield.pipelines.live.view_sums import RoundSums
 from faintfield.pipelines.reconstruction.channels import lattice_noise, view_electrons
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
 from faintfield.pipelines.reconstruction.planes.penalised import MAX_PASSES, Objective
@@ -35,77 +37,26 @@ _MIN_START = 1e-3
 
 
 class _Refined(NamedTuple):
-    """PMLEM's plane with its dual field, the views that it is of, and whether it has reached the optimum."""
+    """PMLEM's plane in electrons of one round, its dual field, its views and rounds, and whether it is the optimum."""
 
     plane: Image
     dual: DualField
     views: tuple[int, ...]
+    rounds: int
     done: bool
 
 
-class ViewSums:
-    """Sums of the frames of each node, one after another in memory, which solvers read as they are.
+class Picture(NamedTuple):
+    """A plane (row, column) in electrons of one round per pixel, where it is covered, and its nodes and rounds."""
 
-    Those of the `views` that have all of their frames come first; sums of the others follow, in the order of `_order`.
-    There is one image per node, however many frames are missing, and `np.empty` takes its memory when it is used.
-    """
-
-    def __init__(self, shape: tuple[int, int], nodes: int, frames_per_view: int) -> None:
-        self._electrons = np.empty((nodes, *shape), np.float32)
-        self._valid = np.empty((nodes, *shape), bool)
-        self._frames_per_view = frames_per_view
-        self._order: list[int] = []
-        self._counts: dict[int, int] = {}
-        self._complete = 0
-
-    @property
-    def views(self) -> tuple[int, ...]:
-        """Views that have all of their frames."""
-        return tuple(self._order[: self._complete])
-
-    def add(self, view: int, images: ElementalImages) -> None:
-        """Add a frame to its node."""
-        if view not in self._counts:
-            place = len(self._order)
-            self._order.append(view)
-            self._counts[view], self._electrons[place], self._valid[place] = 0, 0, True
-        place = self._order.index(view)
-        self._counts[view] += 1
-        self._electrons[place] += images.electrons[0]
-        if images.valid is not None:
-            self._valid[place] &= images.valid[0]
-        if self._counts[view] == self._frames_per_view:
-            self._swap(place, self._complete)
-            self._complete += 1
-
-    def drop(self, view: int) -> None:
-        """Forget a node."""
-        if self._counts.pop(view, None) is None:
-            return
-        place = self._order.index(view)
-        if place < self._complete:
-            self._complete -= 1
-            self._swap(place, self._complete)
-            place = self._complete
-        self._swap(place, len(self._order) - 1)
-        self._order.pop()
-
-    def images(self, background_e: float | Image, read_variance_e2: float | Image) -> ElementalImages:
-        """Return the images in the order of `views`, given what all of them share."""
-        valid = self._valid[: self._complete]
-        electrons = self._electrons[: self._complete]
-        return ElementalImages(electrons, background_e, read_variance_e2, None if valid.all() else valid)
-
-    def _swap(self, first: int, second: int) -> None:
-        if first == second:
-            return
-        for values in (self._electrons, self._valid):
-            values[[first, second]] = values[[second, first]]
-        self._order[first], self._order[second] = self._order[second], self._order[first]
+    plane: Image
+    covered: NDArray[np.bool_]
+    nodes: int
+    rounds: int
 
 
 class _Frame(NamedTuple):
-    """A frame that was read: its view, its pixels and bins in electrons, and its share of the exposure of a view."""
+    """A frame that was read: its view, its pixels and bins in electrons, and its share of the exposure of a round."""
 
     view: int
     pixels: NDArray[np.float32]
@@ -129,9 +80,10 @@ class PlaneAccumulator:
         self._noise = lattice_noise(elemental_set, scene.layout.lattices[0], None)
         width, height = elemental_set.settings.camera.size_px
         shape, nodes = (height // scene.bins, width // scene.bins), len(elemental_set.settings.view)
-        self.stack_bytes = 4 * nodes * shape[0] * shape[1]
+        frames = [len(exposures_s) for exposures_s in scene.rounds_s]
+        self.stack_bytes = 4 * nodes * shape[0] * shape[1] * min(len(frames), 2)
         keeps = scene.knows_noise and self.stack_bytes <= MAX_STACK_BYTES
-        self._sums = ViewSums(shape, nodes, elemental_set.frames_per_view) if keeps else None
+        self._sums = RoundSums(shape, nodes, frames) if keeps else None
 
     @property
     def nodes(self) -> set[tuple[int, int]]:
@@ -141,7 +93,12 @@ class PlaneAccumulator:
     @property
     def complete(self) -> int:
         """Number of nodes that PMLEM can take."""
-        return 0 if self._sums is None else len(self._sums.views)
+        return 0 if self._sums is None else len(self._sums.shared.views)
+
+    @property
+    def rounds(self) -> int:
+        """Number of rounds that PMLEM takes of these nodes."""
+        return 1 if self._sums is None else self._sums.rounds
 
     def add(self, frame: LiveFrame) -> NDArray[np.float32]:
         """Add a frame to all planes; return its pixels (row, column), in electrons.
@@ -157,32 +114,44 @@ class PlaneAccumulator:
             if view is not None:
                 running.add(view, _half(frame))
         if self._sums is not None:
-            self._sums.add(read.view, read.images)
+            self._sums.add(read.view, frame.round, read.images)
         self.frames[frame.intent] = frame
         return read.pixels
 
-    def remove(self, frame: LiveFrame) -> None:
-        """Take a frame away that is not valid any more; raises as `add` does."""
-        read = self._read(frame)
-        del self.frames[frame.intent]
-        for index, running in enumerate(self._running):
-            if (view := self._project(index, read)) is not None:
-                running.remove(view, _half(frame))
+    def remove(self, frames: Sequence[LiveFrame]) -> None:
+        """Take frames of one node away that are not valid any more; raises as `add` does."""
+        for frame in frames:
+            del self.frames[frame.intent]
         if self._sums is not None:
-            self._sums.drop(read.view)
-            for same_node in [kept for kept in self.frames.values() if kept.node == frame.node]:
-                self._sums.add(read.view, self._read(same_node).images)
+            self._remove_from_sums(self._sums, frames)
+        for frame in frames:
+            read = self._read(frame)
+            for index, running in enumerate(self._running):
+                if (view := self._project(index, read)) is not None:
+                    running.remove(view, _half(frame))
 
-    def picture(self, index: int, kind: PictureKind) -> tuple[Image, NDArray[np.bool_], int] | None:
-        """Return a plane (row, column) in electrons per pixel, where it is covered, and from how many nodes."""
+    def _remove_from_sums(self, sums: RoundSums, frames: Sequence[LiveFrame]) -> None:
+        view, parts = self.scene.view_of[frames[0].node], [sums.holds(frame.round) for frame in frames]
+        same_node = [kept for kept in self.frames.values() if kept.node == frames[0].node]
+        rest = [kept for kept in same_node if sums.holds(kept.round) in parts]
+        for frame in frames:
+            sums.drop(view, frame.round)
+        for kept in rest:
+            sums.add(view, kept.round, self._read(kept).images)
+        # Its views may be the same when PMLEM runs again, of other frames
+        self._refined = {index: refined._replace(done=False) for index, refined in self._refined.items()}
+
+    def picture(self, index: int, kind: PictureKind) -> Picture | None:
+        """Return a picture of a plane, None if there is none yet."""
         per_px = np.float32(1 / self.scene.bins**2)
         running, latest, refined = self._running[index], self._latest[index], self._refined.get(index)
         if kind == "mean" and self.frames:
-            return running.mean() * per_px, running.covered, len(self.nodes)
+            rounds = 1 + max(frame.round for frame in self.frames.values())
+            return Picture(running.mean() * per_px, running.covered, len(self.nodes), rounds)
         if kind == "view" and latest is not None:
-            return latest.mean() * per_px, latest.coverage > 0.1 * latest.coverage.max(), 1
+            return Picture(latest.mean() * per_px, latest.coverage > 0.1 * latest.coverage.max(), 1, 1)
         if kind == "pmlem" and refined is not None:
-            return refined.plane * per_px, running.covered, len(refined.views)
+            return Picture(refined.plane * per_px, running.covered, len(refined.views), refined.rounds)
         return None
 
     def focus(self, index: int) -> FocusMeasure:
@@ -192,10 +161,10 @@ class PlaneAccumulator:
 
     def is_refined(self, index: int) -> bool:
         """Return whether PMLEM has reached the optimum of the nodes that are complete."""
-        if self._sums is None or not self._sums.views:
+        if self._sums is None or not self._sums.shared.views:
             return True
-        refined = self._refined.get(index)
-        return refined is not None and refined.done and refined.views == self._sums.views
+        refined, now = self._refined.get(index), (self._sums.shared.views, self._sums.rounds)
+        return refined is not None and refined.done and (refined.views, refined.rounds) == now
 
     def refine(self, index: int, interrupted: Callable[[], bool]) -> None:
         """Run PMLEM on a plane, from where it was left, until its optimum is near or `interrupted`.
@@ -203,25 +172,27 @@ class PlaneAccumulator:
         The weight of the penalty follows from the noise, as in `universal_penalty_weight`; no views are held out.
         """
         assert self._sums is not None
-        views = self._sums.views
-        elemental_set, bins = self.scene.elemental_set, self.scene.bins
-        images = self._sums.images(
-            _binned_sum(elemental_set.background_e(self._noise), bins),
-            _binned_sum(elemental_set.read_variance_e2(self._noise), bins),
+        sums, rounds, bins = self._sums.shared, self._sums.rounds, self.scene.bins
+        views, exposures_s = sums.views, list(chain(*self.scene.rounds_s[:rounds]))
+        images = sums.images(
+            _binned_sum(self._noise.background_e(sum(exposures_s)), bins),
+            _binned_sum(len(exposures_s) * self._noise.read_variance_e2(), bins),
         )
+        # The light in electrons of one round, relative to that of all rounds
+        share = np.float32(sum(self.scene.rounds_s[0]) / sum(exposures_s))
         operator = self._factory.at(self._depths_mm[index], self._grids[index], views, images.valid)
         objective = Objective.of(SceneProblem(operator, images), SolverOptions())
         weight = universal_penalty_weight(operator, objective.posed.images, objective.start)
         before = self._refined.get(index)
         start, dual = objective.start, objective.posed.dual()
         if before is not None:
-            start, dual = np.maximum(before.plane, _MIN_START * start), before.dual
+            start, dual = np.maximum(before.plane / share, _MIN_START * start), before.dual
         fit = objective.posed.fit(objective.level_e)
         iterates = pmlem(fit, start, penalty_weight=weight, penalty=objective.penalty, tolerance=_TOLERANCE, dual=dual)
         for count, iterate in enumerate(iterates, 1):
             done = iterate.certificate.distance <= _TOLERANCE or count >= MAX_PASSES or iterate.passes >= MAX_PASSES
             if done or count >= _MIN_ITERATES:
-                self._refined[index] = _Refined(iterate.plane, iterate.dual, views, done)
+                self._refined[index] = _Refined(iterate.plane * share, iterate.dual, views, rounds, done)
                 if done or interrupted():
                     return
 
@@ -239,9 +210,9 @@ class PlaneAccumulator:
         [(electrons, over)] = view_electrons(elemental_set, self.scene.layout, [self._folder / frame.file])
         background_e = self._noise.background_e(frame.exposure_s)
         images = ElementalImages(electrons[np.newaxis], background_e, valid=~over[np.newaxis] if over.any() else None)
-        total_s = elemental_set.settings.exposure_s or frame.exposure_s
+        round_s = sum(self.scene.rounds_s[0])
         view = self.scene.view_of[frame.node]
-        return _Frame(view, electrons, images.binned(self.scene.bins), frame.exposure_s / total_s)
+        return _Frame(view, electrons, images.binned(self.scene.bins), frame.exposure_s / round_s)
 
 
 def _binned_sum(value: float | NDArray[np.floating], bins: int) -> float | Image:

@@ -41,6 +41,7 @@ class LiveFrame(Struct, frozen=True):
     file: str
     node: tuple[int, int]
     exposure_s: float
+    round: int = 0
 
 
 class BoardPoses(Struct, frozen=True):
@@ -62,12 +63,16 @@ class LiveNews(Struct, frozen=True):
 
 
 class PictureStatus(Struct, frozen=True):
-    """A picture that is there: from how many nodes, and the electrons per pixel that are black and white in it."""
+    """A picture that is there: from how many nodes and rounds, and the electrons per pixel that are black and white.
+
+    Electrons are those of one round.
+    """
 
     version: int
     nodes: int
     black: float
     white: float
+    rounds: int = 1
 
 
 class PlaneStatus(Struct, frozen=True):

@@ -4,6 +4,7 @@ It is started by `pipelines.live.planes_client`, reads frames and calibrations, 
 frames that wait are taken newest first; PMLEM runs when none does.
 """
 
+from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from typing import Literal
 
@@ -120,7 +121,7 @@ class LivePlanes:
         void = [frame for intent, frame in planes.frames.items() if intent not in self._wanted]
         new = self._wanted.keys() - planes.frames.keys() - self._unusable
         if void:
-            self._remove(planes, void[0])
+            self._remove(planes, [frame for frame in void if frame.node == void[0].node])
         elif new:
             self._add(planes, self._wanted[max(new)])
         elif self._tasks:
@@ -149,9 +150,9 @@ class LivePlanes:
         self._work(planes, self._shown, "view")
         self._work(planes, self._shown, "mean")
 
-    def _remove(self, planes: PlaneAccumulator, frame: LiveFrame) -> None:
+    def _remove(self, planes: PlaneAccumulator, frames: Sequence[LiveFrame]) -> None:
         try:
-            planes.remove(frame)
+            planes.remove(frames)
         except _FAILURES as failure:
             self._report_problem(failure)
         self._note_change(planes)
@@ -176,24 +177,25 @@ class LivePlanes:
         picture = planes.picture(index, kind)
         if picture is None:
             return
-        plane, covered, nodes = picture
-        black, white = stretch(plane, covered)
-        levels = grey_levels(np.where(covered, plane, black), white, black)
+        black, white = stretch(picture.plane, picture.covered)
+        levels = grey_levels(np.where(picture.covered, picture.plane, black), white, black)
         self._send_picture(f"plane_{index:03d}_{kind}.png", levels)
         pictures = self._status.planes[index].pictures
         version = pictures[kind].version + 1 if kind in pictures else 1
-        self._report_plane(index, pictures=pictures | {kind: PictureStatus(version, nodes, black, white)})
+        status = PictureStatus(version, picture.nodes, black, white, picture.rounds)
+        self._report_plane(index, pictures=pictures | {kind: status})
 
     def _refine(self, planes: PlaneAccumulator, index: int) -> None:
         """Run PMLEM on a plane until it is done, or there are news; then the rest is to be done later."""
         depths_mm, count = self._order.depths_mm, planes.complete
+        rounds = f" in {planes.rounds} rounds" if planes.rounds > 1 else ""
         self._report(doing=f"PMLEM of the plane at {depths_mm[index]:g} mm")
         planes.refine(index, self._line.poll)
         if not planes.is_refined(index):
             self._tasks.add((index, "pmlem"))
         self._draw(planes, index, "pmlem")
         done = sum(map(planes.is_refined, self._indices))
-        self._report(pmlem=f"PMLEM of {count} nodes: {done} of {len(depths_mm)} planes done")
+        self._report(pmlem=f"PMLEM of {count} nodes{rounds}: {done} of {len(depths_mm)} planes done")
 
     def _report_problem(self, failure: Exception) -> None:
         self._report(problems=(*self._status.problems[-2:], str(failure)))

@@ -1,5 +1,6 @@
 """Scene of live planes before it is complete: nodes, lens, poses and noise, with their sources."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,14 +29,16 @@ type Node = tuple[int, int]
 
 @dataclass(frozen=True)
 class LiveScene:
-    """The views of a dark scene that are planned, as an elemental set without images.
+    """The views of one round of a dark scene that is planned, as an elemental set without images.
 
-    The set has a view per node; the names of its images mean nothing. `layout` has the pixels that count, of RGB the
+    The set has a view per node; the names of its images mean nothing. `rounds_s` are the exposure times of the frames
+    of a view, by round. `layout` has the pixels that count, of RGB the
     green ones; `bins` are so many pixels wide; `view_of` has the index of each node's view. `poses` and `noise` are
     their sources, in words. Unless it `knows_noise`, light is in DN and PMLEM has no likelihood.
     """
 
     elemental_set: ElementalSet
+    rounds_s: tuple[tuple[float, ...], ...]
     layout: ChannelLayout
     bins: int
     view_of: dict[Node, int]
@@ -63,7 +66,8 @@ def live_scene(order: LiveOrder, frozen: FrozenPlan, frame: Frame, boards: Board
     lens, lens_source = _lens(geometry, known, size_px, "as given" if order.fx_px else "of the simulated camera")
     fitted = _noise(sensor, known, size_px)
     mosaic = fitted.mosaic or frozen.rig.mosaic or frame.mosaic
-    planned = _planned_set(order.session, frozen.plan, lens, fitted)
+    rounds_s = _rounds_s(order.session, frozen.plan)
+    planned = _planned_set(order.session, frozen.plan, rounds_s[0], lens, fitted)
     elemental_set, poses = _with_poses(planned, geometry, lens_source)
     if of_boards and elemental_set.poses == "measured":
         poses = "measured, of the boards of this session"
@@ -72,6 +76,7 @@ def live_scene(order: LiveOrder, frozen: FrozenPlan, frame: Frame, boards: Board
     plane_of_colour = 1 if frame.pixels_dn.ndim == 3 else None
     return LiveScene(
         elemental_set,
+        rounds_s,
         ChannelLayout("grey", plane_of_colour, (Lattice((0, 0), (1, 1), (height, width)),)),
         bins_of(size_px, int(np.lcm(*mosaic_period(mosaic)))),
         {view.node: index for index, view in enumerate(elemental_set.settings.view) if view.node is not None},
@@ -119,22 +124,31 @@ def _noise(sensor: Sensor, lens: KnownLens, size_px: tuple[int, int]) -> FittedN
     return FittedNoise(sensor.model, unusable, np.asarray(response, np.float32) if known else None)
 
 
-def _planned_set(session: Path, plan: CapturePlan, lens: Lens, fitted: FittedNoise) -> ElementalSet:
-    """Return the set of all planned views, at the poses that the stage is told."""
-    frames = dark_frames(plan)
-    stops = sorted({frame.stop.node: frame.stop for frame in frames}.items())
-    nodes = [node for node, _ in stops]
-    if plan.centre.node not in nodes:
+def _rounds_s(session: Path, plan: CapturePlan) -> tuple[tuple[float, ...], ...]:
+    """Return the exposure times of the frames of a view in each round."""
+    rounds: dict[int, list[float]] = {}
+    for frame in dark_frames(plan):
+        if frame.stop == plan.centre:
+            rounds.setdefault(frame.round, []).append(frame.exposure_s)
+    if not rounds:
         raise BadValue(
             f"{session}: no dark_scene frame is planned at the centre node {list(plan.centre.node)}, whose camera is "
             "the reference; take the dark scene at the grid"
         )
-    at_centre = [frame.exposure_s for frame in frames if frame.stop == plan.centre]
-    names = ["frame"] * len(at_centre)
+    return tuple(tuple(exposures_s) for _, exposures_s in sorted(rounds.items()))
+
+
+def _planned_set(
+    session: Path, plan: CapturePlan, exposures_s: Sequence[float], lens: Lens, fitted: FittedNoise
+) -> ElementalSet:
+    """Return the set of all planned views, at the poses that the stage is told, with frames of these exposures."""
+    stops = sorted({frame.stop.node: frame.stop for frame in dark_frames(plan)}.items())
+    nodes = [node for node, _ in stops]
+    names = ["frame"] * len(exposures_s)
     camera = Camera(lens.size_px, lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, lens.distortion)
     settings = ElementalSetFile(
         format=1,
-        exposure_s=sum(at_centre),
+        exposure_s=sum(exposures_s),
         reference_view=nodes.index(plan.centre.node),
         camera=camera,
         noise=NOISE_FILE,

@@ -11,6 +11,7 @@ from msgspec import UNSET
 from numpy.typing import NDArray
 from skimage.filters import threshold_li
 
+from faintfield.calib.noise_model import Map
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import write_record, write_whole
 from faintfield.pipelines.formats.frames import read_frame
@@ -92,25 +93,39 @@ def brightness(elemental_set: ElementalSet, region_path: Path | None = None) -> 
 
 def brightness_within(elemental_set: ElementalSet, region: Region | None, name: str) -> Brightness:
     """Measure the reference view over a region (row, column) called `name`; over the whole view if it is None."""
-    has_reference = len(elemental_set.noise_reference) >= elemental_set.frames_per_view
+    no_light_paths = elemental_set.noise_reference[: elemental_set.frames_per_view]
+    has_reference = bool(no_light_paths)
+    share = len(no_light_paths) / elemental_set.frames_per_view
     signal, reference = [], []
     for layout in elemental_set.layouts:
         images = view_electrons(elemental_set, layout, elemental_set.frame_paths[elemental_set.reference_view])
-        no_light = view_electrons(elemental_set, layout, elemental_set.noise_reference[: elemental_set.frames_per_view])
+        no_light = view_electrons(elemental_set, layout, no_light_paths)
         for index, lattice in enumerate(layout.lattices):
             where = np.ones(lattice.shape, bool) if region is None else lattice.of(region)
             signal.append(images[index][0][where])
+            noise = lattice_noise(elemental_set, lattice, None)
+            dark_e = elemental_set.background_e(noise)
             if has_reference:
-                reference.append(no_light[index][0].ravel())
+                no_light_e = no_light[index][0]
+                reference.append((no_light_e if share == 1 else _as_whole_view(no_light_e, dark_e, share)).ravel())
             else:
-                noise = lattice_noise(elemental_set, lattice, None)
-                dark_e = elemental_set.background_e(noise)
                 power = np.broadcast_to(
                     elemental_set.read_variance_e2(noise) + dark_e + np.square(dark_e), lattice.shape
                 )
                 reference.append(np.sqrt(power).ravel())
     noise_from = "noise reference" if has_reference else "noise model"
     return _figures(elemental_set, name, noise_from, np.concatenate(signal), np.concatenate(reference))
+
+
+def _as_whole_view(no_light_e: NDArray[np.float32], dark_e: Map, share: float) -> NDArray[np.floating]:
+    """Return electrons without light with the power that those of all frames of a view have, given a share of them.
+
+    Means grow with the number of frames, deviations from them with its root. The mean of a pixel is its dark electrons
+    by the noise model, `dark_e` in a view, and what all pixels share besides.
+    """
+    mean_e = share * dark_e
+    mean_e = mean_e + np.mean(no_light_e - mean_e)
+    return np.asarray(mean_e / share + (no_light_e - mean_e) / np.sqrt(share))
 
 
 def _figures(

@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 import tifffile
@@ -48,6 +49,30 @@ def test_brightness_by_noise_model_and_noise_reference(make_set: SetMaker) -> No
     assert (found.region, found.noise_from) == ("object region", "noise reference")
     assert found.snr == pytest.approx(((16 + 36) / 2 - (4 + 4 + 4 + 1) / 4) / ((4 + 4 + 4 + 1) / 4), rel=1e-6)
     assert found.mean_signal_e == pytest.approx(5.0 - DARK_E, rel=1e-6)
+
+
+@pytest.mark.parametrize("frames", [1, 2])
+def test_short_noise_reference_counts_as_whole_view(make_set: SetMaker, tmp_path: Path, frames: int) -> None:
+    """Eight frames in a view, in which dark current varies from pixel to pixel and there is stray light."""
+    generator, shape = np.random.default_rng(8), (96, 128)
+    dark_e = generator.uniform(0.0, 4.0, shape)
+    paths = [tmp_path / f"no_light_{number}.tiff" for number in range(8)]
+    for path in paths:
+        frame_e = generator.poisson(dark_e + 0.5) + generator.normal(0.0, 3.0, shape)
+        tifffile.imwrite(path, np.round(100.0 + 2.0 * frame_e).astype(np.uint16))
+    view = np.round(100.0 + 2.0 * generator.poisson(dark_e + 5.0)).astype(np.uint16)
+    loaded = load_set(make_set([view], noise=NOISE, exposure_s=4.0))
+    [seen] = loaded.settings.view
+    settings = msgspec.structs.replace(loaded.settings, view=[msgspec.structs.replace(seen, repeats=(seen.image,) * 7)])
+    noise = replace(loaded.noise, dark_current_e_per_s=2.0 * dark_e)
+    whole = replace(loaded, settings=settings, noise=noise, noise_reference=tuple(paths))
+    expected, found = (
+        brightness(elemental_set) for elemental_set in (whole, replace(whole, noise_reference=tuple(paths[:frames])))
+    )
+    assert found.noise_from == expected.noise_from == "noise reference"
+    assert found.snr is not None
+    assert expected.snr is not None
+    assert 1 + found.snr == pytest.approx(1 + expected.snr, rel=0.03)
 
 
 def test_no_snr_or_negative_counts_no_photons(make_set: SetMaker) -> None:
