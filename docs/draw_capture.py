@@ -97,9 +97,10 @@ class _Session:
         board_order = BoardOrder(self._folder, out, (500.0, 700.0), None)
         with ExitStack() as stack:
             boards = stack.enter_context(followed_boards(board_order, opened[0].of_boards))
-            client = stack.enter_context(live_planes(order, opened[0].of_dark_scene))
-            assert client is not None
             assert boards is not None
+            client = stack.enter_context(live_planes(order, opened[0].of_dark_scene, boards.poses))
+            assert client is not None
+            boards.on_poses.append(client.note_change)
             self.panel.on_change += [boards.note_change, client.note_change, self._wait]
             meter = LightMeter(lambda: known_sensor(self._settings, None), _LIGHT_E_PER_S).wait()
             address = stack.enter_context(serve_page(self.panel, opened[0], client, boards, meter))

@@ -242,13 +242,16 @@ def step_rows(session: SessionFrames, status: Status | None, homing: bool = Fals
     rows: list[StepRow] = []
     has_next = False
     for step in session.steps():
-        done, total = step.done, step.total
+        done, total = (
+            step.done,
+            step.total if status is None or not status.step_frames else status.step_frames[step.index],
+        )
         state: Literal["done", "now", "next", "to do", "left out"] = "to do"
         if done == total:
             state = "done"
         elif step.index == present:
             state = "now"
-        elif done + step.skipped == total:
+        elif done + step.skipped >= total:  # of rounds that are not expected, too
             state = "left out"
         elif not has_next:
             state, has_next = "next", True

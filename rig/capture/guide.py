@@ -1,6 +1,6 @@
 """Guide the operator through a capture: what to do before each step, questions, answers, warnings, remaining time."""
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from statistics import median
 from typing import TYPE_CHECKING, Literal, NoReturn, Protocol
@@ -95,9 +95,9 @@ class Status(Struct, frozen=True):
     """State of the capture, whose present step is the one of number `step`, from 1.
 
     `done` of `total` frames are taken; the rest takes `to_go_s` without prompts. `node` is where the stage is or goes,
-    and `grid` has the share of this step's frames that is done, per row and column; −1 where the step has none. `stage`
-    and `camera` are their states in words; the missing frames of each step take `step_to_go_s`. `rounds` says how far a
-    step in rounds is, else it is empty.
+    and `grid` has the share of the frames of this step and round that is done, per row and column; −1 where there are
+    none. `stage` and `camera` are their states in words. Each step has `step_frames`, of which the missing ones take
+    `step_to_go_s`. `rounds` says how far a step in rounds is, else it is empty; the rounds that are expected count.
     """
 
     doing: str
@@ -113,6 +113,7 @@ class Status(Struct, frozen=True):
     stage: str = ""
     camera: str = ""
     step_to_go_s: tuple[float, ...] = ()
+    step_frames: tuple[int, ...] = ()
     rounds: str = ""
 
 
@@ -206,21 +207,23 @@ def format_duration(duration_s: float) -> str:
 
 def describe_progress(progress: Progress, to_go_s: float) -> str:
     """Return how far a step in rounds is, such as `σ now 0.21 e⁻, wanted 0.1: 3 more rounds, about 41 min`."""
-    until, more = progress.until, progress.enough - progress.done
+    until, more = progress.until, progress.enough - progress.done - progress.within
     if progress.final_e is None:
         return f"σ is not known, wanted {until.sigma_e:g} e⁻: all {until.at_most_rounds} rounds are taken"
-    now = "" if progress.sigma_e is None else f"now {progress.sigma_e:.2g} e⁻, "
+    now = "" if progress.sigma_e is None else f"now {progress.sigma_e:.3g} e⁻, "
     if not progress.reaches:
-        now += f"{progress.final_e:.2g} e⁻ after all {until.at_most_rounds} rounds, "
-    rounds = "no more rounds" if more <= 0 else f"{more} more {'round' if more == 1 else 'rounds'}"
-    time = f", {format_duration(to_go_s)}" if more > 0 else ""
+        now += f"{progress.final_e:.3g} e⁻ after all {until.at_most_rounds} rounds, "
+    rounds = f"{more} more {'round' if more == 1 else 'rounds'}" if more > 0 else "no more rounds"
+    if progress.within:
+        rounds = f"this round and {rounds}" if more > 0 else "the rest of this round"
+    time = f", {format_duration(to_go_s)}" if to_go_s else ""
     return f"σ {now}wanted {until.sigma_e:g}: {rounds}{time}"
 
 
 def describe_rounds(ended: RoundsEnded) -> str:
     """Return how a step in rounds ended, such as `step 4 ended after 3 rounds, at a predicted σ of 0.098 e⁻`."""
     rounds = "1 round" if ended.rounds == 1 else f"{ended.rounds} rounds"
-    noise = "" if ended.sigma_e is None else f", at a predicted σ of {ended.sigma_e:.2g} e⁻"
+    noise = "" if ended.sigma_e is None else f", at a predicted σ of {ended.sigma_e:.3g} e⁻"
     return f"step {ended.step + 1} ended after {rounds}{noise}{', by the operator' * ended.by_operator}"
 
 
@@ -351,7 +354,10 @@ class Dialogue:
     def show_status(self, frame: PlannedFrame, doing: str, recording: PlannedFrame | None = None) -> None:
         """Show the state of the capture, which is `doing` something for `frame`, while another one is recorded."""
         session = self.session
-        missing = self.rounds.expected([left for left in session.missing() if left != recording])
+        expected = self.rounds.expected(session.wanted())
+        open_numbers = {left.number for left in session.missing() if left != recording}
+        missing = [left for left in expected if left.number in open_numbers]
+        frames_of_step = Counter(each.step for each in expected)
         steps, progress = session.plan.steps, self.rounds.progress(frame.step)
         steps_s = self.pace.step_durations_s(missing)
         if session.frozen.rig.drift.check:
@@ -363,24 +369,25 @@ class Dialogue:
             steps=len(steps),
             title=_step_title(frame, len(steps)),
             done=len(session.valid()),
-            total=len(session.wanted()),
+            total=len(expected),
             to_go_s=sum(steps_s.values()),
             node=frame.stop.node,
-            grid=self._shares_done(frame.step),
+            grid=self._shares_done(frame),
             warnings=self.warnings,
             stage=self.stage,
             camera=self.camera,
             step_to_go_s=tuple(steps_s.get(step, 0.0) for step in range(len(steps))),
+            step_frames=tuple(frames_of_step[step] for step in range(len(steps))),
             rounds="" if progress is None else describe_progress(progress, steps_s.get(frame.step, 0.0)),
         )
         self.operator.show_status(status)
 
-    def _shares_done(self, step: int) -> tuple[tuple[float, ...], ...]:
-        """Return the share of a step's frames that is done, per row and column; −1 where the step has none."""
+    def _shares_done(self, now: PlannedFrame) -> tuple[tuple[float, ...], ...]:
+        """Return the share of the frames of a step and round that is done, per row and column; −1 where it has none."""
         grid, valid = self.session.frozen.rig.grid, self.session.valid()
         done: defaultdict[tuple[int, int], list[bool]] = defaultdict(list)
-        for frame in self.session.wanted():
-            if frame.step == step:
+        for frame in self.session.frames:
+            if (frame.step, frame.round) == (now.step, now.round):
                 done[frame.stop.node].append(frame.number in valid)
         nodes = [[done.get((row, column)) for column in range(grid.columns)] for row in range(grid.rows)]
         return tuple(tuple(sum(frames) / len(frames) if frames else -1.0 for frames in row) for row in nodes)

@@ -57,9 +57,13 @@ class Rounds:
         return last[1]
 
     def expected(self, frames: Sequence[PlannedFrame]) -> list[PlannedFrame]:
-        """Return those of the missing frames that will probably be taken: without rounds that will not be needed."""
-        enough = {step: progress.enough for step in self._steps() if (progress := self.progress(step)) is not None}
-        return [frame for frame in frames if frame.round < enough.get(frame.step, frame.round + 1)]
+        """Return the frames without those of rounds that will probably not be needed."""
+        rounds = {
+            step: max(progress.enough, progress.done + progress.within)
+            for step in self._steps()
+            if (progress := self.progress(step)) is not None
+        }
+        return [frame for frame in frames if frame.round < rounds.get(frame.step, frame.round + 1)]
 
     def end_steps(self) -> None:
         """Record which steps need no further round, each after a whole one."""

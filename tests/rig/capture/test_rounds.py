@@ -98,7 +98,7 @@ def test_status_states_noise_rounds_and_time(tmp_path: Path) -> None:
     assert words[NODES].rounds.startswith("σ now 0.85 e⁻, wanted 0.5: 2 more rounds, about")
     # Only the rounds that will be needed count
     assert words[0].step_to_go_s[0] == pytest.approx(3 * words[2 * NODES].step_to_go_s[0], rel=0.3)
-    assert words[0].total == 8 * NODES + DARKS
+    assert (words[0].total, words[0].step_frames) == (3 * NODES + DARKS, (3 * NODES, DARKS))
 
 
 def test_every_round_is_checked_for_drift(tmp_path: Path) -> None:
