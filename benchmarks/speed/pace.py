@@ -1,11 +1,13 @@
 """Time per node of a capture in real time: `python -m benchmarks.speed.pace [FOLDER] [--size-px 1024] [--nodes 7]`.
 
 A simulated GRBL controller answers over a pseudo-terminal at 115200 baud in a process of its own, and the camera takes
-as long as its exposures. The table splits the time of a node: what follows from the plan, and what is added to it.
+as long as its exposures. The table splits the time of a node: what follows from the plan, and what is added to it. With
+`--page` captures without and with the page in Chromium, and with live planes, are compared by turns.
 """
 
 import argparse
 import multiprocessing
+import statistics
 import tempfile
 import threading
 import time
@@ -22,8 +24,10 @@ from unittest import mock
 import numpy as np
 import tifffile
 
+from faintfield.pipelines.live.capture_page import serve_page
 from faintfield.pipelines.live.guided import read_pixels
-from faintfield.pipelines.live.panel import CapturePanel
+from faintfield.pipelines.live.panel import CapturePanel, SessionFrames
+from faintfield.pipelines.live.planes_client import LiveOrder, live_planes
 from faintfield.rig.cameras.protocol import CameraReport, Exposure
 from faintfield.rig.cameras.settings import FolderSettings
 from faintfield.rig.capture import take
@@ -41,8 +45,12 @@ from faintfield.rig.stages.gantry import Gantry, serial_stage
 from faintfield.rig.stages.grbl import GrblController
 from faintfield.rig.stages.protocol import Point, StageSettings
 from faintfield.rig.stages.transport import SerialPort, TrafficLog
+from tests.end_to_end.browser import open_browser
 
 EXPOSURE_S, REST_S, PITCH_MM = 0.2, 0.1, 20.0
+
+# Depths of the live planes beside a capture.
+_DEPTHS_MM = (400.0, 500.0, 600.0, 700.0)
 
 # Share of the stated acceleration that the firmware reaches: motions take a little longer than predicted.
 _ACCELERATION = 0.9
@@ -126,7 +134,22 @@ def rig(settings: RigSettings, size_px: int, traffic: TrafficLog | None = None) 
     return Rig(stage, TimedCamera(size_px), clock, lambda kind, sweep: None, camera_sees_stage=False)
 
 
-def measure(port: str, folder: Path, nodes: int, size_px: int) -> tuple[Times, float]:
+@contextmanager
+def shown(panel: CapturePanel, session: Session, scratch: Path) -> Iterator[None]:
+    """Show the capture in a browser, with live planes at four depths, while the block runs."""
+    frames = SessionFrames(session)
+    order = LiveOrder(session.folder, scratch / "rig.toml", _DEPTHS_MM, fx_px=1000.0)
+    with ExitStack() as stack:
+        planes = stack.enter_context(live_planes(order, frames.of_dark_scene))
+        assert planes is not None
+        panel.on_change.append(planes.note_change)
+        address = stack.enter_context(serve_page(panel, frames, planes))
+        tab = stack.enter_context(open_browser(scratch / "browser"))
+        tab.open(address)
+        yield
+
+
+def measure(port: str, folder: Path, nodes: int, size_px: int, *, page: bool = False) -> tuple[Times, float]:
     """Capture a dark scene; return the times of all nodes but the first, and their sum."""
     settings = RigSettings(
         stage=StageSettings("grbl", port),
@@ -168,6 +191,8 @@ def measure(port: str, folder: Path, nodes: int, size_px: int) -> tuple[Times, f
         stack.enter_context(mock.patch.object(GrblController, "follow", timed_follow))
         stack.enter_context(mock.patch.object(take.FrameTaker, "take", timed_take))
         operator = CapturePanel(unattended=True)
+        if page:
+            stack.enter_context(shown(operator, session, folder.parent))
         Capture(session, rig(settings, size_px, session.journal), operator, read_pixels).run()
     return times, ends_s[-1] - ends_s[0]
 
@@ -189,16 +214,30 @@ def main() -> None:
     parser.add_argument("folder", nargs="?")
     parser.add_argument("--size-px", type=int, default=1024, help="width and height of a frame")
     parser.add_argument("--nodes", type=int, default=7, help="nodes along one side of the grid")
+    parser.add_argument("--page", type=int, default=0, metavar="PAIRS", help="captures without and with the page")
     arguments = parser.parse_args()
+    if arguments.page:
+        ratios = []
+        for _ in range(arguments.page):
+            without_s, with_s = (_captured(arguments, page=page)[1] for page in (False, True))
+            ratios.append(with_s / without_s)
+            print(f"{without_s:.1f} s without the page, {with_s:.1f} s with it: {ratios[-1]:.3f}", flush=True)
+        print(f"median of the ratios: {statistics.median(ratios):.3f}")
+        return
+    times, total_s = _captured(arguments)
+    print(table(times, total_s, arguments.nodes**2 - 1))
+
+
+def _captured(arguments: argparse.Namespace, *, page: bool = False) -> tuple[Times, float]:
     near, far = multiprocessing.Pipe()
     server = multiprocessing.get_context("spawn").Process(target=serve, args=(far,), daemon=True)
     server.start()
     try:
         with tempfile.TemporaryDirectory(dir=arguments.folder) as folder:
-            times, total_s = measure(near.recv(), Path(folder) / "session", arguments.nodes, arguments.size_px)
+            session = Path(folder) / "session"
+            return measure(near.recv(), session, arguments.nodes, arguments.size_px, page=page)
     finally:
         server.kill()
-    print(table(times, total_s, arguments.nodes**2 - 1))
 
 
 if __name__ == "__main__":
