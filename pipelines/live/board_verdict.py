@@ -124,11 +124,12 @@ def judge(
     so_far = _information(prediction, standing_boards(start, boards), plan)
     error_px, depth_mm = prediction.error_px(so_far)
     under_way = [sweep + 1 for sweep, nodes in plan.to_come.items() if nodes]
-    when = f" when sweep {max(under_way)} is done" if under_way else ""
+    when = f" once all frames of sweep {max(under_way)} count," if under_way else ""
     predicted = f"predicted transfer error{when} {error_px:.2g} px at {depth_mm:g} mm, wanted {plan.wanted_px:g}"
     if adjustment is not None and error_px <= plan.wanted_px:
         alone = len(adjustment.geometry.boards) == 1
-        more = ", but nothing checks a single board yet" if alone else ", the boards are good enough"
+        further = "; sweeps that are left may be skipped" if plan.sweeps_left else ""
+        more = ", but nothing checks a single board yet" if alone else f", the boards are good enough{further}"
         return BoardVerdict(f"{predicted}: reached{more}", error_px, depth_mm, reached=True), adjustment
     board = max(boards.values(), key=lambda board: (board.columns * board.rows, board.name))
     placements = candidate_placements(prediction, so_far, board, np.array(coverage(observations, size_px)))

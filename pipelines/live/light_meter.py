@@ -102,7 +102,7 @@ def _advice(light_e: float, sigma_e: float, planned_e: float | None) -> str:
     if planned_e is None:
         return "no light was planned; state that of `faintfield plan` as --light-e to compare"
     if abs(light_e - planned_e) <= max(_MIN_DEVIATIONS * sigma_e, _TOLERANCE * planned_e):
-        return "as planned"
+        return "the light is as planned"
     if light_e < planned_e:
         return f"too dark: give about {planned_e / light_e:.2g} times the light"
     return f"brighter than planned: about {light_e / planned_e:.2g} times the light"

@@ -6,7 +6,7 @@ queue; keys, clicks and Ctrl-C all write to it.
 
 import itertools
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from queue import Empty, SimpleQueue
 from typing import Any, get_args
@@ -23,7 +23,7 @@ from faintfield.rig.capture.checks import LIT_KINDS
 from faintfield.rig.capture.guide import Answer, OperatorRequest, Prompt, ShownFrame, Status, preparations
 from faintfield.rig.plan import CaptureStep, PlannedFrame
 from faintfield.rig.session.homings import Homed
-from faintfield.rig.session.journal import CommittedFrame
+from faintfield.rig.session.journal import CommittedFrame, RoundsEnded
 from faintfield.rig.session.session import Session
 
 REQUESTS: tuple[OperatorRequest, ...] = get_args(OperatorRequest.__value__)
@@ -84,6 +84,8 @@ class CapturePanel:
         """Show `prompt` and return the first answer to it."""
         if self.unattended:
             return prompt.unattended
+        if any(word == "stop" for word, _ in self._waiting_presses()):
+            return "stop"  # of the rest none was meant for this prompt
         self.asked = OpenPrompt(next(self._numbers), prompt)
         self._changed()
         while True:
@@ -96,12 +98,15 @@ class CapturePanel:
     def take_request(self) -> OperatorRequest | None:
         """Return the latest request since the last call, None if there is none."""
         latest: OperatorRequest | None = None
+        for word, number in self._waiting_presses():
+            if word in REQUESTS and number is None:
+                latest = word
+        return latest
+
+    def _waiting_presses(self) -> Iterator[tuple[str, int | None]]:
         with suppress(Empty):
             while True:
-                word, number = self._pressed.get_nowait()
-                if word in REQUESTS and number is None:
-                    latest = word
-        return latest
+                yield self._pressed.get_nowait()
 
     def show_status(self, status: Status) -> None:
         """Show the state of the capture."""
@@ -111,7 +116,9 @@ class CapturePanel:
     def show_frame(self, shown: ShownFrame) -> None:
         """Show the frame just taken."""
         step, scale_dn = shown.frame.step, None
-        if shown.frame.kind not in LIT_KINDS:
+        if shown.frame.kind == "flat":  # a scale of its own would show unevenness as strong as that of a scene
+            scale_dn = 0.0, max(float(sampled(shown.pixels).max()), 1.0)
+        elif shown.frame.kind not in LIT_KINDS:
             scale_dn = self._scale[1] if self._scale[0] == step else _dark_scale_dn(shown.pixels)
             if shown.recorded:
                 self._scale = step, scale_dn
@@ -159,7 +166,7 @@ class SessionFrames:
             StepProgress(
                 index=index,
                 first=self._first[index],
-                frames=_describe_frames(step, len(plan.stops_of(step))),
+                frames=_describe_frames(step, len(plan.stops_of(step)), self._session.rounds_ended.get(index)),
                 done=done[index],
                 skipped=skipped[index],
                 total=total[index],
@@ -235,10 +242,13 @@ class SessionFrames:
         return None
 
 
-def _describe_frames(step: CaptureStep, stops: int) -> str:
+def _describe_frames(step: CaptureStep, stops: int, ended: RoundsEnded | None) -> str:
     """Return the frames of a step, such as `49 nodes, 10 x 0.1 s`."""
     place = "centre node" if step.at == "centre" else f"{stops} nodes" if stops > 1 else "1 node"
     repeats = f"{step.frames_per_node} x " if step.frames_per_node > 1 else ""
     until = step.until
     rounds = "" if until is None else f", at most {until.at_most_rounds} rounds, until σ is {until.sigma_e:g} e⁻"
+    if ended is not None:
+        sigma = "" if ended.sigma_e is None else f", σ is {ended.sigma_e:.3g} e⁻"
+        rounds = f", rounds: {ended.rounds}{sigma}"
     return f"{place}, {repeats}{', '.join(f'{exposure_s:g}' for exposure_s in step.exposure_s)} s{rounds}"

@@ -21,12 +21,14 @@ _LABELS: dict[Answer | OperatorRequest, str] = {
     "test": "test frame",
     "again": "try again",
     "keep": "keep as it is",
-    "retake": "take again",
+    "retake": "take last again",
     "skip": "skip frame",
     "finish": "finish after this round",
     "stop": "stop",
     "pause": "pause",
 }
+# The same in prompts of a key.
+_LABELS_IN_PROMPTS: dict[tuple[str, str | None], str] = {("skip", "step"): "skip step", ("go", "home"): "home"}
 KEYS: dict[Answer | OperatorRequest, str] = {
     "go": "g",
     "test": "t",
@@ -42,7 +44,8 @@ KEYS: dict[Answer | OperatorRequest, str] = {
 
 def button_label(word: Answer | OperatorRequest, prompt: Prompt | None) -> str:
     """Return the label of a button: an answer to a prompt, or a request without one."""
-    return "skip step" if word == "skip" and prompt is not None and prompt.key == "step" else _LABELS[word]
+    key = None if prompt is None else prompt.key
+    return _LABELS_IN_PROMPTS.get((word, key), _LABELS[word])
 
 
 _HISTOGRAM_BINS = 64
@@ -148,7 +151,7 @@ class PageState(Struct, frozen=True):
     """Everything that the page shows, except pictures; `prompt` is the number of the open prompt."""
 
     title: str
-    mode: Literal["waiting", "running", "ended"]
+    mode: Literal["waiting", "failed", "running", "ended"]
     prompt: int | None
     lines: tuple[str, ...]
     buttons: tuple[Button, ...]
@@ -199,7 +202,7 @@ class CaptureView:
         homing = prompt is not None and prompt.key == "home"
         return PageState(
             title=outcome or (prompt.title if prompt else status.title if status else "Connecting to stage and camera"),
-            mode="ended" if outcome else "waiting" if prompt else "running",
+            mode=_mode(outcome, prompt),
             prompt=None if asked is None else asked.number,
             lines=() if prompt is None else prompt.lines,
             buttons=() if outcome else tuple(Button(word, button_label(word, prompt), KEYS[word]) for word in words),
@@ -213,6 +216,14 @@ class CaptureView:
             planes=None if self.planes is None else _planes(self.planes),
             outcome=outcome,
         )
+
+
+def _mode(outcome: str | None, prompt: Prompt | None) -> Literal["waiting", "failed", "running", "ended"]:
+    if outcome is not None:
+        return "ended"
+    if prompt is None:
+        return "running"
+    return "failed" if prompt.key in ("stage", "camera", "light", "drift") else "waiting"
 
 
 class _Memory[T]:

@@ -40,6 +40,7 @@ _TO_DO: dict[StepKind, tuple[str, ...]] = {
         "Set the faint light for the scene, wait until your eyes are dark-adapted, and look for stray light.",
     ),
     "noise_reference": (
+        "Look at the planes first: once the objects are moved, no frame of the dark scene can be taken again.",
         "Take the objects out without touching the camera or the stage.",
         "Turn the faint light off: absolute dark.",
     ),
@@ -67,6 +68,14 @@ _CHECK: dict[StepKind, str] = {
     "noise_reference": "Check that frames are even: a bright corner is stray light.",
     "dark": "Check that frames are even: a bright corner means that the cover leaks.",
     "flat": "Check that frames are even, bright, and not saturated.",
+}
+_TEST: dict[StepKind, str] = {
+    "charuco": "A test frame shows whether the boards are sharp and well lit. One may be cut off by the edge.",
+    "bright": "A test frame shows whether the objects are sharp and well lit.",
+    "dark_scene": "A test frame measures the light: set the lamp, and take another until it is as planned.",
+    "noise_reference": "A test frame is to be even, and shows no more than noise.",
+    "dark": "A test frame is to be even, and shows no more than noise.",
+    "flat": "A test frame is to be even and bright, and nowhere saturated.",
 }
 TITLES: dict[StepKind, str] = {
     "charuco": "Board sweep",
@@ -97,7 +106,8 @@ class Status(Struct, frozen=True):
     `done` of `total` frames are taken; the rest takes `to_go_s` without prompts. `node` is where the stage is or goes,
     and `grid` has the share of the frames of this step and round that is done, per row and column; −1 where there are
     none. `stage` and `camera` are their states in words. Each step has `step_frames`, of which the missing ones take
-    `step_to_go_s`. `rounds` says how far a step in rounds is, else it is empty; the rounds that are expected count.
+    `step_to_go_s`. `round` is the number of the present round, and `rounds` says how far a step in rounds is, else it
+    is empty; rounds that are not expected do not count.
     """
 
     doing: str
@@ -115,6 +125,7 @@ class Status(Struct, frozen=True):
     step_to_go_s: tuple[float, ...] = ()
     step_frames: tuple[int, ...] = ()
     rounds: str = ""
+    round: int = 1
 
 
 class ShownFrame(Struct, frozen=True, eq=False):
@@ -162,7 +173,7 @@ def needs_hand(step: CaptureStep, before: StepKind | None) -> bool:
 
 def step_prompt(steps: Sequence[CaptureStep], frame: PlannedFrame, frames: int, duration_s: float) -> Prompt:
     """Return the prompt before a step, whose first of `frames` frames is `frame`; they take `duration_s`."""
-    test = "A test frame, at the first node, shows whether all is in view, sharp and well exposed; it is not recorded."
+    test = f"{_TEST[frame.kind]} It is taken where the step begins, and not recorded."
     until = steps[frame.step].until
     rounds = "" if until is None else f"rounds over the grid until the noise is {until.sigma_e:g} e⁻, at most "
     frames_follow = f"Then {rounds}{frames} frames follow, {format_duration(duration_s)}."
@@ -213,11 +224,13 @@ def describe_progress(progress: Progress, to_go_s: float) -> str:
     now = "" if progress.sigma_e is None else f"now {progress.sigma_e:.3g} e⁻, "
     if not progress.reaches:
         now += f"{progress.final_e:.3g} e⁻ after all {until.at_most_rounds} rounds, "
+    reached = ", reached" if progress.sigma_e is not None and progress.sigma_e <= until.sigma_e else ""
     rounds = f"{more} more {'round' if more == 1 else 'rounds'}" if more > 0 else "no more rounds"
     if progress.within:
-        rounds = f"this round and {rounds}" if more > 0 else "the rest of this round"
+        present = f"round {progress.done + 1}"
+        rounds = f"{present} and {rounds}" if more > 0 else f"the rest of {present}"
     time = f", {format_duration(to_go_s)}" if to_go_s else ""
-    return f"σ {now}wanted {until.sigma_e:g}: {rounds}{time}"
+    return f"σ {now}wanted {until.sigma_e:g}{reached}: {rounds}{time}"
 
 
 def describe_rounds(ended: RoundsEnded) -> str:
@@ -378,6 +391,7 @@ class Dialogue:
             camera=self.camera,
             step_to_go_s=tuple(steps_s.get(step, 0.0) for step in range(len(steps))),
             step_frames=tuple(frames_of_step[step] for step in range(len(steps))),
+            round=frame.round + 1,
             rounds="" if progress is None else describe_progress(progress, steps_s.get(frame.step, 0.0)),
         )
         self.operator.show_status(status)

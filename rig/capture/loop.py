@@ -250,7 +250,10 @@ class Capture:
         self._dialogue.show_status(frame, f"the {device} failed")
         unattended: Answer = "again" if self._failures < MAX_UNATTENDED_TRIES else "stop"
         answers: tuple[Answer, ...] = ("again", "skip", "stop")
-        answer = self._dialogue.ask(Prompt(device, f"The {device} failed", (str(failure),), answers, unattended))
+        # The stage moves no sooner than it is answered; if it failed itself, that is not certain
+        still = () if device == "stage" else ("The stage stands still. Do not move camera, boards or objects.",)
+        lines = (f"{failure}.", *still)
+        answer = self._dialogue.ask(Prompt(device, f"The {device} failed", lines, answers, unattended))
         if answer == "stop":
             raise failure
         if answer == "again":

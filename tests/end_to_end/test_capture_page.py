@@ -196,10 +196,9 @@ def test_page_shows_plan_before_first_frame(waiting: tuple[CapturePanel, str], b
     text = browser.text()
     for words in (
         *("Take the boards away", "2 Dark-scene set", "about 2 min to go"),
-        *("stage\nhomed", "camera\nready", "No frame yet"),
+        *("stage\nhomed", "camera\nready", "No frame of this step yet"),
     ):
         assert words in text
-    browser.evaluate("document.querySelectorAll('#plan summary')[1].click()")
     for words in ("6 nodes, 0.1 s, about 30 s", "Lights out. Cover every lamp"):
         assert words in browser.text()
     browser.evaluate("document.body.dispatchEvent(new KeyboardEvent('keydown', {key: 't', bubbles: true}))")

@@ -186,7 +186,7 @@ def test_verdict_states_error_wish_and_advice() -> None:
     assert "tilted by about 25° to the " in words
     assert not reached
     assert judged(_SIX, 0.5)[1]
-    assert judged(_SIX, 0.5)[0].endswith("wanted 0.5: reached, the boards are good enough")
+    assert judged(_SIX, 0.5)[0].endswith("reached, the boards are good enough; sweeps that are left may be skipped")
 
 
 def test_facing_board_leads_to_advice_without_lens() -> None:
@@ -199,7 +199,7 @@ def test_facing_board_leads_to_advice_without_lens() -> None:
 
 def test_half_a_sweep_predicts_its_end() -> None:
     words, _, half_px = judged(_SIX[:3], 0.01, to_come=5)
-    assert words.startswith("predicted transfer error when sweep 3 is done ")
+    assert words.startswith("predicted transfer error once all frames of sweep 3 count, ")
     assert ": after it, put the board " in words
     assert half_px == pytest.approx(judged(_SIX[:3], 0.01)[2], rel=0.2)
 

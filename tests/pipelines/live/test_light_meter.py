@@ -33,7 +33,7 @@ def dark_frame(light_e: float, kind: StepKind = "dark_scene") -> ShownFrame:
 @pytest.mark.parametrize(
     ("light_e", "advice"),
     [
-        (1.0, "as planned"),
+        (1.0, "the light is as planned"),
         (0.5, "too dark: give about "),
         (3.0, "brighter than planned: about "),
         (0.0, "hardly any light is seen"),

@@ -111,3 +111,12 @@ class _StopAt(CapturePanel):
         assert status.total == FRAMES
         if status.done == self._last:
             self.press("stop")
+
+
+def test_presses_before_prompt_do_not_answer_it() -> None:
+    panel, prompt = CapturePanel(unattended=False), Prompt("step", "Step 2", (), ("go", "skip", "stop"), "go")
+    panel.on_change.append(lambda: panel.asked is not None and panel.press("go"))
+    panel.press("skip")  # meant for a frame of the step before
+    assert panel.ask(prompt) == "go"
+    panel.press("stop")
+    assert panel.ask(prompt) == "stop"
