@@ -136,7 +136,10 @@ class CapturePanel:
 
 
 class StepProgress(Struct, frozen=True):
-    """A step of the plan, by its first frame: the numbers of its frames that are done, left out, and all."""
+    """A step of the plan, by its first frame: the numbers of its frames that are done, left out, and all.
+
+    `rounds` is their number if the step ended before its last round, else None.
+    """
 
     index: int
     first: PlannedFrame
@@ -144,6 +147,7 @@ class StepProgress(Struct, frozen=True):
     done: int
     skipped: int
     total: int
+    rounds: int | None
     preparations: tuple[str, ...]
 
 
@@ -170,6 +174,7 @@ class SessionFrames:
                 done=done[index],
                 skipped=skipped[index],
                 total=total[index],
+                rounds=None if (ended := self._session.rounds_ended.get(index)) is None else ended.rounds,
                 preparations=preparations(plan.steps, self._first[index]),
             )
             for index, step in enumerate(plan.steps)

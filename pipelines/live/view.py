@@ -268,7 +268,7 @@ def step_rows(session: SessionFrames, status: Status | None, homing: bool = Fals
             state, has_next = "next", True
         to_go_s = status.step_to_go_s[step.index] if status is not None and status.step_to_go_s else 0.0
         to_go = format_duration(to_go_s) if to_go_s and state not in ("done", "left out") else ""
-        title = step_name(step.first)
+        title = step_name(step.first) + ("" if step.rounds is None else f", rounds: {step.rounds}")
         rows.append(StepRow(step.index + 1, title, state, step.frames, done, total, to_go, step.preparations))
     return tuple(rows)
 

@@ -27,7 +27,8 @@ type OperatorRequest = Literal["pause", "skip", "retake", "stop"]
 
 _TO_DO: dict[StepKind, tuple[str, ...]] = {
     "charuco": (
-        "Put the boards in place, in view from every node, and do not touch them until this sweep is done.",
+        "Put the boards in place, in view from every node, at least in part, and do not touch them until this sweep is "
+        "done.",
         "Turn the lights on.",
     ),
     "bright": (
@@ -49,7 +50,8 @@ _TO_DO: dict[StepKind, tuple[str, ...]] = {
 }
 _TO_DO_AGAIN: dict[StepKind, tuple[str, ...]] = {
     "charuco": (
-        "Move and turn the boards: nearer or farther, tilted another way, still in view from every node.",
+        "Move and turn the boards: nearer or farther, tilted another way, still in view from every node, at least in "
+        "part.",
         "Then do not touch them until this sweep is done.",
     ),
     "flat": ("Change the light on the diffuser, so that the frames become clearly brighter or darker.",),
@@ -70,7 +72,7 @@ _CHECK: dict[StepKind, str] = {
     "flat": "Check that frames are even, bright, and not saturated.",
 }
 _TEST: dict[StepKind, str] = {
-    "charuco": "A test frame shows whether the boards are sharp and well lit. One may be cut off by the edge.",
+    "charuco": "A test frame shows whether the boards are sharp and well lit.",
     "bright": "A test frame shows whether the objects are sharp and well lit.",
     "dark_scene": "A test frame measures the light: set the lamp, and take another until it is as planned.",
     "noise_reference": "A test frame is to be even, and shows no more than noise.",

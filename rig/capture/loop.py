@@ -252,7 +252,7 @@ class Capture:
         answers: tuple[Answer, ...] = ("again", "skip", "stop")
         # The stage moves no sooner than it is answered; if it failed itself, that is not certain
         still = () if device == "stage" else ("The stage stands still. Do not move camera, boards or objects.",)
-        lines = (f"{failure}.", *still)
+        lines = (str(failure), *still)
         answer = self._dialogue.ask(Prompt(device, f"The {device} failed", lines, answers, unattended))
         if answer == "stop":
             raise failure

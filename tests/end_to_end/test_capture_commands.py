@@ -285,7 +285,7 @@ def test_check_compares_rig_with_session(small: Shell) -> None:
     ("options", "words"),
     [
         (["--light-e", "1"], "the light is compared on the page or in a terminal, and there is neither; give --page"),
-        (["--noise", "noise.json"], "--noise is of live planes, rounds and the light; give --live-depth-mm or --light-e"),
+        (["--noise", "noise.json"], "--noise is of live planes, rounds and the light; give --live-depth-mm or"),
         (["--fx-px", "800"], "--geometry and --fx-px are of live planes and of rounds; give --live-depth-mm"),
     ],
 )

@@ -13,7 +13,7 @@ from faintfield.pipelines.live.view import CaptureView, CheckRow, frame_view, st
 from faintfield.pipelines.planning.known import Sensor
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.capture.checks import MAIN_QUANTITIES, QUANTITIES, check_frame
-from faintfield.rig.capture.guide import TITLES, ShownFrame, Status
+from faintfield.rig.capture.guide import TITLES, Prompt, ShownFrame, Status
 from faintfield.rig.plan import PlannedFrame, StepKind, Stop
 from faintfield.rig.session.resume import open_session
 from faintfield.rig.settings import CheckSettings
@@ -115,7 +115,12 @@ class _StopAt(CapturePanel):
 
 def test_presses_before_prompt_do_not_answer_it() -> None:
     panel, prompt = CapturePanel(unattended=False), Prompt("step", "Step 2", (), ("go", "skip", "stop"), "go")
-    panel.on_change.append(lambda: panel.asked is not None and panel.press("go"))
+
+    def answer() -> None:
+        if panel.asked is not None:
+            panel.press("go")
+
+    panel.on_change.append(answer)
     panel.press("skip")  # meant for a frame of the step before
     assert panel.ask(prompt) == "go"
     panel.press("stop")
