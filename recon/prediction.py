@@ -52,13 +52,21 @@ def information_of_views(
 def interpolation(views: int) -> float:
     """Return `Σ h² / Σ h` of the bilinear weights h of the pixels that meet a sample on the axis.
 
-    The pixels of the reference view lie on the samples, those of the other views on all places between them. For a rig
-    that moves the picture by whole pixels it would be 1; it is never less than 1/4.
+    The pixels of the reference view lie on the samples, those of the other views on all places between them.
     """
     return _SPREAD_EVENLY + (1 - _SPREAD_EVENLY) / views
 
 
-def sample_sigma_e(information: float, views: int) -> float:
+def interpolation_at(shifts_px: NDArray[np.floating]) -> float:
+    """Return `interpolation` of views that are moved by known shifts (view, 2).
+
+    It is 1 if these are whole pixels, and 1/4 at the least.
+    """
+    between = shifts_px - np.floor(shifts_px)
+    return float((np.square(between) + np.square(1 - between)).prod(axis=1).mean())
+
+
+def sample_sigma_e(information: float, spread: float) -> float:
     """Return the standard deviation in electrons of a sample of the unpenalised estimate, of samples as wide as pixels.
 
     The estimate is the back-projection, or for other than Gaussian noise one step of maximum likelihood from a smooth
@@ -67,11 +75,11 @@ def sample_sigma_e(information: float, views: int) -> float:
 
     Parameters
     ----------
-    information, views : float, int
+    information, spread : float
         In 1/(e⁻)², summed over the views that see the sample, times the part of the pixels that have its colour; and
-        the number of these views, the reference view among them.
+        `interpolation` or `interpolation_at` of these views.
     """
-    return math.sqrt(interpolation(views) / information)
+    return math.sqrt(spread / information)
 
 
 def feature_area_px2(side_px: float, blur_px: float = 0.0) -> float:

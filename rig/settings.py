@@ -245,6 +245,11 @@ class RigSettings(Struct, frozen=True, forbid_unknown_fields=True):
         if unknown := {name for step in self.step for name in step.lights or ()}.difference(names):
             known = ", ".join(map(repr, names)) or "none"
             raise ValueError(f"step.lights has {min(unknown)!r}; the lights of [[light]] are: {known}")
+        dark_scenes = [step for step in self.step if step.kind == "dark_scene"]
+        if len(dark_scenes) > 1 and any(step.until is not None for step in dark_scenes):
+            raise ValueError(
+                f"until stands in one of {len(dark_scenes)} dark_scene steps, whose frames add up; keep a single one"
+            )
         nodes = self.grid.rows * self.grid.columns
         stops = {"grid": nodes, "centre": 1}
         check_frame_count(sum(step.rounds * step.frames_per_stop() * stops[step.at] for step in self.steps()))

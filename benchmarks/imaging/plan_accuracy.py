@@ -25,7 +25,13 @@ from faintfield.recon.likelihood.images import ElementalImages, Image, select_li
 from faintfield.recon.metrics import signal_scale_for_snr
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.single_plane import PlaneOperator
-from faintfield.recon.prediction import depth_sigma_mm, information_of_views, sample_sigma_e, smallest_contrast
+from faintfield.recon.prediction import (
+    depth_sigma_mm,
+    information_of_views,
+    interpolation,
+    sample_sigma_e,
+    smallest_contrast,
+)
 from faintfield.recon.solver.data_fit import DataFit
 from faintfield.recon.solver.initialization import back_projection, smooth_start
 from faintfield.rig.plan import nominal_poses_rt_cam_ref
@@ -99,7 +105,7 @@ def _sigmas(
     light_e = float(on_object.mean()) * white_e
     response = _response_on_axis(experiment)
     information = information_of_views(light_e, dark_e, float(np.sqrt(noise.read_variance_e2())), response)
-    return light_e, sample_sigma_e(float(information.sum()), count**2), found, averaged
+    return light_e, sample_sigma_e(float(information.sum()), interpolation(count**2)), found, averaged
 
 
 def _response_on_axis(experiment: SimulatedExperiment) -> NDArray[np.float64]:

@@ -1,10 +1,11 @@
 """Knowledge of a rig before a capture: its sensor, its lens, the light of the scene, and how fast it is."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,8 @@ from faintfield.pipelines.formats.reading import is_file, is_folder
 from faintfield.pipelines.formats.results.geometry import CameraPoses, read_geometry
 from faintfield.pipelines.formats.results.noise import NOISE_MAPS, NoiseRecord, read_fitted_noise, read_maps, read_noise
 from faintfield.pipelines.planning.options import PlanOptions
-from faintfield.rig.cameras.settings import SimulatedSettings
+from faintfield.recon.prediction import interpolation, interpolation_at
+from faintfield.rig.cameras.settings import CameraSettings, SimulatedSettings
 from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import RigError
 from faintfield.rig.plan import Grid, centre_node, grid_nodes
@@ -108,31 +110,50 @@ def view_noise_e(read_noise_e: float, gain_dn_per_e: float | None, frames: float
     return math.sqrt(frames * (read_noise_e**2 + rounding_e2))
 
 
+class SeenSample(NamedTuple):
+    """Response of each view (view,) where it sees the middle of the reference view, and the `interpolation` of all."""
+
+    response: NDArray[np.float64]
+    spread: float
+
+
 @dataclass(frozen=True)
 class KnownLens:
-    """Focal length, width and height of a frame, the point where the axis meets it, and the relative response."""
+    """Focal length, width and height of a frame, the point where the axis meets it, and the relative response.
+
+    A rig that is `exact` has its camera where it is told, to a small part of a pixel.
+    """
 
     f_px: Estimate
     size_px: tuple[int, int] | None
     centre_px: tuple[float, float] | None
     response: NDArray[np.floating] | None
+    exact: bool = False
 
-    def responses(self, centres_mm: NDArray[np.float64], depth_mm: float | None) -> NDArray[np.float64]:
-        """Return the response of each view (view,) where it sees the middle of the reference view; 0 if it does not.
+    def seen(self, centres_mm: NDArray[np.float64], depth_mm: float | None) -> SeenSample:
+        """Return how the views see the middle of the reference view; the response is 0 where they do not.
 
         `centres_mm` (view, 2) are the cameras relative to the reference camera, right and down.
         Without a depth, a lens or a response all views see it, or see it equally well.
         """
         responses = np.ones(len(centres_mm))
         if depth_mm is None or self.f_px.value is None or self.size_px is None or self.centre_px is None:
-            return responses
-        places = np.rint(np.array(self.centre_px) - self.f_px.value / depth_mm * centres_mm).astype(int)
+            return SeenSample(responses, interpolation(len(responses)))
+        shifts_px = self.f_px.value / depth_mm * centres_mm
+        places = np.rint(np.array(self.centre_px) - shifts_px).astype(int)
         responses[((places < 0) | (places >= self.size_px)).any(axis=1)] = 0
         if self.response is not None:
             axis = _mean_around(self.response, *np.rint(self.centre_px).astype(int).tolist())
             for view in np.flatnonzero(responses):
                 responses[view] = _mean_around(self.response, *places[view].tolist()) / axis
-        return responses
+        seeing = responses > 0
+        spread = interpolation_at(shifts_px[seeing]) if self.exact else interpolation(int(np.count_nonzero(seeing)))
+        return SeenSample(responses, spread)
+
+
+def fewest_seen(samples: Sequence[SeenSample]) -> SeenSample:
+    """Return the sample that the fewest views see, weighted by their response."""
+    return min(samples, key=lambda sample: float(np.square(sample.response).sum()))
 
 
 def _mean_around(response: NDArray[np.floating], column: int, row: int) -> float:
@@ -160,7 +181,15 @@ def known_lens(settings: RigSettings, sensor: Sensor, geometry: Path | None, fx_
         response = maps.get("relative_response")
     elif simulated is not None:
         response = simulated.relative_illumination()
-    return KnownLens(f_px, size_px, centre_px, response)
+    return KnownLens(f_px, size_px, centre_px, response, _is_exact(camera) and geometry is None)
+
+
+def _is_exact(camera: CameraSettings) -> bool:
+    """Return whether a camera is simulated, without errors of position and rotation."""
+    if not isinstance(camera, SimulatedSettings):
+        return False
+    errors = (camera.position_error_mm, camera.rotation_error_mrad, camera.scale_error, camera.squareness_mrad)
+    return not any(errors)
 
 
 @dataclass(frozen=True)

@@ -135,7 +135,7 @@ def print_prediction(record: PredictionRecord) -> None:
 
 
 def _describe_rounds(until: Until, rounds: int, reached_e: Estimate) -> str:
-    wanted, most = f"the wanted sigma of {until.sigma_e:g} e⁻ of a frame", until.at_most_rounds
+    wanted, most = f"the wanted sigma of {until.sigma_e:g} e⁻ in one frame", until.at_most_rounds
     if reached_e.value is None:
         return f"all {most}, unless the capture measures that fewer reach {wanted}; sigma is unknown: {reached_e.why}"
     if reached_e.value > until.sigma_e:
@@ -151,7 +151,7 @@ def _print_depth(depth: DepthPrediction, record: PredictionRecord) -> None:
     if everywhere is not None:
         part = f"{everywhere[0]:.0f} x {everywhere[1]:.0f} mm" if min(everywhere) > 0 else "no part"
         views = f"its middle is seen by {depth.views} of {count} views, {part} by all"
-    inform(f"{name}: {views}; sigma {_number_text(depth.sigma_e, 'e⁻')}")
+    inform(f"{name}: {views}; sigma {_number_text(depth.sigma_e, 'e⁻')} in all frames of a node together")
     across, blur = _number_text(depth.mm_per_px, "mm"), _number_text(depth.blur_mm, "mm")
     inform(
         f"  a pixel: {across}; blur: {blur}; a pixel of parallax: {_number_text(depth.depth_step_mm, 'mm')} of depth"

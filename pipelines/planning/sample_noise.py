@@ -3,13 +3,12 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import numpy as np
-
 from faintfield.pipelines.errors import MissingFile
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE
 from faintfield.pipelines.formats.results.noise import NOISE_FILE
 from faintfield.pipelines.planning.known import (
     calibration_file,
+    fewest_seen,
     grid_centres_mm,
     known_lens,
     known_sensor,
@@ -32,7 +31,7 @@ class MeasuredNoise:
     Raises
     ------
     MissingFile
-        Read noise, gain or dark current of the sensor are not known.
+        Read noise, gain, dark current or offset of the sensor are not known.
     """
 
     def __init__(
@@ -47,20 +46,22 @@ class MeasuredNoise:
         light_e_per_s: float | None,
     ) -> None:
         folders = session, rig.parent
-        self._sensor = sensor = known_sensor(settings, calibration_file(noise, NOISE_FILE, *folders))
+        sensor = known_sensor(settings, calibration_file(noise, NOISE_FILE, *folders))
         read_noise_e, gain = sensor.read_noise_e.value, sensor.gain_dn_per_e.value
-        dark_e_per_s = sensor.dark_current_e_per_s.value
-        if read_noise_e is None or gain is None or dark_e_per_s is None:
-            unknown = (sensor.read_noise_e, sensor.gain_dn_per_e, sensor.dark_current_e_per_s)
-            why = next(number.why for number in unknown if number.value is None)
+        dark_e_per_s, offset_dn = sensor.dark_current_e_per_s.value, sensor.offset_dn()
+        if read_noise_e is None or gain is None or dark_e_per_s is None or offset_dn is None:
+            named = {name: getattr(sensor, name).value for name in ("read_noise_e", "gain_dn_per_e")}
+            named |= {"dark_current_e_per_s": dark_e_per_s, "offset_dn": offset_dn}
+            unknown = ", ".join(name for name, value in named.items() if value is None)
             raise MissingFile(
-                f"{rig}: a step has until.sigma_e, but the noise of the sensor is not known: {why}; or remove until"
+                f"{rig}: a step has until.sigma_e, but {unknown} of the sensor is not known by {sensor.source}; give "
+                "the result of `faintfield noise` as --noise, or put it beside the rig.toml"
             )
-        self._read_noise_e, self._gain, self._dark_e_per_s = read_noise_e, gain, max(dark_e_per_s, 0.0)
+        self._read_noise_e, self._gain, self._offset_dn = read_noise_e, gain, offset_dn
+        self._dark_e_per_s = max(dark_e_per_s, 0.0)
         lens = known_lens(settings, sensor, calibration_file(geometry, GEOMETRY_FILE, *folders), fx_px)
         centres_mm = grid_centres_mm(settings.grid)
-        responses = [lens.responses(centres_mm, depth_mm) for depth_mm in settings.scene.depth_mm or (None,)]
-        self._response = min(responses, key=lambda response: float(np.square(response).sum()))
+        self._seen = fewest_seen([lens.seen(centres_mm, depth_mm) for depth_mm in settings.scene.depth_mm or (None,)])
         self._share = pixel_share(settings, sensor)
         self._light_e_per_s = light_e_per_s
 
@@ -78,9 +79,11 @@ class MeasuredNoise:
         def sigma_e(rounds: float) -> float:
             total_s = rounds * exposure_s
             noise_e = view_noise_e(self._read_noise_e, self._gain, rounds * frames)
-            information = information_of_views(light_e_per_s * total_s, dark_e_per_s * total_s, noise_e, self._response)
-            views = int(np.count_nonzero(information))
-            return step.exposure_s[0] / total_s * sample_sigma_e(self._share * float(information.sum()), views)
+            information = information_of_views(
+                light_e_per_s * total_s, dark_e_per_s * total_s, noise_e, self._seen.response
+            )
+            total = self._share * float(information.sum())
+            return step.exposure_s[0] / total_s * sample_sigma_e(total, self._seen.spread)
 
         return sigma_e
 
@@ -91,8 +94,5 @@ class MeasuredNoise:
             return None if self._light_e_per_s is None else (self._light_e_per_s, self._dark_e_per_s)
         total_s = sum(record.exposure_s for record in lit)
         light_e = sum(record.checks["light_dn"] for record in lit) / self._gain
-        offset_dn = self._sensor.offset_dn()
-        dark_e = 0.0
-        if offset_dn is not None:
-            dark_e = sum(record.checks["darkest_dn"] - offset_dn for record in lit) / self._gain
+        dark_e = sum(record.checks["darkest_dn"] - self._offset_dn for record in lit) / self._gain
         return max(light_e, 0.0) / total_s, max(dark_e / total_s, self._dark_e_per_s)

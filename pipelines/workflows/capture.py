@@ -18,7 +18,8 @@ from faintfield.pipelines.planning.predict import scene_view
 from faintfield.pipelines.planning.sample_noise import MeasuredNoise
 from faintfield.pipelines.reconstruction.options import sweep_values
 from faintfield.rig.capture.rounds import NoisePredictor
-from faintfield.rig.session.session import is_sealed
+from faintfield.rig.session.journal import RoundsEnded
+from faintfield.rig.session.session import ROUNDS_ENDED, has_session, is_sealed, open_journal, read_plan
 from faintfield.rig.settings import RigSettings
 
 # Noise, geometry and focal length for the live planes.
@@ -58,7 +59,7 @@ def capture_or_resume(
         raise WrongUsage("live planes are shown on the page, and there is none; give --page, too")
     in_rounds = any(step.until is not None for step in settings.step)
     seen = page or console.is_terminal or not yes
-    if light_e is not None and not seen:
+    if light_e is not None and not (seen or in_rounds):
         raise WrongUsage("the light is compared on the page or in a terminal, and there is neither; give --page, too")
     if planes is None and not in_rounds:
         if known[1:] != (None, None):
@@ -84,9 +85,14 @@ def _light_meter(
 def _predictor(
     settings: RigSettings, rig: Path, session: Path, known: Known, light_e: float | None
 ) -> NoisePredictor | None:
-    """Return the predictor of the noise of the planes, None where nothing is left to be captured."""
-    if is_sealed(session):
-        return None
+    """Return the predictor of the noise of the planes, None where no round is left to be captured."""
+    if has_session(session):
+        frozen = read_plan(session)
+        with open_journal(session, frozen, read_only=True) as journal:
+            ended = {ended.step for ended in journal.details(ROUNDS_ENDED, RoundsEnded)}
+        steps = {index for index, step in enumerate(frozen.plan.steps) if step.until is not None}
+        if is_sealed(session) or steps <= ended:
+            return None
     return MeasuredNoise(settings, rig, session, *known, light_e_per_s=_per_second(settings, light_e)).predict
 
 

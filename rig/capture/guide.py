@@ -173,13 +173,20 @@ def needs_hand(step: CaptureStep, before: StepKind | None) -> bool:
     return step.lights is None or step.kind in BY_HAND or before in BY_HAND
 
 
-def step_prompt(steps: Sequence[CaptureStep], frame: PlannedFrame, frames: int, duration_s: float) -> Prompt:
-    """Return the prompt before a step, whose first of `frames` frames is `frame`; they take `duration_s`."""
+def step_prompt(
+    steps: Sequence[CaptureStep], frame: PlannedFrame, frames: tuple[int, int], duration_s: float
+) -> Prompt:
+    """Return the prompt before a step that begins with `frame`.
+
+    `frames` are those that are expected, and take `duration_s`, and how many there are at most.
+    """
     test = f"{_TEST[frame.kind]} It is taken where the step begins, and not recorded."
-    until = steps[frame.step].until
-    rounds = "" if until is None else f"rounds over the grid until the noise is {until.sigma_e:g} e⁻, at most "
-    frames_follow = f"Then {rounds}{frames} frames follow, {format_duration(duration_s)}."
-    motion = f"{frames_follow} The stage moves by itself: keep clear of it."
+    until, (expected, most) = steps[frame.step].until, frames
+    sequence = f"Then {expected} frames follow, {format_duration(duration_s)}."
+    if until is not None:
+        sequence = f"Then rounds over the grid follow until the noise of the planes is {until.sigma_e:g} e⁻: "
+        sequence += f"probably {expected} frames, at most {most}, {format_duration(duration_s)}."
+    motion = f"{sequence} The stage moves by itself: keep clear of it."
     return Prompt(
         key="step",
         title=_step_title(frame, len(steps)),
@@ -218,26 +225,32 @@ def format_duration(duration_s: float) -> str:
     return f"about {minutes} min" if minutes < 90 else f"about {minutes // 60} h {minutes % 60:02d} min"
 
 
-def describe_progress(progress: Progress, to_go_s: float) -> str:
+def describe_progress(progress: Progress, to_go_s: float, ended: RoundsEnded | None = None) -> str:
     """Return how far a step in rounds is, such as `σ now 0.21 e⁻, wanted 0.1: 3 more rounds, about 41 min`."""
-    until, more = progress.until, progress.enough - progress.done - progress.within
+    until, more = progress.until, progress.wanted - progress.whole - progress.begun
+    wanted = f"wanted {until.sigma_e:g}"
+    if ended is not None:
+        rounds = _count_rounds(ended.rounds)
+        return rounds if ended.sigma_e is None else f"σ {ended.sigma_e:.3g} e⁻ after {rounds}, {wanted}"
     if progress.final_e is None:
-        return f"σ is not known, wanted {until.sigma_e:g} e⁻: all {until.at_most_rounds} rounds are taken"
-    now = "" if progress.sigma_e is None else f"now {progress.sigma_e:.3g} e⁻, "
-    if not progress.reaches:
-        now += f"{progress.final_e:.3g} e⁻ after all {until.at_most_rounds} rounds, "
-    reached = ", reached" if progress.sigma_e is not None and progress.sigma_e <= until.sigma_e else ""
-    rounds = f"{more} more {'round' if more == 1 else 'rounds'}" if more > 0 else "no more rounds"
-    if progress.within:
-        present = f"round {progress.done + 1}"
-        rounds = f"{present} and {rounds}" if more > 0 else f"the rest of {present}"
-    time = f", {format_duration(to_go_s)}" if to_go_s else ""
-    return f"σ {now}wanted {until.sigma_e:g}{reached}: {rounds}{time}"
+        return f"σ is not known until a frame shows the light, {wanted} e⁻; at most {_count_rounds(progress.most)}"
+    parts = [] if progress.sigma_e is None else [f"now {progress.sigma_e:.3g} e⁻"]
+    if progress.final_e > until.sigma_e:
+        parts.append(f"{progress.final_e:.3g} e⁻ at the end")
+    parts.append(wanted + ", reached" * progress.reached)
+    rest = [f"the rest of round {progress.whole + 1}"] if progress.begun else []
+    rest += [f"{more} more {'round' if more == 1 else 'rounds'}"] if more > 0 else []
+    time = f", {format_duration(to_go_s)}" if rest else ""
+    return f"σ {', '.join(parts)}: {' and '.join(rest) or 'no more rounds'}{time}"
+
+
+def _count_rounds(rounds: int) -> str:
+    return "1 round" if rounds == 1 else f"{rounds} rounds"
 
 
 def describe_rounds(ended: RoundsEnded) -> str:
     """Return how a step in rounds ended, such as `step 4 ended after 3 rounds, at a predicted σ of 0.098 e⁻`."""
-    rounds = "1 round" if ended.rounds == 1 else f"{ended.rounds} rounds"
+    rounds = _count_rounds(ended.rounds)
     noise = "" if ended.sigma_e is None else f", at a predicted σ of {ended.sigma_e:.3g} e⁻"
     return f"step {ended.step + 1} ended after {rounds}{noise}{', by the operator' * ended.by_operator}"
 
@@ -376,8 +389,8 @@ class Dialogue:
         steps, progress = session.plan.steps, self.rounds.progress(frame.step)
         steps_s = self.pace.step_durations_s(missing)
         if session.frozen.rig.drift.check:
-            for step in steps_s:
-                steps_s[step] += self.pace.check_s if steps[step].at == "grid" else 0.0
+            for step, _ in {(left.step, left.round) for left in missing if steps[left.step].at == "grid"}:
+                steps_s[step] += self.pace.check_s
         status = Status(
             doing=doing,
             step=frame.step + 1,
@@ -394,7 +407,9 @@ class Dialogue:
             step_to_go_s=tuple(steps_s.get(step, 0.0) for step in range(len(steps))),
             step_frames=tuple(frames_of_step[step] for step in range(len(steps))),
             round=frame.round + 1,
-            rounds="" if progress is None else describe_progress(progress, steps_s.get(frame.step, 0.0)),
+            rounds=""
+            if progress is None
+            else describe_progress(progress, steps_s.get(frame.step, 0.0), session.rounds_ended.get(frame.step)),
         )
         self.operator.show_status(status)
 

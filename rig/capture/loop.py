@@ -141,17 +141,17 @@ class Capture:
         return next((kind for kind in earlier if kind in BY_HAND), None)
 
     def _run_round(self, missing: list[PlannedFrame]) -> None:
-        """Take the missing frames of a step, or of one round of it, whose first comes first."""
+        """Take those missing frames that are of the same step and round as the first."""
         session, first = self._session, missing[0]
         of_step = [frame for frame in missing if frame.step == first.step]
         frames = [frame for frame in of_step if frame.round == first.round]
         last = self._taker.last
-        goes_on = first.round > 0 and last is not None and last.step == first.step
-        if needs_hand(session.plan.steps[first.step], self._kind_before(first)) and not goes_on:
+        continues = last is not None and last.step == first.step  # a further round, or frames to be taken again
+        if needs_hand(session.plan.steps[first.step], self._kind_before(first)) and not continues:
             self._dialogue.show_status(first, "waiting for your answer")
             expected = self._dialogue.rounds.expected(of_step)
             duration_s = self._dialogue.pace.remaining_s(expected, 0)
-            prompt = step_prompt(session.plan.steps, first, len(expected), duration_s)
+            prompt = step_prompt(session.plan.steps, first, (len(expected), len(of_step)), duration_s)
             while (answer := self._dialogue.ask_or_stop(prompt)) == "test":
                 self._rig.arrange(first.kind, first.sweep)
                 self._take_test(first)
@@ -231,7 +231,7 @@ class Capture:
                 lines += ("The step can finish with this round.",)
             choice = self._dialogue.ask_or_stop(Prompt("paused", "Paused", lines, answers, "go"))
         if choice == "finish":
-            self._dialogue.rounds.end_after_this(frame.step)
+            self._dialogue.rounds.limit(frame)
         if choice == "skip":
             self._session.skip(frame)
         if choice == "retake" and self._taker.last is not None:

@@ -132,6 +132,13 @@ class RoundsEnded(Struct, frozen=True):
     by_operator: bool = False
 
 
+class RoundsLimited(Struct, frozen=True):
+    """Detail of the event `rounds_limited`: the operator wants no more rounds of a step than these."""
+
+    step: int
+    rounds: _Number
+
+
 class Journal:
     """An open journal, which is also the `TrafficLog` of the stage; `read_only` opens it on a write-protected medium.
 

@@ -16,13 +16,20 @@ from faintfield.rig.files import is_plain_name, read_regular, sha256
 from faintfield.rig.plan import MAX_NUMBER, CapturePlan, PlannedFrame, planned_frames
 from faintfield.rig.session.database import FORMAT
 from faintfield.rig.session.disk import encode_exposure, list_names, set_aside, translate_errors, write_new
-from faintfield.rig.session.journal import CommittedFrame, FrameRecord, Journal, RoundsEnded, Sealed
+from faintfield.rig.session.journal import (
+    CommittedFrame,
+    FrameRecord,
+    Journal,
+    RoundsEnded,
+    RoundsLimited,
+    Sealed,
+)
 from faintfield.rig.settings import RigSettings
 
 PLAN, JOURNAL, FRAMES, SUMS, ASIDE = "plan.json", "journal.sqlite", "frames", "SHA256SUMS", "set_aside"
 
-# Kind of the journal's event for a step that needs no further rounds.
-ROUNDS_ENDED = "rounds_ended"
+# Kinds of the journal's events for a step that needs no further rounds, and for one that shall have no more than some.
+ROUNDS_ENDED, ROUNDS_LIMITED = "rounds_ended", "rounds_limited"
 
 # Size in bytes of the plan of MAX_FRAMES stops, and more.
 _MAX_PLAN_BYTES = 32_000_000
@@ -66,7 +73,11 @@ class Session:
         self.is_decided = left_out is not None
         self._skipped = set(left_out or ())
         self._valid = valid_frames(folder, self.frames, journal.committed())
+        for problem in odd_rounds(frozen.plan, journal.details(ROUNDS_ENDED, RoundsEnded)):
+            raise SessionCorrupt(f"{folder / JOURNAL}: {problem}; restore the journal from a copy")
         self.rounds_ended = {ended.step: ended for ended in journal.details(ROUNDS_ENDED, RoundsEnded)}
+        limits = journal.details(ROUNDS_LIMITED, RoundsLimited)
+        self.rounds_limited = {limited.step: limited.rounds for limited in limits}
 
     @property
     def plan(self) -> CapturePlan:
@@ -79,12 +90,17 @@ class Session:
 
     def wanted(self) -> list[PlannedFrame]:
         """Return the frames of the plan, in order, without those of rounds that are not needed."""
-        return wanted_frames(self.frames, self.rounds_ended.values())
+        return wanted_frames(self.frames, tuple(self.rounds_ended.values()))
 
     def missing(self) -> list[PlannedFrame]:
         """Return the frames still to be taken, in order, without those skipped since the session was opened."""
         there = self._valid.keys() | self._skipped
         return [frame for frame in self.wanted() if frame.number not in there]
+
+    def limit_rounds(self, limited: RoundsLimited) -> None:
+        """Record that the operator wants no more than some rounds of a step."""
+        self.journal.add_events(ROUNDS_LIMITED, [limited])
+        self.rounds_limited[limited.step] = limited.rounds
 
     def end_rounds(self, ended: RoundsEnded) -> None:
         """Record that a step needs no further rounds: their frames are not wanted any more."""
@@ -246,6 +262,14 @@ def wanted_frames(frames: Iterable[PlannedFrame], rounds_ended: Iterable[RoundsE
     if not (rounds := {ended.step: ended.rounds for ended in rounds_ended}):
         return list(frames)
     return [frame for frame in frames if frame.round < rounds.get(frame.step, frame.round + 1)]
+
+
+def odd_rounds(plan: CapturePlan, rounds_ended: Iterable[RoundsEnded]) -> Iterator[str]:
+    """Yield how ends of rounds in a journal disagree with the plan, one line each."""
+    most = {index: step.rounds for index, step in enumerate(plan.steps)}
+    for ended in rounds_ended:
+        if not ended.rounds < most.get(ended.step, 0):
+            yield f"step {ended.step + 1} ended after {ended.rounds} rounds, of {most.get(ended.step, 0)} in the plan"
 
 
 def exposure_name(frame: PlannedFrame, intent: int) -> str:

@@ -23,6 +23,7 @@ from faintfield.rig.session.session import (
     exposure_name,
     is_sealed,
     left_out_by_sealing,
+    odd_rounds,
     open_journal,
     read_plan,
     read_plan_and_hash,
@@ -104,6 +105,7 @@ def verify(folder: Path, progress: Callable[[Iterable[Path]], Iterable[Path]] = 
         if begun != [plan_sha256] and (begun or committed or uncommitted):  # else it was interrupted as it began
             problems.append(f"{PLAN}: is not the plan that the session was begun with")
         problems += disagreements(frames, committed)
+        problems += [f"{JOURNAL}: {problem}" for problem in odd_rounds(frozen.plan, rounds_ended)]
         problems += _compare(committed, digests, orphans - set(interrupted))
         if is_sealed(folder):
             problems += [WAL_NOT_COVERED] * (wal_bytes(folder / JOURNAL) > 0) + [_WAL_LOST] * (not sealed)

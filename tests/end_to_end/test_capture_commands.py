@@ -1,13 +1,16 @@
 """init, check, capture and verify, as a person types them."""
 
 import json
+import math
 import shutil
 import signal
 from pathlib import Path
 from typing import Any
 from unittest import mock
 
+import numpy as np
 import pytest
+import tifffile
 
 from faintfield.pipelines import cli
 from faintfield.rig.session.journal import Journal
@@ -293,3 +296,29 @@ def test_options_of_views_need_a_view(options: list[str], words: str, shell: She
     assert shell.run("capture", shell.rig, shell.session, "--yes", *options) == 2
     assert words in shell.words
     assert not shell.session.exists()
+
+
+def test_rounds_end_at_noise_of_frames(shell: Shell) -> None:
+    shell.rig.unlink()
+    write_small_rig(shell.rig, 3, 3)
+    text = shell.rig.read_text()
+    until = "until = { sigma_e = 0.8, at_most_rounds = 12 }"
+    head = text[: text.index("[[step]]")].replace("[500.0, 700.0]", "[500.0]")
+    shell.rig.write_text(f'{head}[[step]]\nkind = "dark_scene"\nexposure_s = 1.0\n{until}\n')
+    assert shell.result("check", shell.rig)["frames"] == 9 * 12
+    assert shell.run("capture", shell.rig, shell.session, "--yes", "--light-e", "20") == 0, shell.words
+    [ended] = shell.result("verify", shell.session)["session"]["rounds"]
+    assert f"step 1 ended after {ended['rounds']} rounds, at a predicted σ of" in shell.words
+    # The scatter of pixels between two rounds, in electrons, where the frames are brightest; the gain is 2
+    nodes: dict[tuple[int, int], list[Any]] = {}
+    for frame, _, path in taken_frames(shell.session):
+        nodes.setdefault(frame.stop.node, []).append(tifffile.imread(path).astype(float) / 2.0)
+    variances_e2 = []
+    for frames in nodes.values():
+        parts = np.stack(frames).reshape(len(frames), 8, 6, 8, 8)  # rows and columns of 8 x 8 parts
+        row, column = np.unravel_index(parts.mean(axis=(0, 2, 4)).argmax(), (8, 8))
+        variances_e2.append(np.var(parts[:, row, :, column], axis=0, ddof=1).mean())
+    # The picture moves by 8 whole pixels from node to node, so that each sample meets one pixel of each view
+    sigma_of_round_e = math.sqrt(np.mean(variances_e2) / 9)
+    assert abs(ended["rounds"] - math.ceil((sigma_of_round_e / 0.8) ** 2)) <= 1
+    assert ended["sigma_e"] == pytest.approx(sigma_of_round_e / math.sqrt(ended["rounds"]), rel=0.06)

@@ -174,7 +174,7 @@ def waiting(tmp_path: Path) -> Iterator[tuple[CapturePanel, str]]:
     panel = CapturePanel(unattended=False)
     with open_session(tmp_path / "session", frozen_plan(SMALL_RIG)) as session:
         first = session.frames[0]
-        prompt = step_prompt(session.plan.steps, first, 6, 60.0)
+        prompt = step_prompt(session.plan.steps, first, (6, 6), 60.0)
         grid = ((0.0, 0.0, 0.0),) * 2
         panel.status = Status(
             "waiting", 1, 3, prompt.title, 0, FRAMES, 99.0, (0, 0), grid, (), "homed", "ready", (60.0, 30.0, 9.0)

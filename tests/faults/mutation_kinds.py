@@ -60,7 +60,8 @@ def _done(*words: object) -> None:
     assert run([str(word) for word in words]) == 0, words
 
 
-def _simulated(folder: Path, sides_px: tuple[int, int] = _SIDES_PX, *, snr: float = 0.16) -> None:
+def _simulated(folder: Path, sides_px: tuple[int, int] = _SIDES_PX, *, snr: float = 100.0) -> None:
+    """Write a small set, bright enough to be darkened."""
     _done("simulate", folder, "--size-px", *sides_px, "--rows", 3, "--columns", 3, "--snr", snr)
 
 
@@ -186,7 +187,7 @@ def _whole_session(folder: Path) -> None:
 
 def _results(folder: Path) -> None:
     """Reconstruct planes of a simulated set by two methods, with its errors and a depth map."""
-    _simulated(folder / "set", snr=20)  # at 0.16 its few small views agree no better than shuffled ones
+    _simulated(folder / "set", snr=20.0)  # at 0.16 its few small views agree no better than shuffled ones
     _done("reconstruct", folder / "set", "--out", folder / "planes", *_PLANES.split())
     _done("reconstruct", folder / "set", "--out", folder / "sweep", *_SWEEP.split())
 

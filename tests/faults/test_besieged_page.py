@@ -89,9 +89,9 @@ class Capture:
 
     def wait_for(self, title: str) -> int:
         """Wait for the prompt with this title, and return its number."""
-        while (prompt := json.loads(self.ask("state"))["prompt"]) is None or prompt["title"] != title:
+        while (state := json.loads(self.ask("state")))["prompt"] is None or state["title"] != title:
             pass
-        return int(prompt["number"])
+        return int(state["prompt"])
 
     def go_on(self, title: str) -> None:
         """Wait for the prompt with this title, and go on."""

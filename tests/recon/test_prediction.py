@@ -13,6 +13,7 @@ from faintfield.recon.prediction import (
     depth_sigma_mm,
     feature_area_px2,
     information_of_views,
+    interpolation,
     pixel_information,
     sample_sigma_e,
     smallest_contrast,
@@ -48,9 +49,9 @@ def test_much_noise_or_light_gives_shifted_information(mean_e: float, read_noise
 
 def test_sigma_is_of_counts_or_of_read_noise() -> None:
     light_e, views = 3.7, 49
-    counting = sample_sigma_e(views * pixel_information(light_e, 0.0), views)
+    counting = sample_sigma_e(views * pixel_information(light_e, 0.0), interpolation(views))
     assert counting == pytest.approx(math.sqrt((1 + 48 * 4 / 9) / 49 * light_e / views), rel=1e-12)
-    reading = sample_sigma_e(views * pixel_information(1e-9, 5.0), views)
+    reading = sample_sigma_e(views * pixel_information(1e-9, 5.0), interpolation(views))
     assert reading == pytest.approx(math.sqrt((1 + 48 * 4 / 9) / 49) * 5.0 / 7, rel=1e-9)
 
 
@@ -84,7 +85,9 @@ def test_maximum_likelihood_scatters_as_predicted(light_e: float, read_noise_e: 
         fit = DataFit(operator, images, light_e)
         squares += np.square(fit.value_and_gradient(start)[1] / fit.metric(start))
     result = math.sqrt(squares[4:-4, 4:-4].mean() / draws)
-    assert result == pytest.approx(sample_sigma_e(30 * pixel_information(light_e, read_noise_e), 30), rel=0.04)
+    assert result == pytest.approx(
+        sample_sigma_e(30 * pixel_information(light_e, read_noise_e), interpolation(30)), rel=0.04
+    )
 
 
 def bar_in_pixels(side_px: float, at_px: float, blur_px: float) -> NDArray[np.float64]:

@@ -3,6 +3,7 @@
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 
 import msgspec
@@ -86,7 +87,7 @@ def files_of_scene(folder: Path, kind: SceneKind = "dark_scene") -> list[str]:
 def _frames_of_views(folder: Path, plan: CapturePlan, kind: SceneKind) -> tuple[float, list[tuple[Stop, list[str]]]]:
     """Return the exposure of a view, and its frames' names at every node that has all of them, in raster order.
 
-    Of steps in rounds, those are the frames of the first rounds, as many as give the most light in all views together.
+    Of a step in rounds, those are the frames of its first rounds, each of which one node of ten may lack, or one.
     """
     planned = [frame for frame in planned_frames(plan) if frame.kind == kind]
     at_centre = [frame for frame in planned if frame.stop == plan.centre]
@@ -100,20 +101,16 @@ def _frames_of_views(folder: Path, plan: CapturePlan, kind: SceneKind) -> tuple[
             stops[frame.stop.node] = frame.stop
             taken[frame.stop.node][frame.round].append(str(path.relative_to(folder)))
 
-    def nodes_with(rounds: int) -> list[tuple[int, int]]:
-        return [
-            node
-            for node, names in sorted(taken.items())
-            if all(len(names[number]) == wanted[number] for number in range(rounds))
-        ]
-
-    def exposure_s(rounds: int) -> float:
-        return sum(frame.exposure_s for frame in at_centre if frame.round < rounds)
-
-    rounds = max(range(1, len(wanted) + 1), key=lambda count: exposure_s(count) * len(nodes_with(count)), default=0)
-    whole = [
-        (stops[node], [name for number in range(rounds) for name in taken[node][number]]) for node in nodes_with(rounds)
-    ]
+    whole_rounds = {
+        node: next(number for number in count() if len(names.get(number, ())) != wanted.get(number))
+        for node, names in taken.items()
+    }
+    counts = sorted(whole_rounds.values(), reverse=True)
+    views = sum(number > 0 for number in counts)
+    fewest = max(views - max(1, views // 10), 1)  # of few views more than one is much
+    rounds = min(counts[fewest - 1], whole_rounds.get(plan.centre.node, 0)) if views else 0
+    nodes = sorted(node for node, number in whole_rounds.items() if number >= max(rounds, 1))
+    whole = [(stops[node], [name for number in range(rounds) for name in taken[node][number]]) for node in nodes]
     if not at_centre or plan.centre not in [stop for stop, _ in whole]:
         raise BadValue(
             f"{folder}: has no {_NAMES[kind]} frame of the centre node {list(plan.centre.node)}, whose camera is the "
@@ -125,7 +122,7 @@ def _frames_of_views(folder: Path, plan: CapturePlan, kind: SceneKind) -> tuple[
         len(names) for of_node in taken.values() for number, names in of_node.items() if number >= rounds
     ):
         inform(f"{folder}: {further} frames of a round that is not whole are left out; capture again to complete it")
-    return exposure_s(rounds), whole
+    return sum(frame.exposure_s for frame in at_centre if frame.round < rounds), whole
 
 
 def _at_centre(folder: Path, kind: StepKind) -> list[tuple[Path, float]]:
