@@ -15,6 +15,9 @@ from faintfield.recon.likelihood.images import read_noise_share
 # where pixels as wide as samples fall evenly on all places between these.
 _SPREAD_EVENLY = 4 / 9
 
+# Harmonics of the mean square of the weights over a pixel: what is left out is below 0.001.
+_HARMONICS = 300
+
 # Steps of the integral over the width of a feature, and how many deviations of the blur beyond a pixel it goes.
 _STEPS, _DEVIATIONS = 2000, 10
 
@@ -57,13 +60,17 @@ def interpolation(views: int) -> float:
     return _SPREAD_EVENLY + (1 - _SPREAD_EVENLY) / views
 
 
-def interpolation_at(shifts_px: NDArray[np.floating]) -> float:
-    """Return `interpolation` of views that are moved by known shifts (view, 2).
+def interpolation_at(shifts_px: NDArray[np.floating], error_px: float) -> float:
+    """Return the expected `interpolation` of views that are moved by shifts (view, 2), each with a normal error.
 
-    It is 1 if these are whole pixels, and 1/4 at the least.
+    Along an axis, Σ h² is `φ² + (1 − φ)² = 2/3 + Σ_k 2/(π k)² cos 2πkφ` at a part φ of a pixel, and the error damps its
+    harmonics. Without any it is 1 at whole pixels, and 1/2 halfway. The reference view, which is not moved, has none.
     """
-    between = shifts_px - np.floor(shifts_px)
-    return float((np.square(between) + np.square(1 - between)).prod(axis=1).mean())
+    order = np.arange(1, _HARMONICS + 1)
+    error_px2 = np.where(shifts_px.any(axis=1), error_px, 0.0) ** 2
+    damped = np.exp(-2 * (np.pi * order) ** 2 * error_px2[:, np.newaxis]) * 2 / (np.pi * order) ** 2
+    along = 2 / 3 + np.sum(damped[:, np.newaxis] * np.cos(2 * np.pi * order * shifts_px[..., np.newaxis]), axis=-1)
+    return float(along.prod(axis=1).mean())
 
 
 def sample_sigma_e(information: float, spread: float) -> float:

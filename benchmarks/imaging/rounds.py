@@ -48,16 +48,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.imaging.rounds", description=__doc__)
     parser.add_argument("--size-px", nargs=2, type=int, default=(320, 240))
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--pitch-mm", type=float, default=20.0, help="of the grid; 21 moves a 320 px picture by 12 px")
     options = parser.parse_args()
     print("| SNR wanted, found | σ of a round: axis, all | wanted σ | rounds taken | needed: axis, all |")
     print("|---|---|---|---|---|")
     apart = []
     for snr in _SNRS:
-        axis_e, all_e, _, measured_snr = _session(snr, None, options.seed, tuple(options.size_px))
+        axis_e, all_e, _, measured_snr = _session(snr, None, options.seed, options)
         for index, part in enumerate(_WANTED):
             wanted_e = part * axis_e
             until = Until(wanted_e, _ROUNDS)
-            _, _, rounds, _ = _session(snr, until, options.seed + 1 + index, tuple(options.size_px))
+            _, _, rounds, _ = _session(snr, until, options.seed + 1 + index, options)
             needed = [ceil((sigma_e / wanted_e) ** 2) for sigma_e in (axis_e, all_e)]
             apart.append(rounds - needed[0])
             sigmas = f"{axis_e:.3f}, {all_e:.3f} | {wanted_e:.3f}"
@@ -65,9 +66,11 @@ def main() -> None:
     print(f"rounds taken less those needed: {min(apart)} to {max(apart)}")
 
 
-def _session(snr: float, until: Until | None, seed: int, size_px: tuple[int, int]) -> tuple[float, float, int, float]:
+def _session(
+    snr: float, until: Until | None, seed: int, options: argparse.Namespace
+) -> tuple[float, float, int, float]:
     """Capture a session; return σ of a round about the axis and of all samples, the rounds, and the measured SNR."""
-    settings = _settings(snr, until or Until(1e-9, _ROUNDS), seed, size_px)
+    settings = _settings(snr, until or Until(1e-9, _ROUNDS), seed, options)
     with TemporaryDirectory(prefix="faintfield-") as name:
         folder, rig = Path(name) / "session", Path(name) / "rig.toml"
         predictor = MeasuredNoise(settings, rig, folder, None, None, None, light_e_per_s=None)
@@ -82,12 +85,12 @@ def _session(snr: float, until: Until | None, seed: int, size_px: tuple[int, int
         planes = _planes(settings, [(frame.round, path) for frame, _, path in frames])
     sigma_e = np.std(planes, axis=0, ddof=1)
     rows, columns = (np.arange(length) - length / 2 for length in sigma_e.shape)
-    near = np.hypot(rows[:, np.newaxis], columns) < _NEAR_AXIS * size_px[0]
+    near = np.hypot(rows[:, np.newaxis], columns) < _NEAR_AXIS * options.size_px[0]
     return _rms(sigma_e[near]), _rms(sigma_e), rounds, found_snr
 
 
-def _settings(snr: float, until: Until, seed: int, size_px: tuple[int, int]) -> RigSettings:
-    camera = SimulatedSettings(size_px=size_px, seed=seed)
+def _settings(snr: float, until: Until, seed: int, options: argparse.Namespace) -> RigSettings:
+    camera = SimulatedSettings(size_px=tuple(options.size_px), seed=seed)
     sensor = lab_experiment(camera).sensor
     noise_e2 = sensor.read_noise_e**2 + 1 / (12 * sensor.gain_dn_per_e**2)
     light_e = -0.5 + sqrt(0.25 + snr * noise_e2)  # eq. (4) of even light: λ² + λ = SNR σ²
@@ -95,7 +98,7 @@ def _settings(snr: float, until: Until, seed: int, size_px: tuple[int, int]) -> 
     return RigSettings(
         stage=StageSettings("simulated"),
         camera=replace(camera, unlit_photons_per_s=photons_per_s),
-        grid=Grid(7, 7, 20.0, Point(-350.0, -350.0)),
+        grid=Grid(7, 7, options.pitch_mm, Point(-350.0, -350.0)),
         step=(StepSettings("dark_scene", _EXPOSURE_S, until=until),),
         settle=SettleSettings(measure=False),
         drift=DriftSettings(check=False),

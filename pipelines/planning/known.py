@@ -19,7 +19,7 @@ from faintfield.pipelines.formats.results.geometry import CameraPoses, read_geom
 from faintfield.pipelines.formats.results.noise import NOISE_MAPS, NoiseRecord, read_fitted_noise, read_maps, read_noise
 from faintfield.pipelines.planning.options import PlanOptions
 from faintfield.recon.prediction import interpolation, interpolation_at
-from faintfield.rig.cameras.settings import CameraSettings, SimulatedSettings
+from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import RigError
 from faintfield.rig.plan import Grid, centre_node, grid_nodes
@@ -121,14 +121,16 @@ class SeenSample(NamedTuple):
 class KnownLens:
     """Focal length, width and height of a frame, the point where the axis meets it, and the relative response.
 
-    A rig that is `exact` has its camera where it is told, to a small part of a pixel.
+    `position_error_mm` and `rotation_error_rad` are standard deviations of the camera's pose, None if not known: then
+    pixels of the views lie on all places between the samples.
     """
 
     f_px: Estimate
     size_px: tuple[int, int] | None
     centre_px: tuple[float, float] | None
     response: NDArray[np.floating] | None
-    exact: bool = False
+    position_error_mm: float | None = None
+    rotation_error_rad: float | None = None
 
     def seen(self, centres_mm: NDArray[np.float64], depth_mm: float | None) -> SeenSample:
         """Return how the views see the middle of the reference view; the response is 0 where they do not.
@@ -147,8 +149,10 @@ class KnownLens:
             for view in np.flatnonzero(responses):
                 responses[view] = _mean_around(self.response, *places[view].tolist()) / axis
         seeing = responses > 0
-        spread = interpolation_at(shifts_px[seeing]) if self.exact else interpolation(int(np.count_nonzero(seeing)))
-        return SeenSample(responses, spread)
+        if self.position_error_mm is None or self.rotation_error_rad is None:
+            return SeenSample(responses, interpolation(int(np.count_nonzero(seeing))))
+        error_px = self.f_px.value * math.hypot(self.position_error_mm / depth_mm, self.rotation_error_rad)
+        return SeenSample(responses, interpolation_at(shifts_px[seeing], error_px))
 
 
 def fewest_seen(samples: Sequence[SeenSample]) -> SeenSample:
@@ -181,15 +185,13 @@ def known_lens(settings: RigSettings, sensor: Sensor, geometry: Path | None, fx_
         response = maps.get("relative_response")
     elif simulated is not None:
         response = simulated.relative_illumination()
-    return KnownLens(f_px, size_px, centre_px, response, _is_exact(camera) and geometry is None)
-
-
-def _is_exact(camera: CameraSettings) -> bool:
-    """Return whether a camera is simulated, without errors of position and rotation."""
-    if not isinstance(camera, SimulatedSettings):
-        return False
-    errors = (camera.position_error_mm, camera.rotation_error_mrad, camera.scale_error, camera.squareness_mrad)
-    return not any(errors)
+    if geometry is not None or not isinstance(camera, SimulatedSettings):
+        return KnownLens(f_px, size_px, centre_px, response)
+    return KnownLens(
+        *(f_px, size_px, centre_px, response),
+        position_error_mm=camera.position_error_mm,
+        rotation_error_rad=1e-3 * camera.rotation_error_mrad,
+    )
 
 
 @dataclass(frozen=True)

@@ -304,6 +304,8 @@ def test_rounds_end_at_noise_of_frames(shell: Shell) -> None:
     text = shell.rig.read_text()
     until = "until = { sigma_e = 0.8, at_most_rounds = 12 }"
     head = text[: text.index("[[step]]")].replace("[500.0, 700.0]", "[500.0]")
+    head = head.replace("position_error_mm = 0.3", "position_error_mm = 0.0")
+    head = head.replace("rotation_error_mrad = 3.5", "rotation_error_mrad = 0.0")
     shell.rig.write_text(f'{head}[[step]]\nkind = "dark_scene"\nexposure_s = 1.0\n{until}\n')
     assert shell.result("check", shell.rig)["frames"] == 9 * 12
     assert shell.run("capture", shell.rig, shell.session, "--yes", "--light-e", "20") == 0, shell.words

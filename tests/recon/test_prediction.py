@@ -14,6 +14,7 @@ from faintfield.recon.prediction import (
     feature_area_px2,
     information_of_views,
     interpolation,
+    interpolation_at,
     pixel_information,
     sample_sigma_e,
     smallest_contrast,
@@ -144,3 +145,13 @@ def test_depth_resolution_is_a_pixel_of_disparity() -> None:
 
     resolved = depth_resolution_mm(500.0, 800.0, 300.0)
     assert disparity_px(500.0 - resolved / 2) - disparity_px(500.0 + resolved / 2) == pytest.approx(1.0, rel=1e-5)
+
+
+@pytest.mark.parametrize("shift_px", [0.0, 8.0, 0.3, 12.5])
+@pytest.mark.parametrize("error_px", [0.0, 0.1, 5.0])
+def test_interpolation_is_mean_of_squared_weights(shift_px: float, error_px: float) -> None:
+    places = shift_px + error_px * np.random.default_rng(1).standard_normal((40_000, 2)) * (shift_px > 0)
+    part = places - np.floor(places)
+    weights = np.stack([1 - part, part], axis=-1)
+    expected = np.mean(np.square(weights[:, 0, :, np.newaxis] * weights[:, 1, np.newaxis]).sum(axis=(1, 2)))
+    assert interpolation_at(np.full((1, 2), shift_px), error_px) == pytest.approx(expected, rel=0.01)

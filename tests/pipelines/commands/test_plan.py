@@ -118,13 +118,13 @@ def test_time_is_that_of_check(rig: Path, predict: Predict, done: Command) -> No
 
 
 def test_frames_and_exposures_add_up(rig: Path, predict: Predict) -> None:
-    words = ("--light-e", 0.5, "--exposures-ms", 100, 200, "--frames", 1, 2, 4, "--depth-mm", 1e10)
+    words = ("--light-e", 0.5, "--exposures-ms", 100, 200, "--frames", 1, 2, 4, "--depth-mm", 1e9)
     rows = {(row["exposure_s"], row["frames_per_node"]): row for row in predict(rig, *words)["alternatives"]}
     sigma = {key: row["sigma_e"]["value"] for key, row in rows.items()}
-    assert sigma[0.1, 1] == pytest.approx(sigma_of(0.5, 25, READ_E2 + ROUNDING_E2, DARK_E, between=1), rel=1e-6)
+    assert sigma[0.1, 1] == pytest.approx(sigma_of(0.5, 25, READ_E2 + ROUNDING_E2, DARK_E, between=1), rel=2e-3)
     assert sigma[0.1, 4] == pytest.approx(sigma[0.1, 1] / 2, rel=1e-6)
     longer = sigma_of(1.0, 25, READ_E2 + ROUNDING_E2, 2 * DARK_E, between=1) / 2
-    assert sigma[0.2, 1] == pytest.approx(longer, rel=1e-6)
+    assert sigma[0.2, 1] == pytest.approx(longer, rel=2e-3)
     times = [rows[0.1, frames]["time_s"]["value"] for frames in (1, 2)]
     assert times[1] - times[0] == pytest.approx(2 * 25 * (0.1 + 0.05))  # the scene's, and the noise reference's
 
