@@ -23,7 +23,7 @@ from faintfield.pipelines.live.planes_client import NO_POSES, LiveOrder, live_pl
 from faintfield.pipelines.live.terminal import TerminalView
 from faintfield.pipelines.termination import interrupt_on_termination
 from faintfield.rig.cameras.protocol import Pixels
-from faintfield.rig.capture.guide import describe_rounds, format_capture_duration
+from faintfield.rig.capture.guide import describe_frame_count, describe_rounds, format_capture_duration
 from faintfield.rig.capture.loop import Capture
 from faintfield.rig.capture.rounds import NoisePredictor
 from faintfield.rig.capture.survey import survey
@@ -93,8 +93,7 @@ def _plan_session(settings: RigSettings, folder: Path) -> FrozenPlan:
     for warning in rig.stage.warnings:
         inform(f"warning: {warning}")
     require_room(folder, rig.plan.wanted_room_bytes())
-    most = "at most " if any(step.until is not None for step in rig.plan.steps) else ""
-    inform(f"{most}{rig.plan.frame_count()} frames, {format_capture_duration(rig.duration_s, settings.stage)}")
+    inform(f"{describe_frame_count(rig.plan)}, {format_capture_duration(rig.duration_s, settings.stage)}")
     return FrozenPlan(rig.plan, settings)
 
 

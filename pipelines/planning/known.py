@@ -132,7 +132,7 @@ class KnownLens:
     position_error_mm: float | None = None
     rotation_error_rad: float | None = None
 
-    def seen(self, centres_mm: NDArray[np.float64], depth_mm: float | None) -> SeenSample:
+    def sample(self, centres_mm: NDArray[np.float64], depth_mm: float | None) -> SeenSample:
         """Return how the views see the middle of the reference view; the response is 0 where they do not.
 
         `centres_mm` (view, 2) are the cameras relative to the reference camera, right and down.

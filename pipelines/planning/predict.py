@@ -212,14 +212,14 @@ class Predictor:
         """Frames of a node in all rounds."""
         return self.view.times(self.rounds)
 
-    def _rounds(self, view: View, seen: SeenSample, exposure_s: float) -> int:
+    def _rounds(self, view: View, sample: SeenSample, exposure_s: float) -> int:
         """Return the number of rounds, of this view each, that reach the wanted noise; all if that is not known."""
         until = self.until
         if until is None:
             return 1
 
         def minus_sigma_e(rounds: int) -> float:
-            sigma_e = self._sigma(view.times(rounds), seen, exposure_s).value
+            sigma_e = self._sigma(view.times(rounds), sample, exposure_s).value
             return -math.inf if sigma_e is None else -sigma_e
 
         most = until.at_most_rounds
@@ -244,7 +244,7 @@ class Predictor:
 
     def _depth(self, depth_mm: float | None) -> DepthPrediction:
         grid = self.settings.grid
-        centres_mm, seen = self._views(grid, depth_mm)
+        centres_mm, sample = self._views(grid, depth_mm)
         depth = Estimate(depth_mm) if depth_mm is not None else Estimate(None, why=_NO_DEPTH)
         scale = _with(lambda z, f: z / f, depth, self.lens.f_px)
         blur = Estimate(self.options.blur_px, why=_NO_BLUR if self.options.blur_px is None else None)
@@ -254,19 +254,19 @@ class Predictor:
             step = _with(lambda z, f: depth_resolution_mm(z, f, aperture_mm), depth, self.lens.f_px)
         return DepthPrediction(
             depth_mm=depth_mm,
-            views=int(np.count_nonzero(seen.response)),
+            views=int(np.count_nonzero(sample.response)),
             seen_by_all_mm=self._seen_by_all_mm(grid, scale.value),
-            sigma_e=self._sigma(self.whole_view, seen),
+            sigma_e=self._sigma(self.whole_view, sample),
             mm_per_px=scale,
             blur_mm=_with(lambda blur, mm: blur * mm, blur, scale),
             depth_step_mm=step,
-            features=[self._feature(centres_mm, seen, side_px, depth) for side_px in self.sides_px],
+            features=[self._feature(centres_mm, sample, side_px, depth) for side_px in self.sides_px],
         )
 
-    def _feature(self, centres_mm: Array, seen: SeenSample, side_px: float, depth: Estimate) -> FeaturePrediction:
-        contrast = self._contrast(self.whole_view, seen, side_px)
+    def _feature(self, centres_mm: Array, sample: SeenSample, side_px: float, depth: Estimate) -> FeaturePrediction:
+        contrast = self._contrast(self.whole_view, sample, side_px)
         unknown = next((quantity for quantity in (depth, self.lens.f_px) if quantity.value is None), None)
-        if unknown is None and len(np.unique(centres_mm[seen.response > 0], axis=0)) < 2:
+        if unknown is None and len(np.unique(centres_mm[sample.response > 0], axis=0)) < 2:
             unknown = Estimate(None, why="one view tells no depth")
         if unknown is None and contrast.value is not None and contrast.value > 1:
             unknown = Estimate(None, why="even a black square is not visible")
@@ -279,38 +279,38 @@ class Predictor:
             side_px=side_px,
             side_mm=_with(lambda z, f: side_px * (z / f), depth, self.lens.f_px),
             smallest_contrast=contrast,
-            depth_sigma_mm=unknown or self._from_information(self.whole_view, seen, depth_sigma),
+            depth_sigma_mm=unknown or self._from_information(self.whole_view, sample, depth_sigma),
         )
 
-    def _contrast(self, view: View, seen: SeenSample, side_px: float) -> Estimate:
+    def _contrast(self, view: View, sample: SeenSample, side_px: float) -> Estimate:
         k, blur_px = self.options.rose_k, self.options.blur_px or 0.0
 
         def contrast(light_e: float, information: Array) -> float:
             return smallest_contrast(side_px, light_e, float(information.sum()), k=k, blur_px=blur_px)
 
-        return self._from_information(view, seen, contrast)
+        return self._from_information(view, sample, contrast)
 
-    def _sigma(self, view: View, seen: SeenSample, exposure_s: float | None = None) -> Estimate:
+    def _sigma(self, view: View, sample: SeenSample, exposure_s: float | None = None) -> Estimate:
         """Return σ of a sample in electrons of a view, or of an exposure."""
         unit = 1.0 if exposure_s is None else exposure_s / view.exposure_s
 
         def sigma(_: float, information: Array) -> float:
-            return unit * sample_sigma_e(float(information.sum()), seen.spread)
+            return unit * sample_sigma_e(float(information.sum()), sample.spread)
 
-        return self._from_information(view, seen, sigma)
+        return self._from_information(view, sample, sigma)
 
-    def _from_information(self, view: View, seen: SeenSample, compute: Callable[[float, Array], float]) -> Estimate:
+    def _from_information(self, view: View, sample: SeenSample, compute: Callable[[float, Array], float]) -> Estimate:
         """Return a number computed from the light in electrons and the information of each view about a sample."""
 
         def of_view(light_e: float, dark_e: float, noise_e: float) -> float:
-            return compute(light_e, self.pixel_share * information_of_views(light_e, dark_e, noise_e, seen.response))
+            return compute(light_e, self.pixel_share * information_of_views(light_e, dark_e, noise_e, sample.response))
 
         return self._from_light(view, of_view)
 
     def _views(self, grid: Grid, depth_mm: float | None) -> tuple[Array, SeenSample]:
         """Return the cameras' places (view, 2) relative to the reference camera, and how they see a sample."""
         centres_mm = grid_centres_mm(grid)
-        return centres_mm, self.lens.seen(centres_mm, depth_mm)
+        return centres_mm, self.lens.sample(centres_mm, depth_mm)
 
     def _seen_by_all_mm(self, grid: Grid, mm_per_px: float | None) -> tuple[float, float] | None:
         if mm_per_px is None or self.lens.size_px is None:

@@ -61,7 +61,9 @@ class MeasuredNoise:
         self._dark_e_per_s = max(dark_e_per_s, 0.0)
         lens = known_lens(settings, sensor, calibration_file(geometry, GEOMETRY_FILE, *folders), fx_px)
         centres_mm = grid_centres_mm(settings.grid)
-        self._seen = fewest_seen([lens.seen(centres_mm, depth_mm) for depth_mm in settings.scene.depth_mm or (None,)])
+        self._sample = fewest_seen(
+            [lens.sample(centres_mm, depth_mm) for depth_mm in settings.scene.depth_mm or (None,)]
+        )
         self._share = pixel_share(settings, sensor)
         self._light_e_per_s = light_e_per_s
 
@@ -80,10 +82,10 @@ class MeasuredNoise:
             total_s = rounds * exposure_s
             noise_e = view_noise_e(self._read_noise_e, self._gain, rounds * frames)
             information = information_of_views(
-                light_e_per_s * total_s, dark_e_per_s * total_s, noise_e, self._seen.response
+                light_e_per_s * total_s, dark_e_per_s * total_s, noise_e, self._sample.response
             )
             total = self._share * float(information.sum())
-            return step.exposure_s[0] / total_s * sample_sigma_e(total, self._seen.spread)
+            return step.exposure_s[0] / total_s * sample_sigma_e(total, self._sample.spread)
 
         return sigma_e
 

@@ -11,7 +11,7 @@ from faintfield.pipelines.errors import MissingFile
 from faintfield.pipelines.formats.files import require_room, write_json
 from faintfield.pipelines.formats.toml_files import read_rig, read_stage_settings, stage_settings_path
 from faintfield.pipelines.termination import interrupt_on_termination
-from faintfield.rig.capture.guide import format_capture_duration
+from faintfield.rig.capture.guide import describe_frame_count, format_capture_duration
 from faintfield.rig.capture.survey import Survey, survey
 from faintfield.rig.devices import open_rig
 from faintfield.rig.session.resume import check_same_rig, find_changes, present_settings
@@ -92,7 +92,7 @@ def _survey_lines(rig: Survey, stage: StageSettings, rig_file: Path) -> list[str
         f"stage: {rig.stage.firmware}, travel {travel}; all {len(plan.path())} points of the path are allowed",
         f"camera: {rig.camera.name}; all exposure times are offered",
         *(f"light {name}: {outcome}" for name, outcome in rig.lights.items()),
-        f"plan: {plan.frame_count()} frames in {len(plan.steps)} steps, {duration}",
+        f"plan: {describe_frame_count(plan)} in {len(plan.steps)} steps, {duration}",
         f"disk: {size_mb:.0f} MB of frames; {need_mb:.0f} MB are wanted, {free_mb:.0f} MB are free",
     ]
 

@@ -12,7 +12,7 @@ from faintfield.rig.capture.checks import Findings
 from faintfield.rig.capture.rounds import NoisePredictor, Progress, Rounds
 from faintfield.rig.clock import Clock
 from faintfield.rig.errors import CaptureStopped
-from faintfield.rig.plan import CaptureStep, PlannedFrame, StepKind
+from faintfield.rig.plan import CapturePlan, CaptureStep, PlannedFrame, StepKind
 from faintfield.rig.session.journal import RoundsEnded
 from faintfield.rig.session.session import Session
 from faintfield.rig.stages.gantry import Gantry
@@ -253,6 +253,12 @@ def describe_rounds(ended: RoundsEnded) -> str:
     rounds = _count_rounds(ended.rounds)
     noise = "" if ended.sigma_e is None else f", at a predicted σ of {ended.sigma_e:.3g} e⁻"
     return f"step {ended.step + 1} ended after {rounds}{noise}{', by the operator' * ended.by_operator}"
+
+
+def describe_frame_count(plan: CapturePlan) -> str:
+    """Return the number of frames of a plan, such as `570 frames`; of one in rounds `at most 570 frames`."""
+    most = "at most " if any(step.until is not None for step in plan.steps) else ""
+    return f"{most}{plan.frame_count()} frames"
 
 
 def format_capture_duration(duration_s: float, stage: StageSettings) -> str:
