@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from unittest import mock
 
 from PIL import Image
 
@@ -30,7 +31,7 @@ from faintfield.pipelines.planning.sample_noise import MeasuredNoise
 from faintfield.rig.cameras.protocol import Exposure
 from faintfield.rig.capture.loop import Capture
 from faintfield.rig.capture.survey import survey
-from faintfield.rig.devices import Rig, open_rig
+from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import CameraError, RigError
 from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.session import FrozenPlan
@@ -80,9 +81,10 @@ class _Session:
                 self.panel.on_change.append(opened[0].note_homings)
                 begun.set()
                 go.wait()
-                rig = self._with_failures(open_rig(self._settings, session.journal))
+                rig = open_rig(self._settings, session.journal)
                 try:
-                    Capture(session, rig, self.panel, read_pixels, noise.predict).run()
+                    with mock.patch.object(rig.camera, "expose", self._failing(rig.camera.expose)):
+                        Capture(session, rig, self.panel, read_pixels, noise.predict).run()
                 except RigError as failure:
                     self.panel.end(str(failure))
                 else:
@@ -118,8 +120,8 @@ class _Session:
         with self._allowed:
             self._allowed.wait_for(lambda: status is None or status.doing != "exposing" or status.done < self._may_take)
 
-    def _with_failures(self, rig: Rig) -> Rig:
-        expose: Callable[[float, int], Exposure] = rig.camera.expose
+    def _failing(self, expose: Callable[[float, int], Exposure]) -> Callable[[float, int], Exposure]:
+        """Return an exposure that fails once where that is asked for."""
 
         def expose_or_fail(exposure_s: float, number: int) -> Exposure:
             if self.failing:
@@ -127,8 +129,7 @@ class _Session:
                 raise CameraError("the camera did not answer in 20 s; check cable and battery, switch it off and on")
             return expose(exposure_s, number)
 
-        rig.camera.expose = expose_or_fail  # type: ignore[method-assign]
-        return rig
+        return expose_or_fail
 
 
 def draw_phases(take: Callable[[Tab, str], None]) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 from msgspec import Struct
 
-from faintfield.rig.cameras.protocol import Camera, CameraReport, Exposure, Thermometer
+from faintfield.rig.cameras.protocol import Camera, CameraReport, Exposure, Thermometer, UntriggeredCamera
 from faintfield.rig.cameras.settings import BUILT_IN_BACKENDS, MosaicSettings, PluginSettings
 from faintfield.rig.clock import Clock
 from faintfield.rig.errors import (
@@ -126,46 +126,68 @@ def _with_options(table: dict[str, Any], kind: type[Struct]) -> dict[str, Any]:
 
 def plugin_camera(settings: PluginSettings, clock: Clock) -> Camera:
     """Return the camera that a plug-in makes; raises `PlanRefused` if its settings are wrong or it cannot be used."""
-    plugin = _load(CAMERAS, settings.name, CameraPlugin)
-    options = convert_options(settings.options, plugin.settings, f"[camera] with backend = {settings.name!r}")
-    with _raise_as(PluginFailed, f"the plug-in {settings.name!r} failed", "correct its settings, or tell its authors"):
-        return PluginCamera(settings.name, plugin.make(options, clock))
+    name = settings.name
+    plugin = _load(CAMERAS, name, CameraPlugin)
+    options = convert_options(settings.options, plugin.settings, f"[camera] with backend = {name!r}")
+    with _making(name):
+        camera = plugin.make(options, clock)
+    return (
+        UntriggeredPluginCamera(name, camera) if isinstance(camera, UntriggeredCamera) else PluginCamera(name, camera)
+    )
 
 
-class PluginCamera:
-    """A camera of another package, the plug-in `name`, whose failures all become `CameraError`."""
+class _PluginDevice[Device: Camera | Light]:
+    """A device of another package, the plug-in `name`, whose failures all become `error`."""
 
-    def __init__(self, name: str, camera: Camera) -> None:
+    error: type[RigError]
+
+    def __init__(self, name: str, device: Device) -> None:
         self._name = name
-        self._camera = camera
+        self._device = device
 
     def open(self) -> None:
-        """Connect to the camera."""
-        with self._as_camera_errors():
-            self._camera.open()
-
-    def report(self) -> CameraReport:
-        """Return the camera's name, limits and settings."""
-        with self._as_camera_errors():
-            return self._camera.report()
-
-    def expose(self, exposure_s: float, number: int) -> Exposure:
-        """Take one frame."""
-        with self._as_camera_errors():
-            return self._camera.expose(exposure_s, number)
-
-    def temperature_c(self) -> float | None:
-        """Return the temperature of the sensor in °C, None if the camera reports none."""
-        with self._as_camera_errors():
-            return self._camera.temperature_c() if isinstance(self._camera, Thermometer) else None
+        """Connect to the device."""
+        with self._guarded():
+            self._device.open()
 
     def close(self) -> None:
         """Disconnect."""
-        with self._as_camera_errors():
-            self._camera.close()
+        with self._guarded():
+            self._device.close()
 
-    def _as_camera_errors(self) -> AbstractContextManager[None]:
-        return _raise_as(CameraError, f"the plug-in {self._name!r} failed", "tell its authors", passing=RigError)
+    def _guarded(self) -> AbstractContextManager[None]:
+        return _raise_as(self.error, f"the plug-in {self._name!r} failed", "tell its authors", passing=RigError)
+
+
+class PluginCamera(_PluginDevice[Camera]):
+    """A camera of another package."""
+
+    error = CameraError
+
+    def report(self) -> CameraReport:
+        """Return the camera's name, limits and settings."""
+        with self._guarded():
+            return self._device.report()
+
+    def expose(self, exposure_s: float, number: int) -> Exposure:
+        """Take one frame."""
+        with self._guarded():
+            return self._device.expose(exposure_s, number)
+
+    def temperature_c(self) -> float | None:
+        """Return the temperature of the sensor in °C, None if the camera reports none."""
+        with self._guarded():
+            return self._device.temperature_c() if isinstance(self._device, Thermometer) else None
+
+
+class UntriggeredPluginCamera(PluginCamera):
+    """A camera of another package that a person or a program triggers."""
+
+    def await_silence(self, exposure_s: float) -> None:
+        """Wait until no exposure is under way that could be taken for the next frame."""
+        with self._guarded():
+            assert isinstance(self._device, UntriggeredCamera)
+            self._device.await_silence(exposure_s)
 
 
 def plugin_light(settings: lights.PluginSettings, clock: Clock) -> Light:
@@ -173,39 +195,24 @@ def plugin_light(settings: lights.PluginSettings, clock: Clock) -> Light:
     name = settings.plugin
     plugin = _load(LIGHTS, name, LightPlugin)
     options = convert_options(settings.options, plugin.settings, f"[[light]] {settings.name} with driver = {name!r}")
-    with _raise_as(PluginFailed, f"the plug-in {name!r} failed", "correct its settings, or tell its authors"):
+    with _making(name):
         return PluginLight(name, plugin.make(options, clock))
 
 
-class PluginLight:
-    """A light of another package, the plug-in `name`, whose failures all become `LightError`."""
+class PluginLight(_PluginDevice[Light]):
+    """A light of another package."""
 
-    def __init__(self, name: str, light: Light) -> None:
-        self._name = name
-        self._light = light
-
-    def open(self) -> None:
-        """Connect to the light."""
-        with self._as_light_errors():
-            self._light.open()
+    error = LightError
 
     def switch(self, on: bool, /) -> None:
         """Switch the light."""
-        with self._as_light_errors():
-            self._light.switch(on)
+        with self._guarded():
+            self._device.switch(on)
 
     def is_on(self) -> bool | None:
         """Return whether the light is on, None if it is not read back."""
-        with self._as_light_errors():
-            return self._light.is_on()
-
-    def close(self) -> None:
-        """Disconnect."""
-        with self._as_light_errors():
-            self._light.close()
-
-    def _as_light_errors(self) -> AbstractContextManager[None]:
-        return _raise_as(LightError, f"the plug-in {self._name!r} failed", "tell its authors", passing=RigError)
+        with self._guarded():
+            return self._device.is_on()
 
 
 def plugin_controller(settings: StageSettings, clock: Clock) -> Controller:
@@ -213,8 +220,12 @@ def plugin_controller(settings: StageSettings, clock: Clock) -> Controller:
     name = settings.protocol
     plugin = _load(STAGES, name, StagePlugin)
     options = convert_options(settings.options, plugin.settings, f"[stage] with protocol = {name!r}")
-    with _raise_as(PluginFailed, f"the plug-in {name!r} failed", "correct its settings, or tell its authors"):
+    with _making(name):
         return plugin.make(options, settings, clock)
+
+
+def _making(name: str) -> AbstractContextManager[None]:
+    return _raise_as(PluginFailed, f"the plug-in {name!r} failed", "correct its settings, or tell its authors")
 
 
 def convert_options[T](options: Mapping[str, Any], kind: type[T], place: str) -> T:

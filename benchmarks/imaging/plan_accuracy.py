@@ -90,9 +90,9 @@ def _sigmas(
     on_object = reference.light[reference.visible[truck.name] > 0.5]
     white_e = signal_scale_for_snr(on_object, snr, dark_e, read_noise_e)
     expected_e = np.stack([view.light for view in views]) * white_e
-    operator = _operator(experiment, poses, _DEPTH_MM)
+    operator = plane_operator(experiment, poses, _DEPTH_MM)
     seen = next(render([truck], optics.ideal(), np.zeros((1, 6)))).visible[truck.name] > 0.99
-    noise = _noise_model(sensor)
+    noise = noise_model(sensor)
     estimates: list[list[Image]] = [[], []]
     for _ in range(options.draws):
         drawn = [sensor.expose(view / sensor.quantum_efficiency, _EXPOSURE_S, generator) for view in expected_e]
@@ -121,7 +121,7 @@ def _one_step(operator: PlaneOperator, images: ElementalImages) -> Image:
     return np.asarray(start - fit.value_and_gradient(start)[1] / fit.metric(start))
 
 
-def _operator(experiment: SimulatedExperiment, poses: NDArray[np.float64], depth_mm: float) -> PlaneOperator:
+def plane_operator(experiment: SimulatedExperiment, poses: NDArray[np.float64], depth_mm: float) -> PlaneOperator:
     """Return H of a plane at a depth, one sample per pixel of the reference view."""
     optics = experiment.optics
     pitch_mm = depth_mm / optics.fx_px
@@ -130,7 +130,7 @@ def _operator(experiment: SimulatedExperiment, poses: NDArray[np.float64], depth
     return PlaneOperator(homographies, optics.rays(1), grid, flat=optics.relative_illumination())
 
 
-def _noise_model(sensor: SimulatedSensor) -> NoiseModel:
+def noise_model(sensor: SimulatedSensor) -> NoiseModel:
     """Return what is known of the sensor."""
     return NoiseModel(sensor.offset_dn, sensor.gain_dn_per_e, sensor.read_noise_e, sensor.dark_current_e_per_s)
 
@@ -174,7 +174,7 @@ def _feature(
 ) -> tuple[float, float, float, float]:
     """Return the smallest contrast, deviations found at it, and σ of depth of a black square, predicted and found."""
     sensor = SimulatedSensor()
-    noise, dark_e = _noise_model(sensor), sensor.dark_current_e_per_s * _EXPOSURE_S
+    noise, dark_e = noise_model(sensor), sensor.dark_current_e_per_s * _EXPOSURE_S
     light_e = signal_scale_for_snr(np.ones(1), snr, dark_e, sensor.read_noise_e)
     information = information_of_views(light_e, dark_e, float(np.sqrt(noise.read_variance_e2())), np.ones(len(poses)))
     contrast = smallest_contrast(side_px, light_e, float(information.sum()))

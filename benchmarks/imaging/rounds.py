@@ -16,17 +16,14 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from faintfield.calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray
-from faintfield.calib.noise_model import NoiseModel
+from benchmarks.imaging.plan_accuracy import noise_model, plane_operator
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.live.guided import capture_session
 from faintfield.pipelines.planning.sample_noise import MeasuredNoise
 from faintfield.recon.likelihood.images import ElementalImages
-from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.single_plane import PlaneOperator
 from faintfield.recon.solver.initialization import back_projection
 from faintfield.rig.cameras.settings import SimulatedSettings
-from faintfield.rig.plan import Grid, Until
+from faintfield.rig.plan import Grid, Until, nominal_poses_rt_cam_ref
 from faintfield.rig.session.journal import RoundsEnded
 from faintfield.rig.session.session import ROUNDS_ENDED, open_journal, read_plan, taken_frames
 from faintfield.rig.settings import DriftSettings, RigSettings, SceneSettings, SettleSettings, StepSettings
@@ -82,7 +79,7 @@ def _session(
         rounds = ended[0].rounds if ended else _ROUNDS
         if until is not None:
             return 0.0, 0.0, rounds, found_snr
-        planes = _planes(settings, [(frame.round, path) for frame, _, path in frames])
+        planes = _planes(settings, folder)
     sigma_e = np.std(planes, axis=0, ddof=1)
     rows, columns = (np.arange(length) - length / 2 for length in sigma_e.shape)
     near = np.hypot(rows[:, np.newaxis], columns) < _NEAR_AXIS * options.size_px[0]
@@ -106,28 +103,21 @@ def _settings(snr: float, until: Until, seed: int, options: argparse.Namespace) 
     )
 
 
-def _planes(settings: RigSettings, frames: list[tuple[int, Path]]) -> NDArray[np.float64]:
+def _planes(settings: RigSettings, folder: Path) -> NDArray[np.float64]:
     """Return the back-projection (round, row, column) of each round, where all views see it."""
     assert isinstance(settings.camera, SimulatedSettings)
     experiment, grid = lab_experiment(settings.camera), settings.grid
-    optics, sensor, poses = experiment.optics, experiment.sensor, np.zeros((49, 6))
-    rows, columns = np.divmod(np.arange(49), 7)
-    poses[:, 3], poses[:, 4] = (3 - columns) * grid.pitch_mm, (3 - rows) * grid.pitch_mm
-    noise = NoiseModel(sensor.offset_dn, sensor.gain_dn_per_e, sensor.read_noise_e, sensor.dark_current_e_per_s)
-    pitch_mm = _DEPTH_MM / optics.fx_px
-    plane = PlaneGrid(optics.size_px[::-1], pitch_mm, (-optics.cx_px * pitch_mm, -optics.cy_px * pitch_mm))
-    homographies = plane_from_ray(poses, fronto_parallel_rt_ref_plane(_DEPTH_MM))
-    operator = PlaneOperator(homographies, optics.rays(1), plane, flat=optics.relative_illumination())
-    images = {number: np.empty((49, *optics.size_px[::-1]), np.float32) for number, _ in frames}
-    for number, path in frames:
-        row, column = (int(word[1:]) for word in path.name.split("_")[-3:-1])
-        images[number][7 * row + column] = noise.electrons(read_frame(path).pixels_dn)
-    dark_e = sensor.dark_current_e_per_s * _EXPOSURE_S
-    rounds = [ElementalImages(electrons, dark_e, noise.read_variance_e2()) for electrons in images.values()]
-    planes = [back_projection(operator, of_round) for of_round in rounds]
-    height, width = planes[0].shape
-    margin = ceil(3 * grid.pitch_mm / pitch_mm) + 1
-    return np.stack([plane[margin : height - margin, margin : width - margin] for plane in planes])
+    poses = nominal_poses_rt_cam_ref(grid.rows, grid.columns, grid.pitch_mm)
+    operator, noise = plane_operator(experiment, poses, _DEPTH_MM), noise_model(experiment.sensor)
+    rounds = np.empty((_ROUNDS, len(poses), *experiment.optics.size_px[::-1]), np.float32)
+    for frame, _, path in taken_frames(folder):
+        row, column = frame.stop.node
+        rounds[frame.round, row * grid.columns + column] = noise.electrons(read_frame(path).pixels_dn)
+    dark_e = experiment.sensor.dark_current_e_per_s * _EXPOSURE_S
+    images = [ElementalImages(electrons, dark_e, noise.read_variance_e2()) for electrons in rounds]
+    planes = np.stack([back_projection(operator, of_round) for of_round in images])
+    margin = ceil(grid.columns // 2 * grid.pitch_mm * experiment.optics.fx_px / _DEPTH_MM) + 1
+    return np.asarray(planes[:, margin:-margin, margin:-margin], np.float64)
 
 
 def _rms(values: NDArray[np.float64]) -> float:

@@ -6,7 +6,6 @@ the geometry as `faintfield geometry` does.
 """
 
 from collections.abc import Mapping
-from multiprocessing.connection import Connection
 
 import cv2
 import numpy as np
@@ -22,7 +21,7 @@ from faintfield.pipelines.formats.results.geometry import camera_poses
 from faintfield.pipelines.formats.sets.board_set import BoardView, named_boards
 from faintfield.pipelines.live.board_progress import BoardFrame, BoardNews, BoardOrder, BoardProgress, FrameCorners
 from faintfield.pipelines.live.board_verdict import SweepPlan, coverage, judge, nominal_poses, sweeps_seen
-from faintfield.pipelines.live.side_process import serve
+from faintfield.pipelines.live.side_process import Line, newest_news, serve
 from faintfield.rig.errors import RigError
 from faintfield.rig.plan import planned_frames
 from faintfield.rig.session.session import FRAMES, PLAN, read_plan
@@ -39,7 +38,7 @@ _FAILURES = (InputError, RigError, CalibrationError)
 class BoardWatch:
     """The board sweeps of a session that is being captured; `line` brings news and takes progress."""
 
-    def __init__(self, order: BoardOrder, line: Connection) -> None:
+    def __init__(self, order: BoardOrder, line: Line) -> None:
         self._order, self._line = order, line
         self._settings = GeometrySettings(depths_mm=order.depths_mm)
         self._wanted_px = order.wanted_px or self._settings.max_transfer_sigma_px
@@ -62,9 +61,7 @@ class BoardWatch:
         self._report()
         busy = False
         while True:
-            news: BoardNews | None = None if busy else self._line.recv()
-            while self._line.poll():
-                news = self._line.recv()
+            news: BoardNews | None = newest_news(self._line, wait=not busy)
             if news is not None:
                 self._take(news)
             busy = self._advance()

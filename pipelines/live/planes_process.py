@@ -5,7 +5,6 @@ frames that wait are taken newest first; PMLEM runs when none does.
 """
 
 from collections.abc import Sequence
-from multiprocessing.connection import Connection
 from typing import Literal
 
 import cv2
@@ -28,7 +27,7 @@ from faintfield.pipelines.live.planes_client import (
     PlaneStatus,
 )
 from faintfield.pipelines.live.planes_scene import LiveScene, dark_frames, live_scene
-from faintfield.pipelines.live.side_process import serve
+from faintfield.pipelines.live.side_process import Line, newest_news, serve
 from faintfield.pipelines.live.terminal import display_levels
 from faintfield.recon.errors import ReconstructionError
 from faintfield.recon.names import on_compiling
@@ -53,7 +52,7 @@ _FAILURES = (InputError, RigError, ReconstructionError)
 class LivePlanes:
     """Planes of a session that is being captured; `line` brings news and takes pictures and states."""
 
-    def __init__(self, order: LiveOrder, line: Connection) -> None:
+    def __init__(self, order: LiveOrder, line: Line) -> None:
         self._order, self._line = order, line
         self._indices = range(len(order.depths_mm))
         self._planes: PlaneAccumulator | None = None
@@ -72,9 +71,7 @@ class LivePlanes:
         self._report()
         busy = False
         while True:
-            news: LiveNews | None = None if busy else self._line.recv()
-            while self._line.poll():
-                news = self._line.recv()
+            news: LiveNews | None = newest_news(self._line, wait=not busy)
             if news is not None:
                 self._wanted = {frame.intent: frame for frame in news.frames}
                 self._shown = min(news.depth, self._indices[-1])

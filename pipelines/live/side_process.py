@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import Any, Protocol
 
 from faintfield.pipelines.console import inform
 
@@ -130,6 +130,27 @@ def running[Process: SideProcess](start: Callable[[], Process], name: str) -> It
         yield process
     finally:
         process.end()
+
+
+class Line(Protocol):
+    """The process's end of its connection with the capture."""
+
+    def poll(self) -> bool:
+        """Return whether a message waits."""
+
+    def recv(self) -> Any:
+        """Return the next message, waiting for it; raises EOFError when the capture has ended."""
+
+    def send(self, message: Any, /) -> None:
+        """Send a message."""
+
+
+def newest_news(line: Line, *, wait: bool) -> Any:
+    """Return the newest of the news that have come, waiting for one if asked to; None without any."""
+    news = line.recv() if wait else None
+    while line.poll():
+        news = line.recv()
+    return news
 
 
 def serve(follow: Callable[[Any, Connection], None], ended: Callable[[str], object]) -> None:

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from faintfield.calib.estimate import Estimate
@@ -188,7 +188,7 @@ class Predictor:
             vignetting=None if self.lens.response is not None else "no flats in the noise calibration",
             rose_k=self.options.rose_k,
             depths=[self._depth(depth_mm) for depth_mm in self.depths_mm or (None,)],
-            time_s=self._duration(grid, {}, rounds)[0],
+            time_s=self._duration(grid, rounds)[0],
             alternatives=rows,
             wanted_sigma_e=sigma_e,
             cheapest=min(reaching, key=lambda row: row.time_s.value or 0.0, default=None),
@@ -342,8 +342,7 @@ class Predictor:
             fewest, of_round = self._fewest(grid), View(frames * exposure_s, frames)
             # `until` counts in electrons of the exposure that it stands beside
             rounds = self._rounds(of_round, fewest, exposure_s)
-            changes = {"exposure_s": (exposure_s,), "frames_per_node": frames}
-            total_s, scene_s, why_not = self._duration(grid, changes, rounds)
+            total_s, scene_s, why_not = self._duration(grid, rounds, (exposure_s, frames))
         except ValueError as failure:
             raise WrongUsage(str(failure)) from failure
         view = of_round.times(rounds)
@@ -361,21 +360,27 @@ class Predictor:
             why_not=why_not,
         )
 
-    def _duration(self, grid: Grid, changes: dict[str, Any], rounds: int) -> tuple[Estimate, Estimate, str | None]:
-        """Return the duration of the session and of its dark scene with `changes`, and why it cannot be done."""
+    def _duration(
+        self, grid: Grid, rounds: int, frames: tuple[float, int] | None = None
+    ) -> tuple[Estimate, Estimate, str | None]:
+        """Return the duration of the session and of its dark scene, and why it cannot be done.
+
+        `frames` are another exposure, and the number of frames at a node, of the dark scene.
+        """
         settings, pace, steps = self.settings, self.pace, []
         for step in settings.steps():
             # The noise reference must be exposed like the dark scene
-            now = msgspec.structs.replace(step, **changes) if step.kind in ("dark_scene", "noise_reference") else step
-            if now.until is not None:
-                now = msgspec.structs.replace(now, until=msgspec.structs.replace(now.until, at_most_rounds=rounds))
-            steps.append(now)
+            if frames is not None and step.kind in ("dark_scene", "noise_reference"):
+                step = replace(step, exposure_s=(frames[0],), frames_per_node=frames[1])
+            if step.until is not None:
+                step = replace(step, until=replace(step.until, at_most_rounds=rounds))
+            steps.append(step)
         plan = CapturePlan.of(grid, steps, approach_mm=settings.stage.approach_mm, frame_bytes=0)
         if isinstance(pace, str):
             unknown = Estimate(None, why=pace)
             return unknown, unknown, None
-        plan = msgspec.structs.replace(plan, settle_s=settings.settle.wait_s, readout_s=pace.readout_s)
-        scene = msgspec.structs.replace(plan, steps=tuple(step for step in plan.steps if step.kind == "dark_scene"))
+        plan = replace(plan, settle_s=settings.settle.wait_s, readout_s=pace.readout_s)
+        scene = replace(plan, steps=tuple(step for step in plan.steps if step.kind == "dark_scene"))
         whole, part = (Estimate(schedule.duration_s(pace.motion, pace.feed_mm_per_s)) for schedule in (plan, scene))
         try:
             pace.workspace.check_path(plan.path())
@@ -390,7 +395,7 @@ def _about_the_centre(grid: Grid, shape: tuple[int, int]) -> Grid:
     row, column = centre_node(rows, columns)
     centre = grid.centre().target
     origin_mm = Point(centre.x_mm - column * grid.pitch_mm, centre.y_mm - row * grid.pitch_mm)
-    return msgspec.structs.replace(grid, rows=rows, columns=columns, origin_mm=origin_mm)
+    return replace(grid, rows=rows, columns=columns, origin_mm=origin_mm)
 
 
 def _reaches(row: Alternative, sigma_e: float | None) -> bool:

@@ -246,7 +246,10 @@ class Capture:
         self._dialogue.pace.here = None
         self._record_failure(f"{device}_failed", frame, failure)
         self._dialogue.warn(f"{frame.name}: {failure}")
-        setattr(self._dialogue, device, "failed")
+        if device == "camera":
+            self._dialogue.camera = "failed"
+        elif device == "stage":
+            self._dialogue.stage = "failed"
         self._dialogue.show_status(frame, f"the {device} failed")
         unattended: Answer = "again" if self._failures < MAX_UNATTENDED_TRIES else "stop"
         answers: tuple[Answer, ...] = ("again", "skip", "stop")

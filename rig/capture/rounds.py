@@ -41,14 +41,13 @@ class Rounds:
 
     def __init__(self, session: Session, predictor: NoisePredictor | None) -> None:
         self._session, self._predictor = session, predictor
-        self._last: dict[int, tuple[tuple[int, int], Progress]] = {}
+        self._last: dict[int, tuple[tuple[int, int, int], Progress]] = {}
 
     def limit(self, frame: PlannedFrame) -> None:
-        """Record that the operator wants no round beyond that of a frame, the next to be taken, if it is begun."""
+        """Record that the operator wants no round after that of the next frame, nor that one if it is not begun."""
         step, session = frame.step, self._session
         begun = any((other.step, other.round) == (step, frame.round) for other in self._taken(step))
         session.limit_rounds(RoundsLimited(step, max(frame.round + begun, 1)))
-        self._last.clear()
         self.end_steps()
 
     def progress(self, step: int) -> Progress | None:
@@ -57,10 +56,11 @@ class Rounds:
         until = session.plan.steps[step].until
         if until is None:
             return None
-        state = len(session.valid()), len(session.missing())
+        most = min(session.rounds_limited.get(step, until.at_most_rounds), until.at_most_rounds)
+        state = len(session.valid()), len(session.missing()), most
         last = self._last.get(step)
         if last is None or last[0] != state:
-            last = self._last[step] = state, self._progress(step, until)
+            last = self._last[step] = state, self._progress(step, until, most)
         return last[1]
 
     def expected(self, frames: Sequence[PlannedFrame]) -> list[PlannedFrame]:
@@ -89,9 +89,8 @@ class Rounds:
         valid = self._session.valid()
         return [frame for frame in self._session.frames if frame.step == step and frame.number in valid]
 
-    def _progress(self, step: int, until: Until) -> Progress:
+    def _progress(self, step: int, until: Until, most: int) -> Progress:
         session, taken = self._session, self._taken(step)
-        most = min(session.rounds_limited.get(step, until.at_most_rounds), until.at_most_rounds)
         open_rounds = [frame.round for frame in session.missing() if frame.step == step]
         whole = min(open_rounds, default=max((frame.round + 1 for frame in taken), default=0))
         begun = any(frame.round >= whole for frame in taken)

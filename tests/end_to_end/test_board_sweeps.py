@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import SimpleNamespace
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -116,8 +116,9 @@ def test_page_draws_corners_over_frame(browser: Tab) -> None:
         verdict=BoardVerdict("predicted transfer error 0.04 px", 0.04, 500.0),
         last=FrameCorners(frame.name, (160, 120), ((40.0, 30.0), (150.0, 110.0))),
     )
-    boards = SimpleNamespace(progress=progress, failure=lambda: None)
-    with serve_page(panel, boards=boards) as address:  # type: ignore[arg-type]
+    boards = mock.create_autospec(BoardsClient, instance=True)
+    boards.progress, boards.failure.return_value = progress, None
+    with serve_page(panel, boards=boards) as address:
         browser.open(address)
         browser.wait_until("document.querySelectorAll('#corners circle').length === 2")
         browser.wait_until("document.getElementById('frame').naturalWidth > 0")

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
+from unittest import mock
 
 import pytest
 
@@ -55,7 +56,7 @@ class Controller(Server):
             self.received += data
             receive(data)
 
-        self._firmware.receive = note  # type: ignore[method-assign]
+        mock.patch.object(self._firmware, "receive", note).start()
 
     def run_until(self, condition: Callable[[], bool]) -> None:
         deadline_s = time.monotonic() + HANG_S

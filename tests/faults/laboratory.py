@@ -7,7 +7,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from faintfield.rig.cameras.protocol import CameraReport, Exposure
+from faintfield.rig.cameras.protocol import CameraReport, Decode, Exposure
 from faintfield.rig.capture.guide import OperatorInterface
 from faintfield.rig.capture.loop import Capture
 from faintfield.rig.capture.survey import survey
@@ -98,7 +98,10 @@ class Lab:
         self._link = link
 
     def run(
-        self, prepare: Prepare = lambda bench, camera: None, operator: OperatorInterface | None = None
+        self,
+        prepare: Prepare = lambda bench, camera: None,
+        operator: OperatorInterface | None = None,
+        decode: Decode = lambda path: None,
     ) -> RigError | None:
         """Capture; return how it failed, None when it did not."""
         frozen = read_plan(self.folder) if (self.folder / "plan.json").exists() else self.plan()
@@ -109,7 +112,7 @@ class Lab:
                 camera = TruthfulCamera(bench)
                 rig = Rig(bench.stage(traffic=session.journal), camera, bench.clock, lambda kind, sweep: None)
                 prepare(bench, camera)
-                Capture(session, rig, operator or Operator(), lambda path: None).run()
+                Capture(session, rig, operator or Operator(), decode).run()
         except RigError as failure:
             return failure
         finally:

@@ -86,6 +86,7 @@ class LitLab:
         self.shutter = SimulatedLight("shutter")
         self.on_exposure: dict[int, Callable[[], object]] = {}
         self.exposures = 0
+        self.camera_type: type[WatchingCamera] = WatchingCamera
 
     def kill(self) -> None:
         """End the capture at once; what the rig was told to do lasts."""
@@ -138,10 +139,10 @@ class LitLab:
         truth = true_lights(self.settings.light, lights, bench)
         centre = self.settings.grid.centre().target
         lab = SimulatedLab(centre, bench.true_position, bench.still_s, (BOARD,), self.camera, truth)
-        return Rig(stage, _WatchingCamera(self, bench, lab), bench.clock, lab.arrange, lights=lights)
+        return Rig(stage, self.camera_type(self, bench, lab), bench.clock, lab.arrange, lights=lights)
 
 
-class _WatchingCamera(SimulatedCamera):
+class WatchingCamera(SimulatedCamera):
     """The simulated camera; while it exposes, lights and stage are looked at every few milliseconds."""
 
     def __init__(self, laboratory: LitLab, bench: Bench, lab: SimulatedLab) -> None:

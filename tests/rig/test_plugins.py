@@ -3,6 +3,7 @@
 import sys
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import msgspec
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from faintfield.pipelines.formats.toml_files import read_rig
 from faintfield.rig import plugins
 from faintfield.rig.cameras.folder import FolderCamera
+from faintfield.rig.cameras.protocol import UntriggeredCamera
 from faintfield.rig.cameras.settings import (
     BUILT_IN_BACKENDS,
     AravisSettings,
@@ -122,9 +124,13 @@ def test_camera_of_another_package(packages: Path, tmp_path: Path) -> None:
     assert settings.mosaic == ("RG", "GB")
     guarded = open_rig(settings).camera
     assert isinstance(guarded, plugins.PluginCamera)
-    camera = guarded._camera  # noqa: SLF001 - what the plug-in made
+    camera = guarded._device  # noqa: SLF001 - what the plug-in made
     assert isinstance(camera, FolderCamera)
     assert camera._settings == FolderSettings("frames", arrival_s=60.0)  # noqa: SLF001 - what the plug-in got
+    assert isinstance(guarded, UntriggeredCamera), "a watched folder has to be silent before each frame"
+    with mock.patch.object(camera, "await_silence") as silence:
+        guarded.await_silence(0.5)
+    silence.assert_called_once_with(0.5)
 
 
 def test_keys_of_built_in_drivers_are_read(tmp_path: Path) -> None:

@@ -69,7 +69,7 @@ def followed(session: Path, out: Path, *news: BoardNews) -> list[BoardProgress]:
     """Return all that is told of a session when these news come, each after the work on the last is done."""
     line = Line(*news)
     with pytest.raises(EOFError):
-        BoardWatch(BoardOrder(session, out, (500.0,), 0.001), line).run()  # type: ignore[arg-type]
+        BoardWatch(BoardOrder(session, out, (500.0,), 0.001), line).run()
     return [message for message in line.sent if isinstance(message, BoardProgress)]
 
 
@@ -227,9 +227,9 @@ def test_live_planes_take_poses_of_boards(session: Path, tmp_path: Path) -> None
     )[:2]
     order = LiveOrder(session, tmp_path / "rig.toml", (500.0,))
     measured = BoardPoses(Path(told[-1].geometry))
-    line = Line(order, LiveNews(dark, 0), LiveNews(dark, 0, measured))
+    line = Line(LiveNews(dark, 0), LiveNews(dark, 0, measured))
     with pytest.raises(EOFError):
-        LivePlanes(line.recv(), line).run()  # type: ignore[arg-type]
+        LivePlanes(order, line).run()
     poses = list(dict.fromkeys(it.poses for it in line.sent if isinstance(it, LiveStatus) and it.poses))
     assert poses[0].startswith("nominal, as the stage is told; ")
     assert poses[1:] == ["measured, of the boards of this session"]

@@ -9,10 +9,12 @@ import pytest
 from msgspec.structs import replace
 
 from faintfield.rig.cameras.protocol import Exposure, Pixels
-from faintfield.rig.capture.take import FrameTaker
+from faintfield.rig.capture.loop import Capture
+from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import CameraError
-from faintfield.rig.plan import Grid, PlannedFrame, planned_frames
+from faintfield.rig.plan import Grid, planned_frames
 from faintfield.rig.session.journal import Journal
+from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.session import read_plan
 from faintfield.rig.settings import SettleSettings, StepSettings
 from faintfield.rig.simulation.controller.bench import Bench
@@ -21,7 +23,7 @@ from faintfield.rig.simulation.lab import SimulatedCamera
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.motion import one_sided_path, path_duration_s
 from faintfield.rig.stages.protocol import MotionLimits, Point, Position
-from tests.faults.capturing import SMALL_RIG, capture, events
+from tests.faults.capturing import SMALL_RIG, Operator, capture, events, frozen_plan
 from tests.faults.laboratory import Lab, at_exposures
 from tests.patience import HANG_S
 from tests.rig.stages.benches import firmware
@@ -64,15 +66,12 @@ def test_frame_is_recorded_during_next_motion(tmp_path: Path) -> None:
 
 
 def test_refused_frame_is_retaken_at_its_node(lab: Lab) -> None:
-    decode = FrameTaker._decode_frame  # noqa: SLF001
-
-    def refuse(taker: FrameTaker, frame: PlannedFrame, path: Path, exposure: Exposure) -> Pixels | None:
-        if path.name.endswith("_x3.tiff"):
+    def refuse(path: Path) -> Pixels | None:
+        if "_x3." in path.name:
             raise CameraError("the frame is damaged; take it again")
-        return decode(taker, frame, path, exposure)
+        return None
 
-    with mock.patch.object(FrameTaker, "_decode_frame", refuse):
-        assert lab.run() is None
+    assert lab.run(decode=refuse) is None
     lab.assert_true_positions()
     assert uncommitted(lab) == [(3, 2)]
 
@@ -102,20 +101,22 @@ def test_interrupt_on_the_way_keeps_last_frame(lab: Lab) -> None:
 
 def test_nodes_add_quarter_second_to_plan(tmp_path: Path) -> None:
     begun_s: list[float] = []
-    expose = SimulatedCamera.expose
-
-    def watched(camera: SimulatedCamera, exposure_s: float, number: int) -> Exposure:
-        begun_s.append(camera._clock.now_s())  # noqa: SLF001
-        return expose(camera, exposure_s, number)
-
     settings = replace(
         SMALL_RIG,
         grid=Grid(3, 4, 30.0, Point(-350.0, -350.0)),
         step=(StepSettings("dark_scene", 0.1),),
         settle=SettleSettings(measure=False, wait_s=0.0),
     )
-    with mock.patch.object(SimulatedCamera, "expose", watched):
-        assert capture(tmp_path / "session", settings=settings) is None
+    with open_session(tmp_path / "session", frozen_plan(settings)) as session:
+        rig = open_rig(settings, session.journal)
+        expose = rig.camera.expose
+
+        def watched(exposure_s: float, number: int) -> Exposure:
+            begun_s.append(rig.clock.now_s())
+            return expose(exposure_s, number)
+
+        with mock.patch.object(rig.camera, "expose", watched):
+            Capture(session, rig, Operator(), lambda path: None).run()
     motion = MotionLimits((100.0, 100.0), (500.0, 500.0))
     targets = [frame.stop.target for frame in planned_frames(read_plan(tmp_path / "session").plan)]
     motions_s = [

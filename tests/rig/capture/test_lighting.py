@@ -13,9 +13,9 @@ from faintfield.rig.session.session import taken_frames
 from faintfield.rig.settings import DriftSettings, StepSettings
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
-from faintfield.rig.simulation.lab import TRUE_LIGHTS, SimulatedCamera
+from faintfield.rig.simulation.lab import TRUE_LIGHTS
 from tests.faults.capturing import Operator, events
-from tests.faults.lit_laboratory import STEPS, Killed, LitLab
+from tests.faults.lit_laboratory import STEPS, Killed, LitLab, WatchingCamera
 from tests.rig.stages.benches import firmware, on_homing
 
 
@@ -70,19 +70,18 @@ def test_light_that_stays_on_is_shown(lab: LitLab) -> None:
 
 
 @pytest.mark.parametrize("test", [False, True])
-def test_watched_camera_is_triggered_for_every_frame(lab: LitLab, monkeypatch: pytest.MonkeyPatch, test: bool) -> None:
+def test_watched_camera_is_triggered_for_every_frame(lab: LitLab, test: bool) -> None:
     calls: list[str] = []
 
-    def silent(camera: SimulatedCamera, exposure_s: float) -> None:
-        calls.append("silence")
+    class Untriggered(WatchingCamera):
+        def await_silence(self, exposure_s: float) -> None:
+            calls.append("silence")
 
-    def expose(camera: SimulatedCamera, exposure_s: float, number: int) -> Exposure:
-        calls.append("exposure")
-        return exposed(camera, exposure_s, number)
+        def expose(self, exposure_s: float, number: int) -> Exposure:
+            calls.append("exposure")
+            return super().expose(exposure_s, number)
 
-    exposed = SimulatedCamera.expose
-    monkeypatch.setattr(SimulatedCamera, "await_silence", silent, raising=False)
-    monkeypatch.setattr(SimulatedCamera, "expose", expose)
+    lab.camera_type = Untriggered
     lights = None if test else ("room", "shutter")
     lab.settings = replace(lab.settings, step=(StepSettings("bright", 0.1, lights=lights),))
     operator = Operator({"step": ["test", "go"]} if test else {})

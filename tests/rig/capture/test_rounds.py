@@ -49,8 +49,7 @@ def test_rounds_end_once_noise_is_reached(tmp_path: Path, one_round_e: float, ro
     frames = rounds * NODES + DARKS
     assert (verdict.problems, verdict.missing, verdict.left_out, verdict.sealed) == ((), (), (), True)
     assert (verdict.planned, verdict.present) == (frames, frames)
-    ended = RoundsEnded(0, rounds, pytest.approx(one_round_e / math.sqrt(rounds)))  # type: ignore[arg-type]
-    assert verdict.rounds == (() if rounds == 8 else (ended,))
+    assert verdict.rounds == (() if rounds == 8 else (RoundsEnded(0, rounds, one_round_e / math.sqrt(rounds)),))
     assert (operator.statuses[-1].done, operator.statuses[-1].total) == (frames, frames)
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from unittest import mock
 
 import pytest
 from msgspec import Struct, ValidationError, convert
@@ -20,6 +21,7 @@ from faintfield.rig.simulation.controller.grblhal import SimulatedGrblHal
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.simulation.lab import SimulatedLight
 from faintfield.rig.stages.gantry import Gantry
+from faintfield.rig.stages.protocol import Controller as ControllerProtocol
 from faintfield.rig.stages.protocol import Output
 from faintfield.testing import light_contract
 from tests.faults.capturing import SMALL_RIG
@@ -187,7 +189,7 @@ def test_foreign_output_is_refused(controller: Controller, output: Output, words
 
 def test_stage_without_outputs_refuses_lights() -> None:
     bench = Bench(SimulatedGrbl)
-    stage = Gantry(object(), bench.stage().settings, bench.clock)  # type: ignore[arg-type]
+    stage = Gantry(mock.create_autospec(ControllerProtocol, instance=True), bench.stage().settings, bench.clock)
     with pytest.raises(PlanRefused, match="has no outputs for lights; switch them with driver = 'command'"):
         stage.switch_output(FLOOD, on=True)
 
