@@ -50,6 +50,7 @@ COMMANDS: dict[tuple[Group, str], tuple[str, ...]] = {
     (Group("Calibrate", sort_key=3), "calibration"): (
         "noise session --out results",
         "geometry boards --depth-mm 500 --depth-mm 700",
+        "align set --out alignment",
     ),
     (Group("Reconstruct", sort_key=4), "reconstruction"): (
         "run session --depth-mm 500 --depth-mm 700",

@@ -1,18 +1,22 @@
 """Commands that measure a sensor, and where the camera was."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING, Annotated, overload
 
-from faintfield.pipelines.arguments import LensName, Positive
+from cyclopts import Parameter
+
+from faintfield.pipelines.arguments import LensName, NotNegative, Positive, SceneKind
 from faintfield.pipelines.errors import WrongUsage
 
 if TYPE_CHECKING:
     from faintfield.pipelines.calibration.noise_comparison import NoiseComparison
     from faintfield.pipelines.formats.results.noise import NoiseRecord
+    from faintfield.pipelines.workflows.align import AlignmentSummary
     from faintfield.pipelines.workflows.geometry import GeometrySummary
 
 type Noise = NoiseRecord | NoiseComparison
 type Geometry = GeometrySummary
+type Alignment = AlignmentSummary
 
 
 @overload
@@ -76,3 +80,57 @@ def geometry(
     from faintfield.pipelines.workflows.geometry import measure_stage
 
     return measure_stage(directory, out, lens, depth_mm, limit_px)
+
+
+def align(
+    set_path: Path,
+    /,
+    *,
+    out: Path | None = None,
+    depth: Annotated[list[float] | None, Parameter(allow_leading_hyphen=True)] = None,
+    depth_range: Annotated[str | None, Parameter(allow_leading_hyphen=True)] = None,
+    geometry: Path | None = None,
+    scene: SceneKind = "dark_scene",
+    position_error: NotNegative = 0.0,
+    rotation_error_mrad: NotNegative = 0.0,
+) -> Alignment:
+    """Find where the camera was at every node from the views of the scene themselves, dark ones, too.
+
+    Writes geometry.json with source "views", its covariance, and a page that shows the scene before and after; give its
+    folder to `reconstruct --geometry`. The new poses are accepted only if they predict pixels that were held out better
+    than the old ones, beyond chance. Otherwise the command says so, and nothing is written.
+
+    Parameters
+    ----------
+    set_path
+        A folder with elemental.toml, or a session whose noise and geometry were measured: its poses are then the start,
+        and what changed since is measured.
+    out
+        Folder for the results; by default the folder alignment in SET-PATH.
+    depth
+        Depth of a plane of the scene in the unit of the set; give it once per plane. By default the depth of each pixel
+        is found, which suits all scenes; planes are more precise where the scene is nothing else.
+    depth_range
+        NEAR:FAR in the unit of the set: range in which depths are sought, such as 400:1500. By default it is found.
+    geometry
+        geometry.json, or its folder, whose poses are the start instead of those of the set.
+    scene
+        Set of the session whose views are aligned.
+    position_error
+        Standard deviation of a node's position along each axis, in the unit of the poses; by default 0.6 % of the
+        distance between nodes. It is where an estimate from the views starts.
+    rotation_error_mrad
+        Standard deviation of a node's rotation about each axis; by default 3.5.
+    """
+    from faintfield.pipelines.workflows.align import align_views
+
+    return align_views(
+        set_path,
+        out,
+        depth=depth or (),
+        depth_range=depth_range,
+        geometry=geometry,
+        scene=scene,
+        position_error=position_error,
+        rotation_error_mrad=rotation_error_mrad,
+    )

@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 from faintfield.calib.estimate import Estimate, StageFigure, StageReport
 from faintfield.pipelines.formats.files import files_named, folders_in, sha256
 from faintfield.pipelines.formats.provenance import Provenance
-from faintfield.pipelines.formats.results.geometry import GEOMETRY_PAGE, GeometryRecord, LensRecord, read_geometry
+from faintfield.pipelines.formats.results.geometry import (
+    GEOMETRY_PAGE,
+    CameraPoses,
+    GeometryRecord,
+    LensRecord,
+    read_geometry,
+)
 from faintfield.pipelines.formats.results.noise import NOISE_PAGES, NoiseRecord, read_noise
 from faintfield.pipelines.pages.page import (
     INK,
@@ -257,8 +263,10 @@ def noise_section(directory: Path, path: Path, inputs: Set[str]) -> NoiseSection
     )
 
 
-def geometry_section(directory: Path, path: Path, inputs: Set[str]) -> GeometrySection:
-    """Return the section of a geometry.json; `inputs` as for `noise_section`."""
+def geometry_section(directory: Path, path: Path, inputs: Set[str]) -> GeometrySection | None:
+    """Return the section of a geometry.json, None if its poses are by the views; `inputs` as for `noise_section`."""
+    if read_geometry(path, CameraPoses).source == "views":
+        return None
     record = read_geometry(path, GeometryRecord)
     page = path.with_name(GEOMETRY_PAGE)
     options = msgspec.structs.asdict(record.options)

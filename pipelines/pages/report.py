@@ -43,6 +43,7 @@ from faintfield.pipelines.reconstruction.planes.saturation import saturation_tex
 _POSES: dict[Poses, str] = {
     "stated": "by the set; not measured",
     "measured": f"their uncertainty is in the {GEOMETRY_FILE} that was used, which is not here",
+    "aligned": f"found by the views themselves; their uncertainty is in the {GEOMETRY_FILE} that was used",
     "nominal": "where the stage was sent; not measured",
     "true": "known to the simulation",
 }

@@ -19,13 +19,13 @@ from faintfield.pipelines.formats.units import StatedUnits, units_of
 from faintfield.pipelines.pages.page import format_depths
 
 # Order of the columns.
-_POSES_IN_ORDER: tuple[Poses, ...] = ("measured", "nominal", "true", "stated")
+_POSES_IN_ORDER: tuple[Poses, ...] = ("measured", "aligned", "nominal", "true", "stated")
 
 # The poses that a report leads with: the first of these that there are.
-PREFERRED_POSES: tuple[Poses, ...] = ("measured", "stated", "nominal", "true")
+PREFERRED_POSES: tuple[Poses, ...] = ("measured", "aligned", "stated", "nominal", "true")
 
 # Order of the poses in the comparison of errors.
-_COMPARED_POSES: tuple[Poses, ...] = ("nominal", "measured", "true")
+_COMPARED_POSES: tuple[Poses, ...] = ("nominal", "measured", "aligned", "true")
 
 # Names of the methods, in the order of the columns; a report leads with the last that there is.
 METHOD_NAMES: dict[Method, str] = {

@@ -98,7 +98,7 @@ class DepthEvidence:
 
         def ratio(inverse_depth: float) -> list[Image]:
             sums = self._sums(stack, inverse_depth, *unhidden)
-            lights = [self._denoised(sum_e, count, _OF_DEPTH) for count, sum_e in sums]
+            lights = [denoised(sum_e, count, self.variance, _OF_DEPTH) for count, sum_e in sums]
             total = np.zeros_like(self.variance)
             for (count, sum_e), other in zip(sums, reversed(lights), strict=True):
                 light = detail(other, count, _COARSE_DETAIL)
@@ -116,7 +116,9 @@ class DepthEvidence:
         for view, seen in enumerate(relief):  # one at a time: all together are as large as the images
             seen[operator.forward(samples, [view])[0] == 0] = 0
         sums = [(operator.adjoint(self.views.light_e, half), operator.sensitivity(half)) for half in self.halves]
-        return Explained(operator, relief, [self._denoised(*of_half, _OF_SURFACE, workers=None) for of_half in sums])
+        return Explained(
+            operator, relief, [denoised(*of_half, self.variance, _OF_SURFACE, workers=None) for of_half in sums]
+        )
 
     def against(self, known: Explained) -> Ratios:
         """Return the evidence for each depth against a surface and its light."""
@@ -126,7 +128,7 @@ class DepthEvidence:
 
         def ratio(inverse_depth: float) -> list[Image]:
             sums = self._sums(stack, inverse_depth, relief, tolerance)
-            lights = [self._denoised(sum_e, count, _OF_DEPTH) for count, sum_e, _ in sums]
+            lights = [denoised(sum_e, count, self.variance, _OF_DEPTH) for count, sum_e, _ in sums]
             own, matched = np.zeros_like(self.variance), np.zeros_like(self.variance)
             others = zip(reversed(lights), reversed(details), strict=True)
             for (count, sum_e, of_known), (light, of_surface) in zip(sums, others, strict=True):
@@ -170,15 +172,21 @@ class DepthEvidence:
         map_in_threads(work, range(len(self.inverse_depths)))
         return volumes
 
-    def _denoised(self, sum_e: Image, count: Image, strength: float, workers: int | None = 1) -> Image:
-        """Return light (row, column) from its sum over views, smoothed by total variation as its noise asks for."""
-        share = np.clip(count / np.float32(_FEW_VIEWS), 0, 1)
-        light = share * sum_e / np.maximum(count, np.float32(0.5)) + (1 - share) * blurred_mean(sum_e, count, _SPARSE)
-        metric = np.maximum(count, np.float32(1)) / self.variance
-        weight = strength * float(np.sqrt(np.median(metric)))
-        dual = DualField.zero([light.shape], np.dtype(np.float32))
-        dual = dual if workers is None else replace(dual, workers=workers)
-        return dual.prox(light, metric, weight, Penalty(), lambda _: 0.0, _STEPS).plane
+
+def denoised(
+    sum_e: Image, count: Image, variance: Image | np.float32, strength: float, workers: int | None = 1
+) -> NDArray[np.float32]:
+    """Return light (row, column) from its sum over views, smoothed by total variation as its noise asks for.
+
+    `variance` is that of a pixel of one view, and `strength` the weight of total variation in units of the noise.
+    """
+    share = np.clip(count / np.float32(_FEW_VIEWS), 0, 1)
+    light = share * sum_e / np.maximum(count, np.float32(0.5)) + (1 - share) * blurred_mean(sum_e, count, _SPARSE)
+    metric = np.maximum(count, np.float32(1)) / variance
+    weight = strength * float(np.sqrt(np.median(metric)))
+    dual = DualField.zero([light.shape], np.dtype(np.float32))
+    dual = dual if workers is None else replace(dual, workers=workers)
+    return np.asarray(dual.prox(light, metric, weight, Penalty(), lambda _: 0.0, _STEPS).plane, np.float32)
 
 
 def blurred_mean(sum_e: Image, count: Image, scale: float) -> Image:

@@ -22,6 +22,7 @@ from faintfield.pipelines.formats.units import Node, Pose, Shift
 
 if TYPE_CHECKING:  # readers of the record need no solver
     from faintfield.calib.geometry.rig_geometry import HomingShift, RigGeometry
+    from faintfield.pipelines.formats.results.alignment import AlignmentRecord
 
 GEOMETRY_FILE = "geometry.json"
 COVARIANCE_FILE = "geometry_covariance.npz"
@@ -70,9 +71,13 @@ class HomingRecord(Struct, frozen=True):
 
 
 class CameraPoses(Struct, frozen=True, kw_only=True):
-    """The part of `geometry.json` that a reconstruction needs; a file written by hand may hold nothing else."""
+    """The part of `geometry.json` that a reconstruction needs; a file written by hand may hold nothing else.
+
+    Poses with the `source` "views" go with the lens of their set, and include what homings shifted.
+    """
 
     format: Literal[1] = 1
+    source: Literal["views"] | UnsetType = UNSET
     lens: LensRecord
     size_px: tuple[int, int]
     reference_node: Node
@@ -180,7 +185,7 @@ def read_geometry[Kind: CameraPoses](path: Path, kind: type[Kind]) -> Kind:
     path = path / GEOMETRY_FILE if is_folder(path) else path
     if not is_file(path):
         raise MissingFile(f"{path}: no such file; run `faintfield geometry` on the board set first")
-    geometry = read_json(path, kind, what="the result of `faintfield geometry`", remedy="run that again")
+    geometry = read_json(path, kind, what="the result of `faintfield geometry` or `align`", remedy="run that again")
     try:
         geometry.camera_lens()
     except ValueError as failure:
@@ -188,7 +193,7 @@ def read_geometry[Kind: CameraPoses](path: Path, kind: type[Kind]) -> Kind:
     return geometry
 
 
-def write_geometry(out: Path, record: GeometryRecord, files: Mapping[str, bytes | str]) -> None:
+def write_geometry(out: Path, record: "GeometryRecord | AlignmentRecord", files: Mapping[str, bytes | str]) -> None:
     """Write geometry.json and the files beside it into `out`.
 
     geometry.json is removed first and written last: where it stands, it vouches for the files beside it.

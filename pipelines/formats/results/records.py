@@ -43,7 +43,7 @@ type Count = Annotated[int, Meta(ge=0, le=1_000_000)]
 JOINT_METHODS: tuple[Method, ...] = ("joint", "occlusion")
 
 # Where poses come from: as the set states them, measured, where the stage was told to go, or known to the simulator.
-type Poses = Literal["stated", "measured", "nominal", "true"]
+type Poses = Literal["stated", "measured", "aligned", "nominal", "true"]
 
 
 def preview_name(name: str) -> str:

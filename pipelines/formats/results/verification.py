@@ -16,6 +16,7 @@ from faintfield.pipelines.errors import InputError, MissingFile
 from faintfield.pipelines.formats.files import files_below, problem_of_file, sha256
 from faintfield.pipelines.formats.provenance import digest_holds
 from faintfield.pipelines.formats.reading import JSON_FAILURES, read_content
+from faintfield.pipelines.formats.results.alignment import AlignmentRecord
 from faintfield.pipelines.formats.results.figures import METRICS_FILE, OVERVIEW_FILE, Metrics, Overview
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, CameraPoses, GeometryRecord
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, NoiseRecord
@@ -39,7 +40,7 @@ _KINDS: dict[str, tuple[type[Struct], ...]] = {
     OVERVIEW_FILE: (Overview,),
     METRICS_FILE: (Metrics,),
     NOISE_FILE: (NoiseRecord,),
-    GEOMETRY_FILE: (GeometryRecord, CameraPoses),
+    GEOMETRY_FILE: (GeometryRecord, AlignmentRecord, CameraPoses),
 }
 
 # How far above a result its inputs are searched for: a method's folder lies in `reconstructions`, this in the session.

@@ -29,7 +29,7 @@ from faintfield.pipelines.formats.sets.elemental_file import (
     named_files,
     read_set_file,
 )
-from faintfield.pipelines.formats.units import DEPTH_KEYS, LENGTH_KEYS, LIGHT_KEYS, StatedUnits
+from faintfield.pipelines.formats.units import DEPTH_KEYS, LENGTH_KEYS, LIGHT_KEYS, Node, StatedUnits
 from faintfield.recon.threads import map_in_threads
 
 # Exposure without light, beside a set's images if there is one.
@@ -75,6 +75,13 @@ class ElementalSet:
     def offset_from_files(self) -> bool:
         """The offset of each raw file is the black level of its masked pixels."""
         return isinstance(self.settings.noise, Noise) and self.settings.noise.offset_dn is None
+
+    @property
+    def nodes(self) -> list[Node]:
+        """Row and column of the node of each view; those of a row of views if any view states none."""
+        views = self.settings.view
+        stated = [view.node for view in views if view.node is not None]
+        return stated if len(stated) == len(views) else [(0, number) for number in range(len(views))]
 
     @property
     def reference_view(self) -> int:
@@ -166,6 +173,10 @@ class ElementalSet:
     def stated_depth(self, depth_mm: float) -> float:
         """Return a depth in the unit of the set: the same number, or the disparity in px to a millionth."""
         return depth_mm if self.units.depth != "disparity_px" else round(self.disparity_of_depth(depth_mm), 6) + 0.0
+
+    def depth_in_mm(self, depth: float) -> float:
+        """Return a depth that is stated in the unit of the set; BadValue if it is a disparity without a depth."""
+        return self.depth_of_disparity(depth) if self.units.depth == "disparity_px" else depth
 
     def depth_text(self, depth_mm: float) -> str:
         """Return a depth in words, in the unit of the set: "892.857 mm", "disparity -3.25 px", "depth 1.234"."""

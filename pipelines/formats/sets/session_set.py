@@ -172,11 +172,21 @@ def nominal_view(stop: Stop, centre: Stop, names: list[str], homing: int) -> Vie
 
 
 def with_measured_geometry(elemental_set: ElementalSet, path: Path) -> ElementalSet:
-    """Return a set with the lens of a geometry.json, each view at its node's measured pose; BadValue if one lacks."""
+    """Return a set with the lens of a geometry.json, each view at its node's measured pose; BadValue if one lacks.
+
+    Poses that were found by the views go with the lens of the set.
+    """
     path = path / GEOMETRY_FILE if is_folder(path) else path
     geometry, settings = read_geometry(path, CameraPoses), elemental_set.settings
     poses = {entry.node: entry.rt_cam_ref for entry in geometry.nodes}
     _check_match(path, geometry, elemental_set)
+    if geometry.source == "views":
+        views = [
+            msgspec.structs.replace(view, rt_cam_ref=poses[node])
+            for view, node in zip(settings.view, elemental_set.nodes, strict=True)
+        ]
+        aligned = msgspec.structs.replace(settings, view=views)
+        return replace(elemental_set, settings=aligned, measured_in=path, poses="aligned")
     stated = ("fx_px", "fy_px", "cx_px", "cy_px", "distortion")
     camera = msgspec.structs.replace(settings.camera, **{name: getattr(geometry.lens, name) for name in stated})
     shifts_mm = _homing_shifts_mm(path, geometry, elemental_set)
@@ -220,13 +230,14 @@ def _check_match(path: Path, geometry: CameraPoses, elemental_set: ElementalSet)
         raise BadValue(
             f"{path}: is of {geometry.size_px} px images, the set has {settings.camera.size_px}; use its own"
         )
-    missing = [view.image for view in settings.view if view.node not in nodes]
+    stated = elemental_set.nodes if geometry.source == "views" else [view.node for view in settings.view]
+    missing = [view.image for view, node in zip(settings.view, stated, strict=True) if node not in nodes]
     if missing:
         raise BadValue(
             f"{path}: has no pose for {len(missing)} of {len(settings.view)} views ({missing[0]} is the first); "
             "state the node of every view, and show a board at every node"
         )
-    reference = settings.view[settings.reference_view].node
+    reference = stated[settings.reference_view]
     if reference != geometry.reference_node:
         raise BadValue(
             f"{path}: its reference is node {list(geometry.reference_node)}, the set's is {reference}; "

@@ -96,7 +96,7 @@ def luminance(elemental_set: ElementalSet, bins: int) -> PinholeViews:
         (camera.fx_px / bins, camera.fy_px / bins),
         ((camera.cx_px + 0.5) / bins - 0.5, (camera.cy_px + 0.5) / bins - 0.5),
         between_pixels(plane_grid(elemental_set, 1.0).binned(bins)),
-        _nodes(elemental_set),
+        np.array(elemental_set.nodes),
         _mean_response(responses, undistorted),
         _noise_share(undistorted),
     )
@@ -264,14 +264,6 @@ def naming_range(elemental_set: ElementalSet, far: float, near: float, purpose: 
 
 def _between(elemental_set: ElementalSet, far: float, near: float) -> str:
     return f"between {elemental_set.depths_text(float(f'{1 / near:.4g}'), float(f'{1 / far:.4g}'), join=' and ')}"
-
-
-def _nodes(elemental_set: ElementalSet) -> NDArray[np.intp]:
-    """Return row and column of the node of each view; a row of views if no nodes are stated."""
-    views = elemental_set.settings.view
-    if any(view.node is None for view in views):
-        return np.array([(0, index) for index in range(len(views))])
-    return np.array([view.node for view in views])
 
 
 def _check_steps(views: PinholeViews, depths: NDArray[np.float64]) -> None:

@@ -83,6 +83,19 @@ def select_surface(options: Options) -> SurfaceRequest | None:
     return SurfaceRequest(ends, "px" if disparity_range_px else "mm", solver)
 
 
+def range_in_mm(elemental_set: ElementalSet, option: str, text: str) -> tuple[float, float]:
+    """Return a range NEAR:FAR in the unit of the set in mm, the nearest depth first.
+
+    Raises WrongUsage if it is no range, and BadValue if a disparity has no depth.
+    """
+    near_mm, far_mm = sorted(elemental_set.depth_in_mm(end) for end in _ends(option, text, "400:1500"))
+    if not 0 < near_mm < far_mm <= _FARTHEST_MM:
+        raise WrongUsage(
+            f"{option} {text}: is no range of depths in front of the camera; give NEAR:FAR, such as 400:1500"
+        )
+    return near_mm, far_mm
+
+
 def _ends(option: str, text: str, example: str) -> tuple[float, float]:
     parts = re.fullmatch(f"{_NUMBER}:{_NUMBER}", text)
     if parts is None or float(parts[1]) == float(parts[2]):

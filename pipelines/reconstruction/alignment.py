@@ -1,0 +1,221 @@
+"""Camera poses of a set by its views: the request, and what the views tell."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.calib.homography import (
+    fronto_parallel_rt_ref_plane,
+    image_lattice,
+    rotation_matrix,
+    transfer,
+    transfer_sigma_px,
+)
+from faintfield.pipelines.console import inform, progress, working
+from faintfield.pipelines.errors import BadValue
+from faintfield.pipelines.formats.results.alignment import AlignmentOptions
+from faintfield.pipelines.formats.results.geometry import COVARIANCE_FILE
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
+from faintfield.pipelines.reconstruction.depth.autofocus import searched_range_mm, views_of_search
+from faintfield.pipelines.reconstruction.depth.comparison import check_places
+from faintfield.pipelines.reconstruction.depth.search import check_views, default_bins, luminance, naming_range
+from faintfield.pipelines.reconstruction.operators import principal_shift
+from faintfield.recon.alignment.cameras import POSE, PosedViews, moved
+from faintfield.recon.alignment.estimate import Aligner, Alignment
+from faintfield.recon.alignment.light import Folds, Light, PlanesLight, SurfaceLight
+from faintfield.recon.alignment.prior import PosePrior
+from faintfield.recon.surface.estimate import found_range
+
+# Fewest views that are told apart from one another's noise.
+_MIN_VIEWS = 8
+
+# Errors of a stage's poses unless they are stated: translations relative to the distance of neighbours, and rotations;
+# and of poses that boards measured, since when little has changed but by homings.
+_STAGE_ERROR, _STAGE_RAD = 0.006, 3.5e-3
+_CHANGE, _CHANGE_RAD = 4e-4, 1e-4
+
+# Bins, on top of those of the finest pictures, in which the range of depths is found.
+_RANGE_BINS = 2
+
+# Step of a pose for derivatives.
+_STEP = 1e-6
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Standard deviations of the poses of nodes before the views are looked at."""
+
+    sigma_rad: float
+    sigma_mm: float
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """What the views of a set tell: the alignment, the depths it used or found, nearest first, and the bins' width."""
+
+    alignment: Alignment
+    depths_mm: list[float]
+    bins_px: int
+
+
+def assumed_errors(elemental_set: ElementalSet, options: AlignmentOptions) -> Errors:
+    """Return the errors of the poses: those stated, else what suits nominal or measured poses."""
+    measured = elemental_set.poses == "measured"
+    rad, share = (_CHANGE_RAD, _CHANGE) if measured else (_STAGE_RAD, _STAGE_ERROR)
+    return Errors(
+        1e-3 * options.rotation_error_mrad or rad,
+        options.position_error_mm or share * distance_of_neighbours(elemental_set),
+    )
+
+
+def distance_of_neighbours(elemental_set: ElementalSet) -> float:
+    """Return the median distance of a camera from its nearest neighbour, in the unit of the poses."""
+    centres = elemental_set.poses_rt_cam_ref[:, 3:]  # rotations change no distance from the reference
+    apart = np.linalg.norm(centres[:, np.newaxis] - centres, axis=2)
+    np.fill_diagonal(apart, np.inf)
+    return float(np.median(apart.min(axis=1)))
+
+
+def align_set(
+    elemental_set: ElementalSet,
+    out: Path,
+    depths_mm: Sequence[float],
+    range_mm: tuple[float, float] | None,
+    errors: Errors,
+) -> Aligned:
+    """Return the poses by the views, given light on planes at given depths, else on a surface in a range or any.
+
+    `out` is for a temporary file. Raises BadValue for too few or too small views, or two of one node, and
+    NothingInFocus if the views tell no depths, or shuffled ones agree as well.
+    """
+    check_views(elemental_set, "an alignment")
+    views = len(elemental_set.settings.view)
+    if views < _MIN_VIEWS:
+        raise BadValue(
+            f"{elemental_set.folder}: has {views} views, and an alignment needs at least {_MIN_VIEWS}; "
+            "capture more nodes"
+        )
+    if len(set(elemental_set.nodes)) < views:
+        raise BadValue(f"{elemental_set.folder}: two views are of one node; state a node of its own for each")
+    bins, shift = default_bins(elemental_set), principal_shift(elemental_set)
+    poses = elemental_set.poses_rt_cam_ref
+    posed = PosedViews(luminance(elemental_set, bins), poses, np.zeros((views, 2)) if shift is None else shift).at(
+        poses
+    )
+    folds = Folds.of(views)
+    light: Light
+    if depths_mm:
+        light, depths = PlanesLight(folds, [1 / depth for depth in depths_mm]), sorted(depths_mm)
+    else:
+        searched = range_mm or searched_range_mm(elemental_set)
+        check_places(views_of_search(elemental_set, searched, out), searched)
+        far, near = 1 / searched[1], 1 / searched[0]
+        if range_mm is None:
+            with naming_range(elemental_set, far, near), working("searching the range of depths"):
+                far, near = found_range(posed.binned(_RANGE_BINS).views, far, near)
+        light, depths = SurfaceLight(folds, far, near), [1 / near, 1 / far]
+        inform(
+            f"depths between {elemental_set.depths_text(*(float(f'{depth:.3g}') for depth in depths), join=' and ')}"
+        )
+    aligner = Aligner(posed, elemental_set.reference_view, _prior(elemental_set, errors), light)
+    for _ in progress(aligner.run(), "aligning views", aligner.total):
+        pass
+    return Aligned(aligner.result, depths, bins)
+
+
+def _prior(elemental_set: ElementalSet, errors: Errors) -> PosePrior:
+    nodes, reference = np.array(elemental_set.nodes), elemental_set.reference_view
+    known = _measured_covariance(elemental_set)
+    if known is None:
+        return PosePrior.of_grid(nodes, reference, errors.sigma_rad, errors.sigma_mm)
+    groups = [view.homing for view in elemental_set.settings.view]
+    return PosePrior.of_measurement(known, groups, reference, errors.sigma_rad, errors.sigma_mm)
+
+
+def _measured_covariance(elemental_set: ElementalSet) -> NDArray[np.float64] | None:
+    """Return the covariance of all poses but the reference's that boards measured; None if it is not at hand."""
+    if elemental_set.poses != "measured" or elemental_set.measured_in is None:
+        return None
+    path = elemental_set.measured_in.with_name(COVARIANCE_FILE)
+    if not path.is_file():
+        return None
+    with np.load(path, allow_pickle=False) as arrays:
+        covariance, nodes, lens = arrays["covariance"], arrays["nodes"].tolist(), len(arrays["intrinsics"])
+    others = [node for number, node in enumerate(elemental_set.nodes) if number != elemental_set.reference_view]
+    rows = np.concatenate([lens + POSE * nodes.index(list(node)) + np.arange(POSE) for node in others])
+    return np.asarray(covariance[np.ix_(rows, rows)], np.float64)
+
+
+@dataclass(frozen=True)
+class PoseUncertainty:
+    """Covariance of the numbers of all poses (6·view, square), zero for the reference's, and σ of each view.
+
+    `sigma_rad` and `sigma_mm` (view,) are of orientation and centre, each the root of the trace.
+    """
+
+    covariance: NDArray[np.float64]
+    sigma_rad: NDArray[np.float64]
+    sigma_mm: NDArray[np.float64]
+
+
+def pose_uncertainty(alignment: Alignment, reference: int) -> PoseUncertainty:
+    """Return the uncertainty of poses, by first-order propagation of that of their steps."""
+    poses = alignment.rt_cam_ref
+    others = np.delete(np.arange(len(poses)), reference)
+    rows = (POSE * others[:, np.newaxis] + np.arange(POSE)).ravel()
+    of_steps = np.zeros((POSE * len(poses),) * 2)
+    of_steps[np.ix_(rows, rows)] = alignment.covariance
+    numbers, centres = np.zeros_like(of_steps), np.zeros((3 * len(poses), POSE * len(poses)))
+    for view in range(len(poses)):
+        part = slice(POSE * view, POSE * (view + 1))
+        for axis in range(POSE):
+            step = np.zeros((1, POSE))
+            step[0, axis] = _STEP
+            ahead, behind = moved(poses[view : view + 1], step)[0], moved(poses[view : view + 1], -step)[0]
+            numbers[part, POSE * view + axis] = (ahead - behind) / (2 * _STEP)
+            centres[3 * view : 3 * view + 3, POSE * view + axis] = (_centre(ahead) - _centre(behind)) / (2 * _STEP)
+    variances = np.diag(of_steps).reshape(-1, POSE)
+    of_centres = np.einsum("ij,jk,ik->i", centres, of_steps, centres).reshape(-1, 3)
+    return PoseUncertainty(
+        numbers @ of_steps @ numbers.T,
+        np.sqrt(variances[:, :3].sum(axis=1)),
+        np.sqrt(np.maximum(of_centres.sum(axis=1), 0)),
+    )
+
+
+def _centre(rt_cam_ref: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(-rotation_matrix(rt_cam_ref).T @ rt_cam_ref[3:])
+
+
+def shifts_px(
+    elemental_set: ElementalSet, before: NDArray[np.float64], after: NDArray[np.float64], depth_mm: float
+) -> NDArray[np.float64]:
+    """Return how the picture of a plane at a depth moves in each view, at some of its pixels (view, point, 2).
+
+    `before` and `after` are the poses (view, 6).
+    """
+    plane, pixels = fronto_parallel_rt_ref_plane(depth_mm), image_lattice(elemental_set.lens.size_px)
+    lens = elemental_set.lens
+    return np.array(
+        [
+            transfer(lens, new, plane, pixels) - transfer(lens, old, plane, pixels)
+            for old, new in zip(before, after, strict=True)
+        ]
+    )
+
+
+def transfer_sigmas_px(
+    elemental_set: ElementalSet, alignment: Alignment, uncertainty: PoseUncertainty, depth_mm: float
+) -> float:
+    """Return σ of the transfer between views by a plane at a depth, rms over views and image, as boards' is stated."""
+    lens, reference = elemental_set.lens, elemental_set.reference_view
+    size = len(lens.parameters) + POSE
+    covariances = np.zeros((len(alignment.rt_cam_ref), size, size))
+    for view, of_view in enumerate(covariances):
+        part = slice(POSE * view, POSE * (view + 1))
+        of_view[-POSE:, -POSE:] = uncertainty.covariance[part, part]
+    sigma_px = transfer_sigma_px(lens, alignment.rt_cam_ref, list(covariances), fronto_parallel_rt_ref_plane(depth_mm))
+    return float(np.sqrt(np.nanmean(np.delete(sigma_px, reference, axis=0) ** 2)))

@@ -1,0 +1,187 @@
+"""Camera poses by the views of a set or session, with their record, files and page: `faintfield align`."""
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from msgspec import UNSET, UnsetType
+from numpy.typing import NDArray
+
+from faintfield.pipelines.arguments import SceneKind
+from faintfield.pipelines.console import inform
+from faintfield.pipelines.errors import OutputExists
+from faintfield.pipelines.formats.files import check_results_folder, exclusive, remove
+from faintfield.pipelines.formats.provenance import provenance
+from faintfield.pipelines.formats.results.alignment import (
+    ALIGNMENT_FOLDER,
+    ALIGNMENT_PAGE,
+    AlignmentOptions,
+    AlignmentRecord,
+    HeldOutGain,
+    PoseErrors,
+    ViewChange,
+)
+from faintfield.pipelines.formats.results.geometry import (
+    COVARIANCE_FILE,
+    GEOMETRY_FILE,
+    LensRecord,
+    NodeRecord,
+    write_geometry,
+)
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, check_exists
+from faintfield.pipelines.pages.alignment_page import alignment_page
+from faintfield.pipelines.reconstruction.alignment import (
+    Aligned,
+    PoseUncertainty,
+    align_set,
+    assumed_errors,
+    pose_uncertainty,
+    shifts_px,
+    transfer_sigmas_px,
+)
+from faintfield.pipelines.reconstruction.surface.request import range_in_mm
+from faintfield.pipelines.workflows.reconstruct import open_set
+from faintfield.recon.alignment.cameras import moved
+from faintfield.recon.errors import NothingInFocus
+
+
+class AlignmentSummary(msgspec.Struct, frozen=True):
+    """The result of `faintfield align`: whether the views gave better poses, and the main figures of geometry.json."""
+
+    accepted: bool
+    reason: str
+    out: str | UnsetType = UNSET
+    report: str | UnsetType = UNSET
+    gain: HeldOutGain | UnsetType = UNSET
+    errors_found: PoseErrors | UnsetType = UNSET
+    transfer_sigma_px: dict[str, float] | UnsetType = UNSET
+
+
+def align_views(
+    folder: Path,
+    out: Path | None = None,
+    *,
+    depth: Sequence[float] = (),
+    depth_range: str | None = None,
+    geometry: Path | None = None,
+    scene: SceneKind = "dark_scene",
+    position_error: float = 0.0,
+    rotation_error_mrad: float = 0.0,
+) -> AlignmentSummary:
+    """Find the poses of a set or session by its views, and write them with their page if they are better.
+
+    Raises
+    ------
+    InputError, ReconstructionError
+        The set cannot be used, or its depths do not suit it.
+    """
+    check_exists(folder)
+    out = out or folder / ALIGNMENT_FOLDER
+    check_results_folder(out)
+    elemental_set, _ = open_set(folder, out, scene, geometry)
+    if elemental_set.measured_in is not None and out.resolve() == elemental_set.measured_in.parent.resolve():
+        raise OutputExists(f"{out}: holds the geometry.json that the alignment starts from; name another --out")
+    depths_mm = [elemental_set.depth_in_mm(value) for value in depth]
+    range_mm = None if depth_range is None else range_in_mm(elemental_set, "--depth-range", depth_range)
+    asked = AlignmentOptions(tuple(depths_mm), range_mm, position_error, rotation_error_mrad, elemental_set.poses)
+    errors = assumed_errors(elemental_set, asked)
+    options = msgspec.structs.replace(
+        asked, position_error_mm=errors.sigma_mm, rotation_error_mrad=1e3 * errors.sigma_rad
+    )
+    try:
+        aligned = align_set(elemental_set, out, depths_mm, range_mm, errors)
+    except NothingInFocus as failure:
+        return _unchanged(out, f"the views tell no poses: {failure}")
+    gain = HeldOutGain(**vars(aligned.alignment.gain))
+    if not aligned.alignment.gain.sure:
+        better = (
+            f"held-out pixels are predicted better by {gain.value:.3g} ± {gain.sigma:.3g} nats, which may be chance"
+        )
+        return msgspec.structs.replace(_unchanged(out, f"the poses stay as they are: {better}"), gain=gain)
+    record, uncertainty = _record(elemental_set, aligned, options)
+    page = alignment_page(record, aligned.alignment.pictures, elemental_set.units.tone_curve)
+    write_geometry(out, record, {COVARIANCE_FILE: _covariance_file(elemental_set, uncertainty), ALIGNMENT_PAGE: page})
+    _inform_of(record)
+    figures = {name: getattr(record, name) for name in ("gain", "errors_found", "transfer_sigma_px")}
+    said = f"the new poses predict held-out pixels better by {gain.value:.3g} ± {gain.sigma:.2g} nats"
+    return AlignmentSummary(True, said, str(out), str(out / ALIGNMENT_PAGE), **figures)
+
+
+def _unchanged(out: Path, reason: str) -> AlignmentSummary:
+    """Say that there are no new poses, and remove those of an earlier call."""
+    with exclusive(out):
+        remove(out / GEOMETRY_FILE)
+    inform(reason)
+    return AlignmentSummary(False, reason)
+
+
+def _record(
+    elemental_set: ElementalSet, aligned: Aligned, options: AlignmentOptions
+) -> tuple[AlignmentRecord, PoseUncertainty]:
+    alignment, reference = aligned.alignment, elemental_set.reference_view
+    uncertainty = pose_uncertainty(alignment, reference)
+    middle_mm = float(2 / (1 / aligned.depths_mm[0] + 1 / aligned.depths_mm[-1]))
+    before, after = elemental_set.poses_rt_cam_ref, alignment.rt_cam_ref
+    shifts = shifts_px(elemental_set, before, after, middle_mm)
+    left = shifts_px(elemental_set, moved(after, -alignment.last_steps), after, middle_mm)
+    camera, nodes = elemental_set.settings.camera, elemental_set.nodes
+    turns = alignment.steps[:, 2]
+    record = AlignmentRecord(
+        source="views",
+        lens=LensRecord("opencv", camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, tuple(camera.distortion)),
+        size_px=camera.size_px,
+        reference_node=nodes[reference],
+        nodes=[
+            NodeRecord(node, tuple(pose), sigma_mm, sigma_rad)
+            for node, pose, sigma_mm, sigma_rad in zip(
+                nodes, after.tolist(), uncertainty.sigma_mm.tolist(), uncertainty.sigma_rad.tolist(), strict=True
+            )
+        ],
+        views=[
+            ViewChange(node, _mean_shift(shift), float(turn), float(np.sqrt(np.nanmean(np.sum(rest**2, axis=1)))))
+            for node, shift, turn, rest in zip(nodes, shifts, turns, left, strict=True)
+        ],
+        gain=HeldOutGain(**vars(alignment.gain)),
+        errors_assumed=PoseErrors(1e-3 * options.rotation_error_mrad, options.position_error_mm),
+        errors_found=PoseErrors(alignment.prior.sigma_rad, alignment.prior.sigma_mm),
+        dispersion=alignment.dispersion,
+        rounds=len(alignment.rounds),
+        bins_px=aligned.bins_px,
+        transfer_sigma_px={
+            elemental_set.depth_text(float(f"{depth:.3g}")): transfer_sigmas_px(
+                elemental_set, alignment, uncertainty, depth
+            )
+            for depth in (aligned.depths_mm[0], aligned.depths_mm[-1])
+        },
+        **provenance("align", options, elemental_set.input_hashes(), elemental_set.units).parts(),
+    )
+    return record, uncertainty
+
+
+def _mean_shift(shift: NDArray[np.float64]) -> tuple[float, float]:
+    right, down = np.nanmean(shift, axis=0).tolist()
+    return right, down
+
+
+def _covariance_file(elemental_set: ElementalSet, uncertainty: PoseUncertainty) -> bytes:
+    """Return the covariance as that of boards is written: of the lens, which is taken as known, and of all poses."""
+    lens = elemental_set.lens.parameters
+    covariance = np.zeros((len(lens) + len(uncertainty.covariance),) * 2)
+    covariance[len(lens) :, len(lens) :] = uncertainty.covariance
+    content = io.BytesIO()
+    np.savez_compressed(content, covariance=covariance, nodes=np.array(elemental_set.nodes), intrinsics=lens)
+    return content.getvalue()
+
+
+def _inform_of(record: AlignmentRecord) -> None:
+    shifts = np.array([view.shift_px for view in record.views])
+    turns = np.degrees([view.turn_rad for view in record.views])
+    inform(
+        f"views move by {np.sqrt(np.mean(np.sum(shifts**2, axis=1))):.2f} px rms, at most "
+        f"{np.abs(shifts).max():.2f} px, and turn by up to {np.abs(turns).max():.2f}°"
+    )
+    known = ", ".join(f"{sigma:.2f} px at {depth}" for depth, sigma in record.transfer_sigma_px.items())
+    inform(f"transfer between views known to {known}")
+    inform(f"held-out pixels are predicted better by {record.gain.value:.3g} ± {record.gain.sigma:.2g} nats")

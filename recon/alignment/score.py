@@ -1,0 +1,209 @@
+"""How the likelihood of each view changes with its pose, and with changes of the scene that all views share."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.recon.alignment.cameras import POSE, PosedViews, motion, motion_of_step
+from faintfield.recon.alignment.light import Layer, Light, depth_shapes
+from faintfield.recon.likelihood.images import Image
+from faintfield.recon.operator.surface_operator import homographies_of_surface
+from faintfield.recon.threads import map_in_threads
+
+# Pixels along the edges of a view that do not count, where a blurred picture is not that of the scene.
+_BORDER = 2
+
+# Errors beyond this many standard deviations count less (Huber); median of a squared normal error of variance 1.
+_LARGE, _MEDIAN_SQUARE = 3.0, 0.455
+
+# A view counts less if its gradient scatters this many times more than that of all views.
+_ODD = 4.0
+
+
+@dataclass(frozen=True)
+class Score:
+    """Gradient and information of the log-likelihood of each view, by the step of its pose and by changes of the scene.
+
+    The latter are motions of the light in its picture, six as those of a camera, then `depth_shapes`.
+
+    Attributes
+    ----------
+    gradient, information : float array (view, parameter), (view, parameter, parameter)
+        Divided by the dispersion.
+    dispersion : float
+        Variance of the gradient relative to what the noise explains, by its scatter over cells of the pictures; ≥ 1.
+    """
+
+    gradient: NDArray[np.float64]
+    information: NDArray[np.float64]
+    dispersion: float
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Square cells of the pictures, and those (view, row of cells, column of cells) that are held out.
+
+    A cell has a side of `side_px` pixels of the finest pictures.
+    """
+
+    side_px: int
+    held_out: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, shape: tuple[int, int, int], side_px: int, share: float) -> "Cells":
+        """Return cells of pictures (view, row, column), a share of which is held out."""
+        views, rows, columns = shape
+        generator = np.random.default_rng(0)
+        return cls(side_px, generator.random((views, -(-rows // side_px), -(-columns // side_px))) < share)
+
+    def none_held_out(self) -> "Cells":
+        """Return the same cells, all of which count."""
+        return Cells(self.side_px, np.zeros_like(self.held_out))
+
+    def pixels(self, view: int, shape: tuple[int, int], bins: int) -> NDArray[np.bool_]:
+        """Return the pixels (row, column) of held-out cells in a picture of bins."""
+        cells = self.held_out[view]
+        rows, columns = (
+            np.minimum(np.arange(size) * bins // self.side_px, count - 1)
+            for size, count in zip(shape, cells.shape, strict=True)
+        )
+        return np.asarray(cells[np.ix_(rows, columns)])
+
+    def sums(self, values: Image, bins: int) -> NDArray[np.float64]:
+        """Return sums (number, cell) of values (number, row, column) over whole cells."""
+        side = max(self.side_px // bins, 1)
+        count, rows, columns = values.shape
+        down, right = rows // side, columns // side
+        whole = values[:, : down * side, : right * side].reshape(count, down, side, right, side)
+        return np.asarray(whole.sum(axis=(2, 4)).reshape(count, -1), np.float64)
+
+
+def score(posed: PosedViews, light: Light, cells: Cells, precision: NDArray[np.float64], bins: int) -> Score:
+    """Return the score of all views at their poses, without the cells that are held out.
+
+    `precision` (6,) is that of a step before the views are looked at, and `bins` the width of the pictures' bins.
+    """
+    views, count = posed.views, len(posed.rt_cam_ref)
+    rays = views.rays()
+    at_infinity, slopes = homographies_of_surface(views.ray_from_surface)
+    results: dict[int, tuple[NDArray[np.float64], NDArray[np.float64], float]] = {}
+
+    def work(item: tuple[int, list[Layer], NDArray[np.bool_]]) -> None:
+        view, layers, seen = item
+        camera = rays + posed.principal_shift[view].astype(np.float32)
+        parts: list[Image] = []
+        for layer in layers:
+            directions = _directions(rays, at_infinity[view], slopes[view], layer.inverse_depth)
+            fields = [
+                motion(camera[..., 0], camera[..., 1], layer.inverse_depth),
+                motion(*directions, layer.inverse_depth),
+            ]
+            if light.smooth_depth:
+                fields.append(_parallax(rays, views.ray_from_surface[view, :, 3], directions, layer.inverse_depth))
+            parts.append(_derivative(layer, np.concatenate(fields, axis=1), views.focal_px))
+        derivative = np.sum(parts, axis=0) if len(parts) > 1 else parts[0]
+        expected = np.sum([layer.picture for layer in layers], axis=0, dtype=np.float32)
+        usable = _inside(seen) & ~cells.pixels(view, expected.shape, bins)
+        weight, error = _weights(usable, views.light_e[view] - expected, views.pixel_variance(expected))
+        flat = derivative.reshape(len(derivative), -1)
+        weighted = flat * weight.ravel()
+        to_motion = np.eye(len(flat))
+        to_motion[:POSE, :POSE] = motion_of_step(posed.rt_cam_ref[view])
+        gradient = to_motion.T @ (weighted @ error.ravel())
+        information = to_motion.T @ (weighted @ flat.T) @ to_motion
+        own = information[:POSE, :POSE]
+        step = to_motion[:POSE, :POSE] @ np.linalg.solve(own + np.diag(precision), gradient[:POSE])
+        left = error.ravel() - step.astype(np.float32) @ flat[:POSE]
+        of_cells = to_motion[:POSE, :POSE].T @ cells.sums((weighted[:POSE] * left).reshape(POSE, *error.shape), bins)
+        scatter = float(np.sum(of_cells * (np.linalg.pinv(own, hermitian=True) @ of_cells))) / POSE
+        results[view] = gradient, information, scatter
+
+    for item in _layers_of_folds(light):
+        map_in_threads(work, item)
+    gradients, informations, scatters = (
+        np.array(part) for part in zip(*(results[n] for n in range(count)), strict=True)
+    )
+    odd = scatters > _ODD * np.median(scatters)
+    typical = max(1.0, float(scatters[~odd].mean()))
+    dispersion = np.maximum(typical, scatters / _ODD)
+    return Score(gradients / dispersion[:, None], informations / dispersion[:, None, None], typical)
+
+
+def log_likelihood(posed: PosedViews, light: Light, cells: Cells) -> NDArray[np.float32]:
+    """Return the log-likelihood of each pixel (view, row, column) that is held out, up to a constant; NaN of others."""
+    views = posed.views
+    found = np.full_like(views.light_e, np.nan)
+
+    def work(item: tuple[int, list[Layer], NDArray[np.bool_]]) -> None:
+        view, layers, seen = item
+        expected = np.sum([layer.picture for layer in layers], axis=0, dtype=np.float32)
+        usable = _inside(seen) & cells.pixels(view, expected.shape, 1)
+        variance = views.pixel_variance(expected)
+        error = np.where(usable, views.light_e[view] - expected, np.float32(0))
+        found[view] = np.where(usable, -0.5 * (error**2 / variance + np.log(variance)), np.float32(np.nan))
+
+    for item in _layers_of_folds(light):
+        map_in_threads(work, item)
+    return found
+
+
+def _layers_of_folds(light: Light) -> Iterator[list[tuple[int, list[Layer], NDArray[np.bool_]]]]:
+    """Yield the views of each fold, with their layers and the pixels that see them."""
+    for fold in light.folds.numbers:
+        layers, seen = light.layers(fold)
+        yield [
+            (int(view), [layer.of_view(number) for layer in layers], seen[number])
+            for number, view in enumerate(light.folds.views(fold))
+        ]
+
+
+def _inside(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    inside = np.zeros_like(seen)
+    part = slice(_BORDER, -_BORDER)
+    inside[part, part] = seen[part, part]
+    return inside
+
+
+def _weights(usable: NDArray[np.bool_], error: Image, variance: Image) -> tuple[Image, Image]:
+    """Return weights and errors of pixels (row, column), zero where they are not usable.
+
+    A weight is the inverse variance, of the noise or, where it is larger, of all errors; less for large errors.
+    """
+    weight = np.where(usable, 1 / variance, np.float32(0))
+    error = np.where(usable, error, np.float32(0))
+    squares = (weight * error**2)[usable]
+    weight /= np.float32(max(1.0, float(np.median(squares)) / _MEDIAN_SQUARE if squares.size else 1.0))
+    weight *= np.minimum(1, _LARGE / np.maximum(np.abs(error) * np.sqrt(weight), np.float32(1e-6)))
+    return weight, error
+
+
+def _directions(
+    rays: Image, at_infinity: NDArray[np.float64], slope: NDArray[np.float64], inverse_depth: Image | float
+) -> tuple[Image, Image]:
+    """Return the directions x and y (row, column) in which the reference view sees what the pixels of a view see."""
+    x, y, q = rays[..., 0], rays[..., 1], np.float32(1) * inverse_depth
+    (a, b, c), (d, e, f) = at_infinity.astype(np.float32), slope.astype(np.float32)
+    scale = 1 / (c[0] * x + c[1] * y + c[2] + q * (f[0] * x + f[1] * y + f[2]))
+    first = a[0] * x + a[1] * y + a[2] + q * (d[0] * x + d[1] * y + d[2])
+    second = b[0] * x + b[1] * y + b[2] + q * (e[0] * x + e[1] * y + e[2])
+    return first * scale, second * scale
+
+
+def _parallax(
+    rays: Image, translation: NDArray[np.float64], directions: tuple[Image, Image], inverse_depth: Image | float
+) -> Image:
+    """Return how a ray (x, y, 1) moves with each of the `depth_shapes`: (2, shape, row, column)."""
+    x, y, z = translation.astype(np.float32)
+    moved = np.stack([x - rays[..., 0] * z, y - rays[..., 1] * z])
+    shapes = depth_shapes(*directions, np.broadcast_to(np.float32(inverse_depth), directions[0].shape))
+    return moved[:, np.newaxis] * shapes
+
+
+def _derivative(layer: Layer, fields: Image, focal_px: tuple[float, float]) -> Image:
+    """Return the derivative (parameter, row, column) of a picture whose rays move by fields (2, parameter, …)."""
+    along_rows, along_columns = np.gradient(layer.picture)
+    along_rows *= np.float32(-focal_px[1] * layer.gain[0])
+    along_columns *= np.float32(-focal_px[0] * layer.gain[1])
+    return np.asarray(along_columns * fields[0] + along_rows * fields[1], np.float32)
