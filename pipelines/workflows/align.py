@@ -96,10 +96,9 @@ def align_views(
         return _unchanged(out, f"the views tell no poses: {failure}")
     gain = HeldOutGain(**vars(aligned.alignment.gain))
     if not aligned.alignment.gain.sure:
-        better = (
-            f"held-out pixels are predicted better by {gain.value:.3g} ± {gain.sigma:.3g} nats, which may be chance"
-        )
-        return msgspec.structs.replace(_unchanged(out, f"the poses stay as they are: {better}"), gain=gain)
+        found = f"log-likelihood of held-out pixels {gain.value:+.3g} ± {gain.sigma:.2g}"
+        why = f"the poses stay as they are: the views give none that are better beyond chance ({found})"
+        return msgspec.structs.replace(_unchanged(out, why), gain=gain)
     record, uncertainty = _record(elemental_set, aligned, options)
     page = alignment_page(record, aligned.alignment.pictures, elemental_set.units.tone_curve)
     write_geometry(out, record, {COVARIANCE_FILE: _covariance_file(elemental_set, uncertainty), ALIGNMENT_PAGE: page})

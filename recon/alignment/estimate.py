@@ -151,7 +151,7 @@ class Aligner:
         """Do all rounds, and yield each; then `result` is known."""
         self._light.find_depth(self._binned[_DEPTH_BINS].views)
         finest = self._binned[1]
-        self._light.fit(finest.views)
+        self._light.fit(finest.views, afresh=True)
         before = log_likelihood(finest, self._light, self._cells)
         picture = self._light.picture()
         for level in _LEVELS:
@@ -162,7 +162,7 @@ class Aligner:
                 yield self.rounds[-1]
                 if self.rounds[-1].step < _SMALL_STEP:
                     break
-        self._light.fit(self._at(1).views)
+        self._light.fit(self._at(1).views, afresh=True)
         after = log_likelihood(self._at(1), self._light, self._cells)
         gain = self._gain(np.nan_to_num(after - before))
         solution, last = self._round(1, _LEVELS[-1].blurs[-1], self._cells.none_held_out(), estimate_variances=True)

@@ -86,8 +86,11 @@ class Light(Protocol):
     def change_depth(self, change: NDArray[np.float64]) -> None:
         """Add `depth_shapes` times `change` to 1/depth, if it is not given."""
 
-    def fit(self, views: PinholeViews, blur: float = 0.0) -> None:
-        """Find the light of each fold from the views of the others; `layers` are blurred by `blur` pixels."""
+    def fit(self, views: PinholeViews, blur: float = 0.0, *, afresh: bool = False) -> None:
+        """Find the light of each fold from the views of the others; `layers` are blurred by `blur` pixels.
+
+        `afresh` makes no use of the light of earlier calls, so that the lights of two calls can be compared.
+        """
 
     def layers(self, fold: int) -> tuple[list[Layer], NDArray[np.bool_]]:
         """Return the light in the views of a fold, and which of their pixels (view, row, column) see it."""
@@ -121,7 +124,7 @@ class SurfaceLight:
         shapes = depth_shapes(x, y, self._inverse_depth)
         self._inverse_depth = np.maximum(self._inverse_depth + np.tensordot(change, shapes, 1), 0)
 
-    def fit(self, views: PinholeViews, blur: float = 0.0) -> None:
+    def fit(self, views: PinholeViews, blur: float = 0.0, *, afresh: bool = False) -> None:
         """Take for each fold the mean of the other views on the surface, denoised."""
         self._operator = operator = views.surface_operator(_enlarged(self._inverse_depth, views.grid.shape))
         self._inverse_depths, self._usable, self._blur = (
@@ -177,7 +180,7 @@ class PlanesLight:
     def change_depth(self, change: NDArray[np.float64]) -> None:
         """Do nothing: the depths are given."""
 
-    def fit(self, views: PinholeViews, blur: float = 0.0) -> None:
+    def fit(self, views: PinholeViews, blur: float = 0.0, *, afresh: bool = False) -> None:
         """Take for each fold a few passes of PMLEM over the other views, from the light of the last call."""
         at_infinity, slopes = homographies_of_surface(views.ray_from_surface)
         homographies = np.stack([at_infinity + slopes * q for q in self._inverse_depths])
@@ -192,7 +195,8 @@ class PlanesLight:
         weight, level_e = universal_penalty_weight(operator, images, start), mean_light_e(operator, start)
         self._lights = []
         for fold in self.folds.numbers:
-            last, dual = self._last.get((fold, start.size), (start, problem.dual()))
+            new = start, problem.dual()
+            last, dual = new if afresh else self._last.get((fold, start.size), new)
             fit = problem.fit(level_e, self.folds.others(fold))
             iterates = pmlem(fit, np.maximum(last, 1e-3 * start), penalty_weight=weight, dual=dual)
             for _ in range(_PASSES):
