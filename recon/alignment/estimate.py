@@ -35,8 +35,8 @@ _DEPTH_BINS = 2
 # Steps of the variances in each round; step relative to its standard deviation below which a level is done.
 _VARIANCE_STEPS, _SMALL_STEP = 3, 0.15
 
-# Side of a cell in pixels of the finest pictures, and share of the cells that are held out.
-_CELL_PX, _HELD_OUT = 32, 0.12
+# Share of the cells that are held out.
+_HELD_OUT = 0.12
 
 # Standard errors by which the gain on held-out pixels must exceed zero.
 _SURE = 3.0
@@ -139,7 +139,7 @@ class Aligner:
         self._others = np.delete(np.arange(len(posed.rt_cam_ref)), reference)
         self._start, self._poses, self._prior = posed.rt_cam_ref, posed.rt_cam_ref.copy(), prior
         self._binned = {level.bins: posed.binned(level.bins) for level in _LEVELS}
-        self._cells = Cells.of(posed.views.light_e.shape, _CELL_PX, _HELD_OUT)
+        self._cells = Cells.of(posed.views.light_e.shape, _HELD_OUT)
         self.rounds: list[Round] = []
 
     @property
@@ -162,6 +162,7 @@ class Aligner:
                 yield self.rounds[-1]
                 if self.rounds[-1].step < _SMALL_STEP:
                     break
+        self._light.find_depth(self._at(_DEPTH_BINS).views)  # as at first: a depth that was adapted would be better
         self._light.fit(self._at(1).views, afresh=True)
         after = log_likelihood(self._at(1), self._light, self._cells)
         gain = self._gain(np.nan_to_num(after - before))

@@ -18,6 +18,13 @@ _BORDER = 2
 # Errors beyond this many standard deviations count less (Huber); median of a squared normal error of variance 1.
 _LARGE, _MEDIAN_SQUARE = 3.0, 0.455
 
+# Side of a cell, and half of it where fewer would be held out.
+_SIDE_PX, _MIN_CELLS = 16, 300
+
+# Side of squares of cells over which the scatter of the gradient is measured: errors of light and depth are alike in
+# neighbouring pixels.
+_SCATTER_CELLS = 2
+
 # A view counts less if its gradient scatters this many times more than that of all views.
 _ODD = 4.0
 
@@ -45,16 +52,17 @@ class Score:
 class Cells:
     """Square cells of the pictures, and those (view, row of cells, column of cells) that are held out.
 
-    A cell has a side of `side_px` pixels of the finest pictures.
+    A cell has a side of `side_px` pixels of the finest pictures, a multiple of the bins of all pictures.
     """
 
     side_px: int
     held_out: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, shape: tuple[int, int, int], side_px: int, share: float) -> "Cells":
-        """Return cells of pictures (view, row, column), a share of which is held out."""
+    def of(cls, shape: tuple[int, int, int], share: float) -> "Cells":
+        """Return cells of pictures (view, row, column), smaller ones if few; a share of them is held out."""
         views, rows, columns = shape
+        side_px = _SIDE_PX if share * views * rows * columns >= _MIN_CELLS * _SIDE_PX**2 else _SIDE_PX // 2
         generator = np.random.default_rng(0)
         return cls(side_px, generator.random((views, -(-rows // side_px), -(-columns // side_px))) < share)
 
@@ -71,9 +79,9 @@ class Cells:
         )
         return np.asarray(cells[np.ix_(rows, columns)])
 
-    def sums(self, values: Image, bins: int) -> NDArray[np.float64]:
-        """Return sums (number, cell) of values (number, row, column) over whole cells."""
-        side = max(self.side_px // bins, 1)
+    def sums(self, values: Image, bins: int, cells: int = 1) -> NDArray[np.float64]:
+        """Return sums (number, square) of values (number, row, column) over whole squares of `cells` by `cells`."""
+        side = max(self.side_px * cells // bins, 1)
         count, rows, columns = values.shape
         down, right = rows // side, columns // side
         whole = values[:, : down * side, : right * side].reshape(count, down, side, right, side)
@@ -116,7 +124,9 @@ def score(posed: PosedViews, light: Light, cells: Cells, precision: NDArray[np.f
         own = information[:POSE, :POSE]
         step = to_motion[:POSE, :POSE] @ np.linalg.solve(own + np.diag(precision), gradient[:POSE])
         left = error.ravel() - step.astype(np.float32) @ flat[:POSE]
-        of_cells = to_motion[:POSE, :POSE].T @ cells.sums((weighted[:POSE] * left).reshape(POSE, *error.shape), bins)
+        of_cells = to_motion[:POSE, :POSE].T @ cells.sums(
+            (weighted[:POSE] * left).reshape(POSE, *error.shape), bins, _SCATTER_CELLS
+        )
         scatter = float(np.sum(of_cells * (np.linalg.pinv(own, hermitian=True) @ of_cells))) / POSE
         results[view] = gradient, information, scatter
 

@@ -1,0 +1,119 @@
+"""`align`: poses of a simulated set by its views, and nothing where the views tell none."""
+
+import shutil
+from json import loads
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.image_files import write_frame
+from faintfield.pipelines.formats.results.alignment import AlignmentRecord
+from faintfield.pipelines.formats.results.geometry import COVARIANCE_FILE, read_geometry
+from faintfield.pipelines.formats.sets.elemental_set import load_set
+from faintfield.pipelines.formats.sets.ground_truth import read_truth
+from faintfield.pipelines.formats.sets.session_set import with_measured_geometry
+from tests.pipelines.conftest import Command
+from tests.pipelines.forms import read_record
+
+GRID = ("--rows", 5, "--columns", 5, "--size-px", 160, 120, "--snr", 2, "--objects", "surfaces")
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from faintfield.pipelines.commands.simulation import simulate
+    from faintfield.pipelines.simulation.options import SyntheticOptions
+
+    out = tmp_path_factory.mktemp("aligned") / "set"
+    simulate(
+        out,
+        options=SyntheticOptions(
+            rows=5,
+            columns=5,
+            size_px=(160, 120),
+            snr=2.0,
+            objects="surfaces",
+            poses="nominal",
+            rotation_error_mrad=8.0,
+            seed=2,
+        ),
+    )
+    return out
+
+
+def test_poses_by_the_views_are_nearer_to_the_truth_by_what_they_state(
+    scene: Path, tmp_path: Path, done: Command
+) -> None:
+    printed = loads(done("align", scene, "--out", tmp_path / "aligned", "--json").stdout)
+    assert printed["accepted"]
+    record = read_geometry(tmp_path / "aligned", AlignmentRecord)
+    assert record.source == "views"
+    assert record.gain.value > 3 * record.gain.sigma
+
+    stated, truth = load_set(scene), read_truth(scene)
+    assert truth is not None
+    aligned = with_measured_geometry(stated, tmp_path / "aligned")
+    assert aligned.poses == "aligned"
+    assert aligned.settings.camera == stated.settings.camera
+    true = np.array(truth.true_rt_cam_ref)
+    others = np.delete(np.arange(25), stated.reference_view)
+    np.testing.assert_array_equal(aligned.poses_rt_cam_ref[stated.reference_view], true[stated.reference_view])
+
+    # Shifts of the picture at 700 mm, where a rotation and a translation take each other's place
+    def moved_px(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+        a, b, _, x, y, _ = (poses - true)[others].T
+        return stated.settings.camera.fx_px * np.column_stack([b + x / 700, y / 700 - a])
+
+    before, after = (np.sqrt(np.mean(moved_px(posed.poses_rt_cam_ref) ** 2)) for posed in (stated, aligned))
+    assert after < 0.35 * before
+
+    with np.load(tmp_path / "aligned" / COVARIANCE_FILE) as arrays:
+        covariance, lens = arrays["covariance"], len(arrays["intrinsics"])
+    rows = (lens + 6 * others[:, np.newaxis] + np.arange(6)).ravel()
+    errors = (aligned.poses_rt_cam_ref - true)[others].ravel()
+    assert 0.5 < errors @ np.linalg.solve(covariance[np.ix_(rows, rows)], errors) / len(errors) < 1.5
+
+    done("verify", tmp_path / "aligned", "--inputs", scene)
+    planes = ("--geometry", tmp_path / "aligned", "--depth-mm", 700, "--prior", "tv", "--out", tmp_path / "planes")
+    done("reconstruct", scene, *planes)
+    assert read_record(tmp_path / "planes")["options"]["poses"] == "aligned"
+
+
+def test_noise_alone_gives_no_poses_and_removes_earlier_ones(scene: Path, tmp_path: Path, faintfield: Command) -> None:
+    dark = tmp_path / "dark"
+    shutil.copytree(scene, dark)
+    generator = np.random.default_rng(1)
+    for view in dark.glob("view_*.tiff"):
+        shape = read_frame(view).pixels_dn.shape
+        write_frame(view, np.rint(100 + generator.normal(0, 7, shape)).astype(np.uint16))
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "geometry.json").write_text("{}")
+    ended = faintfield("align", dark, "--out", tmp_path / "out", "--json")
+    assert ended.returncode == 0
+    assert not loads(ended.stdout)["accepted"]
+    assert "the views tell no poses" in ended.stderr
+    assert not (tmp_path / "out" / "geometry.json").exists()
+
+
+def test_true_poses_stay(tmp_path: Path, done: Command) -> None:
+    done("simulate", tmp_path / "set", *GRID, "--seed", 3)
+    printed = loads(done("align", tmp_path / "set", "--depth-range", "500:1050", "--json").stdout)
+    assert not printed["accepted"]
+    assert "the poses stay as they are" in printed["reason"]
+    assert not (tmp_path / "set" / "alignment" / "geometry.json").exists()
+
+
+def test_few_views_and_a_range_that_is_none_are_refused(
+    simulated_scene: Path, scene: Path, tmp_path: Path, faintfield: Command
+) -> None:
+    few = tmp_path / "few"
+    shutil.copytree(simulated_scene, few)
+    text = (few / "elemental.toml").read_text()
+    head, *views = text.split("[[view]]")
+    (few / "elemental.toml").write_text("[[view]]".join([head, *views[:6]]))
+    ended = faintfield("align", few)
+    assert (ended.returncode, "6 views" in ended.stderr, "at least 8" in ended.stderr) == (1, True, True)
+    ended = faintfield("align", scene, "--depth-range", "800:800")
+    assert (ended.returncode, "--depth-range 800:800: is no range" in ended.stderr) == (2, True)

@@ -1,0 +1,94 @@
+"""Poses moved, and what is known of their errors; the whole of it is tested by `align` on a simulated set."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from faintfield.recon.alignment.cameras import motion, motion_of_step, moved, steps_between
+from faintfield.recon.alignment.light import Folds, gradient_gain, gradient_products
+from faintfield.recon.alignment.prior import PosePrior
+
+NODES = np.array([(row, column) for row in range(5) for column in range(5)])
+
+
+def matrix_exponential(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rotation matrix of a vector by the series of the exponential."""
+    x, y, z = vector
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    term, total = np.eye(3), np.eye(3)
+    for power in range(1, 25):
+        term = term @ cross / power
+        total = total + term
+    return total
+
+
+@given(st.lists(st.floats(-1, 1), min_size=12, max_size=12))
+def test_step_turns_in_the_frame_of_the_camera_and_steps_are_found_again(numbers: list[float]) -> None:
+    pose, step = np.array(numbers).reshape(2, 1, 6)
+    after = moved(pose, step)
+    wanted = matrix_exponential(step[0, :3]) @ matrix_exponential(pose[0, :3])
+    np.testing.assert_allclose(matrix_exponential(after[0, :3]), wanted, atol=1e-9)
+    np.testing.assert_allclose(after[0, 3:], pose[0, 3:] + step[0, 3:])
+    np.testing.assert_allclose(steps_between(pose, after), step, atol=1e-9)
+
+
+def test_motion_is_the_derivative_of_the_ray_by_the_step_of_a_pose() -> None:
+    generator = np.random.default_rng(3)
+    pose = np.concatenate([generator.normal(0, 0.3, 3), [120.0, -80.0, 30.0]])
+    points = generator.uniform((-300, -300, 600), (300, 300, 1200), (20, 3))
+
+    def rays(rt: NDArray[np.float64]) -> NDArray[np.float64]:
+        seen = points @ matrix_exponential(rt[:3]).T + rt[3:]
+        return seen[:, :2] / seen[:, 2:]
+
+    seen = points @ matrix_exponential(pose[:3]).T + pose[3:]
+    x, y = (seen[:, :2] / seen[:, 2:]).T
+    found = np.einsum("dmp,ms->dsp", motion(x, y, (1 / seen[:, 2]).astype(np.float32)), motion_of_step(pose))
+    for axis in range(6):
+        step = np.zeros((1, 6))
+        step[0, axis] = 1e-6
+        slope = (rays(moved(pose[np.newaxis], step)[0]) - rays(moved(pose[np.newaxis], -step)[0])) / 2e-6
+        np.testing.assert_allclose(found[:, axis].T, slope, rtol=2e-4, atol=2e-6)
+
+
+def test_variances_of_poses_are_found_from_errors_that_are_known() -> None:
+    generator = np.random.default_rng(1)
+    start = PosePrior.of_grid(NODES, 12, sigma_rad=3e-3, sigma_mm=0.3)
+    errors = generator.normal(size=(24, 6)) * np.repeat([5e-4, 0.05], 3)
+    prior = start
+    for _ in range(60):
+        prior = prior.updated(errors.ravel(), np.zeros((144, 144)))
+    assert prior.sigma_rad == pytest.approx(np.std(errors[:, :3]), rel=0.1)
+    assert prior.sigma_mm == pytest.approx(np.std(errors[:, 3:]), rel=0.1)
+    assert np.sqrt(prior.variances[2:] / start.variances[2:]).max() < 0.2  # there is no drift
+
+
+def test_shift_of_one_group_is_told_from_errors_of_single_views() -> None:
+    groups = [0] * 15 + [1] * 10
+    prior = PosePrior.of_measurement(np.zeros((144, 144)), groups, 12, sigma_rad=1e-4, sigma_mm=0.02)
+    errors = np.random.default_rng(2).normal(size=(24, 6)) * np.repeat([1e-4, 0.01], 3)
+    errors[14:, 3] += 0.4
+    for _ in range(60):
+        prior = prior.updated(errors.ravel(), np.zeros((144, 144)))
+    assert prior.sigma_mm == pytest.approx(0.01, rel=0.2)
+    assert np.sqrt(prior.variances[2]) == pytest.approx(0.4 / np.sqrt(3), rel=0.1)
+
+
+def test_gain_of_the_gradient_undoes_what_denoising_took() -> None:
+    generator = np.random.default_rng(4)
+    true = gaussian_filter(generator.normal(size=(60, 80)), 3) * 50
+    views = np.full(true.shape, 5.0, np.float32)
+    own = (5 * true + generator.normal(0, 1, true.shape)).astype(np.float32)
+    light = (true * [0.5]).astype(np.float32)
+    found = gradient_gain([gradient_products(light, own, views, views, blur=0.0)])
+    np.testing.assert_allclose(found, 2.0, rtol=0.05)
+
+
+@pytest.mark.parametrize("views", [8, 25, 49, 81])
+def test_each_view_is_in_one_fold_of_few(views: int) -> None:
+    folds = Folds.of(views)
+    assert sorted(np.concatenate([folds.views(fold) for fold in folds.numbers])) == list(range(views))
+    assert max(len(folds.views(fold)) for fold in folds.numbers) <= views / 3
