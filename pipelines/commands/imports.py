@@ -8,13 +8,13 @@ from faintfield.pipelines.formats.exchange.options import GridOptions, ImportOpt
 if TYPE_CHECKING:
     from faintfield.pipelines.formats.exchange.emva1288 import ImportedFrames
     from faintfield.pipelines.formats.exchange.imported_set import ImportedSet
-    from faintfield.pipelines.formats.exchange.picture_grid import ImportedGrid
+    from faintfield.pipelines.workflows.import_grid import AlignedGrid
 
 _DEFAULTS, _GRID_DEFAULTS = ImportOptions(), GridOptions()
 
 type Result = ImportedSet
 type Frames = ImportedFrames
-type Grid = ImportedGrid
+type Grid = AlignedGrid
 
 
 def import_grid(src: Path, out: Path, /, *, options: GridOptions = _GRID_DEFAULTS) -> Grid:
@@ -29,7 +29,8 @@ def import_grid(src: Path, out: Path, /, *, options: GridOptions = _GRID_DEFAULT
     A parameters.cfg of the HCI 4D benchmark beside the pictures gives the scale. Pictures of 16 bits are copied as they
     are, and floats become 16 bits by one factor. Those of 8 bits are taken to have the tone curve of sRGB, as
     photographs have; it is undone, and they become 16-bit TIFF. Gain and noise that are not given are estimated from
-    the views.
+    the views. Where the pictures show that the grid was not regular, the poses are found by the views, as by `align`,
+    whose page lies in OUT/alignment.
 
     Parameters
     ----------
@@ -39,9 +40,9 @@ def import_grid(src: Path, out: Path, /, *, options: GridOptions = _GRID_DEFAULT
     out
         Folder to write.
     """
-    from faintfield.pipelines.formats.exchange.picture_grid import import_pictures
+    from faintfield.pipelines.workflows.import_grid import import_and_align
 
-    return import_pictures(src, out, options)
+    return import_and_align(src, out, options)
 
 
 def import_colmap(src: Path, out: Path, /, *, options: ImportOptions = _DEFAULTS) -> Result:

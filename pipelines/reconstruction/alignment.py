@@ -30,7 +30,7 @@ from faintfield.recon.alignment.prior import PosePrior
 from faintfield.recon.surface.estimate import found_range
 
 # Fewest views that are told apart from one another's noise.
-_MIN_VIEWS = 8
+MIN_VIEWS = 8
 
 # Errors of a stage's poses unless they are stated: translations relative to the distance of neighbours, and rotations;
 # and of poses that boards measured, since when little has changed but by homings.
@@ -93,9 +93,9 @@ def align_set(
     """
     check_views(elemental_set, "an alignment")
     views = len(elemental_set.settings.view)
-    if views < _MIN_VIEWS:
+    if views < MIN_VIEWS:
         raise BadValue(
-            f"{elemental_set.folder}: has {views} views, and an alignment needs at least {_MIN_VIEWS}; "
+            f"{elemental_set.folder}: has {views} views, and an alignment needs at least {MIN_VIEWS}; "
             "capture more nodes"
         )
     if len(set(elemental_set.nodes)) < views:

@@ -15,7 +15,6 @@ from faintfield.pipelines.errors import OutputExists
 from faintfield.pipelines.formats.files import check_results_folder, exclusive, remove
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.results.alignment import (
-    ALIGNMENT_FOLDER,
     ALIGNMENT_PAGE,
     AlignmentOptions,
     AlignmentRecord,
@@ -24,6 +23,7 @@ from faintfield.pipelines.formats.results.alignment import (
     ViewChange,
 )
 from faintfield.pipelines.formats.results.geometry import (
+    ALIGNMENT_FOLDER,
     COVARIANCE_FILE,
     GEOMETRY_FILE,
     LensRecord,
@@ -80,7 +80,7 @@ def align_views(
     check_exists(folder)
     out = out or folder / ALIGNMENT_FOLDER
     check_results_folder(out)
-    elemental_set, _ = open_set(folder, out, scene, geometry)
+    elemental_set, _ = open_set(folder, out, scene, geometry, aligned=False)
     if elemental_set.measured_in is not None and out.resolve() == elemental_set.measured_in.parent.resolve():
         raise OutputExists(f"{out}: holds the geometry.json that the alignment starts from; name another --out")
     depths_mm = [elemental_set.depth_in_mm(value) for value in depth]
@@ -96,15 +96,17 @@ def align_views(
         return _unchanged(out, f"the views tell no poses: {failure}")
     gain = HeldOutGain(**vars(aligned.alignment.gain))
     if not aligned.alignment.gain.sure:
-        found = f"log-likelihood of held-out pixels {gain.value:+.3g} ± {gain.sigma:.2g}"
-        why = f"the poses stay as they are: the views give none that are better beyond chance ({found})"
+        why = (
+            "the poses stay as they are: those by the views predict held-out pixels no better, beyond chance "
+            f"({gain.text}; 3 are needed)"
+        )
         return msgspec.structs.replace(_unchanged(out, why), gain=gain)
     record, uncertainty = _record(elemental_set, aligned, options)
     page = alignment_page(record, aligned.alignment.pictures, elemental_set.units.tone_curve)
     write_geometry(out, record, {COVARIANCE_FILE: _covariance_file(elemental_set, uncertainty), ALIGNMENT_PAGE: page})
     _inform_of(record)
     figures = {name: getattr(record, name) for name in ("gain", "errors_found", "transfer_sigma_px")}
-    said = f"the new poses predict held-out pixels better by {gain.value:.3g} ± {gain.sigma:.2g} nats"
+    said = f"the new poses predict held-out pixels better, by {gain.text}"
     return AlignmentSummary(True, said, str(out), str(out / ALIGNMENT_PAGE), **figures)
 
 
@@ -183,4 +185,4 @@ def _inform_of(record: AlignmentRecord) -> None:
     )
     known = ", ".join(f"{sigma:.2f} px at {depth}" for depth, sigma in record.transfer_sigma_px.items())
     inform(f"transfer between views known to {known}")
-    inform(f"held-out pixels are predicted better by {record.gain.value:.3g} ± {record.gain.sigma:.2g} nats")
+    inform(f"held-out pixels are predicted better, by {record.gain.text}")

@@ -109,14 +109,22 @@ def _write_report(folder: Path) -> Path:
 
 
 def open_set(
-    folder: Path, out: Path | None = None, scene: SceneKind = "dark_scene", geometry: Path | None = None
+    folder: Path,
+    out: Path | None = None,
+    scene: SceneKind = "dark_scene",
+    geometry: Path | None = None,
+    *,
+    aligned: bool = True,
 ) -> tuple[ElementalSet, Path]:
-    """Return a set, or that of a session, and the folder of its results: for a session by default that of the scene."""
+    """Return a set, or that of a session, and the folder of its results: for a session by default that of the scene.
+
+    The poses are those by which its views were `aligned`, if they were, unless a geometry.json is given.
+    """
     if has_session(folder):
-        elemental_set = load_session(folder, scene, geometry)
+        elemental_set = load_session(folder, scene, geometry, aligned=aligned)
         out = out or folder / RECONSTRUCTIONS / ("" if scene == "dark_scene" else scene)
     else:
-        elemental_set = load_set(folder)
+        elemental_set = load_set(folder, aligned=aligned and geometry is None)
         if out is None:
             raise WrongUsage("no folder for the results is named; give --out")
         elemental_set = elemental_set if geometry is None else with_measured_geometry(elemental_set, geometry)

@@ -111,6 +111,7 @@ def arrange_grid(
         odd_views=tuple(paths[index].name for index in fits.odd),
         turn_deg=round(float(np.degrees(np.abs(fits.turn_rad).max())), 3),
         relative_light=tuple(round(light[path], 4) for path in arranged.paths.values()) if uneven else (),
+        irregular=inspection.failure is None and any(_irregularities(inspection)),
     )
     _print_table(arranged, record, inspection)
     for warning in _warnings(record, inspection, len(paths)):
@@ -254,7 +255,7 @@ def _print_table(grid: ImageGrid, record: Arrangement, inspection: GridInspectio
 
 def _warnings(record: Arrangement, inspection: GridInspection, count: int) -> Iterator[str]:
     """Yield what a person should know before using the set."""
-    fits, order = inspection.fits, inspection.order
+    order = inspection.order
     if inspection.failure:
         yield f"{_FAILURES[inspection.failure]}; the order of the names is kept"
         return
@@ -273,14 +274,21 @@ def _warnings(record: Arrangement, inspection: GridInspection, count: int) -> It
         yield "the pictures do not tell where rows and columns begin; the order of the names is kept"
     if record.odd_views:
         yield f"fit none of their neighbours, and are left out: {', '.join(record.odd_views)}"
+    yield from _irregularities(inspection)
+
+
+def _irregularities(inspection: GridInspection) -> Iterator[str]:
+    """Yield by how much the views differ from those of a regular grid, where that is notable."""
+    fits = inspection.fits
     x_px, y_px = fits.shift_px[int(np.argmax(np.abs(fits.shift_px).max(axis=1)))]
     if max(abs(x_px), abs(y_px)) > _NOTABLE_PX:
         yield (
             f"views are shifted against their neighbours, by up to ({x_px:.1f}, {y_px:.1f}) px: the camera was off the "
-            "grid; planes are sharper with calibrated poses (import colmap)"
+            "grid; planes are sharper at the poses that `faintfield align` finds"
         )
-    if record.turn_deg > _NOTABLE_DEG:
-        yield f"views are turned by up to {record.turn_deg:.2f}°; a grid's camera does not turn"
+    turn_deg = float(np.degrees(np.abs(fits.turn_rad).max()))
+    if turn_deg > _NOTABLE_DEG:
+        yield f"views are turned by up to {turn_deg:.2f}°; a grid's camera does not turn"
     magnification = float(np.abs(fits.magnification - 1).max())
     if magnification > _NOTABLE_SCALE:
         yield f"views are magnified by up to {100 * magnification:.1f} %"

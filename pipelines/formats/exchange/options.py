@@ -112,6 +112,9 @@ class GridOptions:
         Values of 8-bit pictures are proportional to light; without it the tone curve of sRGB is undone.
     srgb
         16-bit pictures have the tone curve of sRGB, too, which is undone.
+    no_align
+        Keep the poses of a regular grid where the pictures show that it was none; without it they are found by the
+        views, see `align`.
     overwrite
         Replace an earlier set in OUT.
     """
@@ -133,4 +136,5 @@ class GridOptions:
     quantum_efficiency: Fraction | None = None
     linear: bool = False
     srgb: bool = False
+    no_align: bool = False
     overwrite: bool = False

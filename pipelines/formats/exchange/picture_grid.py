@@ -65,7 +65,7 @@ class ImportedGrid(msgspec.Struct, frozen=True):
 def import_pictures(src: Path, out: Path, options: GridOptions) -> ImportedGrid:
     """Make an elemental set of the pictures in a folder or a file, put in order by what they show."""
     check_set_free(out, options, src)
-    recorded = {name: value for name, value in asdict(options).items() if name != "overwrite"}
+    recorded = {name: value for name, value in asdict(options).items() if name not in ("no_align", "overwrite")}
     pitch_mm, fx_px, disparity_px = options.pitch_mm, options.fx_px, options.disparity_px
     described = described_grid(src)
     own_scale = pitch_mm is None and fx_px is None and disparity_px is None

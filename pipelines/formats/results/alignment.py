@@ -6,7 +6,6 @@ from faintfield.pipelines.formats.results.geometry import CameraPoses
 from faintfield.pipelines.formats.results.records import Poses
 from faintfield.pipelines.formats.units import Node, StatedUnits
 
-ALIGNMENT_FOLDER = "alignment"
 ALIGNMENT_PAGE = "alignment.html"
 
 
@@ -29,6 +28,11 @@ class HeldOutGain(Struct, frozen=True):
     value: float
     sigma: float
     cells: int
+
+    @property
+    def text(self) -> str:
+        """The gain in standard errors."""
+        return f"{self.value / self.sigma if self.sigma else 0:.1f} standard errors"
 
 
 class PoseErrors(Struct, frozen=True):

@@ -28,6 +28,9 @@ GEOMETRY_FILE = "geometry.json"
 COVARIANCE_FILE = "geometry_covariance.npz"
 CORNERS_FILE = "geometry_corners.npz"
 GEOMETRY_PAGE = "geometry.html"
+
+# Folder in a set or session with the geometry.json that its views were aligned by.
+ALIGNMENT_FOLDER = "alignment"
 CAMERA_FILE = "cameras/node_r{}_c{}.cameramodel"
 
 # Depths at which a geometry is judged unless others are stated; the paper's.

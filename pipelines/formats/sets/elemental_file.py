@@ -92,6 +92,8 @@ class Arrangement(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
         Largest rotation of a view about its axis, against the others.
     relative_light : tuple of float
         Mean of each view's picture over their median, where they differ.
+    irregular : bool
+        Views are shifted, turned or magnified against those of a regular grid.
     """
 
     disparity_range_px: tuple[float, float] | None = None
@@ -105,6 +107,7 @@ class Arrangement(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
     odd_views: tuple[str, ...] = ()
     turn_deg: float = 0.0
     relative_light: tuple[float, ...] = ()
+    irregular: bool = False
 
 
 class ElementalSetFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):

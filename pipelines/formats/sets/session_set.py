@@ -20,7 +20,14 @@ from faintfield.pipelines.formats.reading import is_file, is_folder
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, CameraPoses, PosesOfSession, read_geometry
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, NOISE_MAPS, read_fitted_noise
 from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSetFile, View
-from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
+from faintfield.pipelines.formats.sets.elemental_set import (
+    ElementalSet,
+    alignment_of,
+    check_match,
+    load_set,
+    with_alignment,
+    with_poses_of_views,
+)
 from faintfield.pipelines.formats.units import Pose
 from faintfield.rig.plan import CapturePlan, StepKind, Stop, planned_frames
 from faintfield.rig.session.homings import read_homing_groups
@@ -28,16 +35,22 @@ from faintfield.rig.session.session import PLAN, has_session, read_plan, taken_f
 
 RECONSTRUCTIONS = "reconstructions"
 
+# Files that state the poses from which an alignment of a session starts.
+_SOURCES = (PLAN, GEOMETRY_FILE)
+
 _NAMES: dict[SceneKind, str] = {"dark_scene": "dark-scene", "bright": "bright"}
 
 
-def load_session(folder: Path, kind: SceneKind = "dark_scene", geometry: Path | None = None) -> ElementalSet:
+def load_session(
+    folder: Path, kind: SceneKind = "dark_scene", geometry: Path | None = None, *, aligned: bool = True
+) -> ElementalSet:
     """Return a session's views of the scene, with the noise of its noise.json and the poses of its geometry.json.
 
     All frames of a node are added up to one view, whatever their exposures. `geometry` is another geometry.json than
-    the session's own, or its folder.
+    the session's own, or its folder. Without one, the poses are those by which the views were `aligned`, if they were.
     """
-    return with_measured_geometry(nominal_session(folder, kind, geometry), geometry or folder)
+    measured = with_measured_geometry(nominal_session(folder, kind, geometry), geometry or folder)
+    return measured if geometry is not None or not aligned else with_alignment(measured, *_SOURCES)
 
 
 def load_set_or_session(folder: Path) -> ElementalSet:
@@ -81,7 +94,9 @@ def nominal_session(folder: Path, kind: SceneKind = "dark_scene", geometry: Path
 def files_of_scene(folder: Path, kind: SceneKind = "dark_scene") -> list[str]:
     """Return the names of all files that a reconstruction of a session reads."""
     _, frames = _frames_of_views(folder, read_plan(folder).plan, kind)
-    return [PLAN, NOISE_FILE, NOISE_MAPS, GEOMETRY_FILE, *(name for _, names in frames for name in names)]
+    aligned = alignment_of(folder, [names[0] for _, names in frames], _SOURCES)
+    geometry = GEOMETRY_FILE if aligned is None else aligned.relative_to(folder).as_posix()
+    return [PLAN, NOISE_FILE, NOISE_MAPS, geometry, *(name for _, names in frames for name in names)]
 
 
 def _frames_of_views(folder: Path, plan: CapturePlan, kind: SceneKind) -> tuple[float, list[tuple[Stop, list[str]]]]:
@@ -178,15 +193,10 @@ def with_measured_geometry(elemental_set: ElementalSet, path: Path) -> Elemental
     """
     path = path / GEOMETRY_FILE if is_folder(path) else path
     geometry, settings = read_geometry(path, CameraPoses), elemental_set.settings
-    poses = {entry.node: entry.rt_cam_ref for entry in geometry.nodes}
-    _check_match(path, geometry, elemental_set)
     if geometry.source == "views":
-        views = [
-            msgspec.structs.replace(view, rt_cam_ref=poses[node])
-            for view, node in zip(settings.view, elemental_set.nodes, strict=True)
-        ]
-        aligned = msgspec.structs.replace(settings, view=views)
-        return replace(elemental_set, settings=aligned, measured_in=path, poses="aligned")
+        return with_poses_of_views(elemental_set, path)
+    check_match(path, geometry, elemental_set, [view.node for view in settings.view])
+    poses = {entry.node: entry.rt_cam_ref for entry in geometry.nodes}
     stated = ("fx_px", "fy_px", "cx_px", "cy_px", "distortion")
     camera = msgspec.structs.replace(settings.camera, **{name: getattr(geometry.lens, name) for name in stated})
     shifts_mm = _homing_shifts_mm(path, geometry, elemental_set)
@@ -222,24 +232,3 @@ def _shifted(rt_cam_ref: Pose, shift_mm: NDArray[np.float64]) -> Pose:
     turned = rotation_matrix(np.array(rt_cam_ref)) @ shift_mm
     a, b, c, x, y, z = (np.array(rt_cam_ref) - np.append(np.zeros(3), turned)).tolist()
     return a, b, c, x, y, z
-
-
-def _check_match(path: Path, geometry: CameraPoses, elemental_set: ElementalSet) -> None:
-    settings, nodes = elemental_set.settings, {entry.node for entry in geometry.nodes}
-    if geometry.size_px != settings.camera.size_px:
-        raise BadValue(
-            f"{path}: is of {geometry.size_px} px images, the set has {settings.camera.size_px}; use its own"
-        )
-    stated = elemental_set.nodes if geometry.source == "views" else [view.node for view in settings.view]
-    missing = [view.image for view, node in zip(settings.view, stated, strict=True) if node not in nodes]
-    if missing:
-        raise BadValue(
-            f"{path}: has no pose for {len(missing)} of {len(settings.view)} views ({missing[0]} is the first); "
-            "state the node of every view, and show a board at every node"
-        )
-    reference = stated[settings.reference_view]
-    if reference != geometry.reference_node:
-        raise BadValue(
-            f"{path}: its reference is node {list(geometry.reference_node)}, the set's is {reference}; "
-            "set reference_view to the view of that node"
-        )
