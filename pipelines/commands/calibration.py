@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, overload
 
 from cyclopts import Parameter
 
-from faintfield.pipelines.arguments import LensName, NotNegative, Positive, SceneKind
+from faintfield.pipelines.arguments import LensName, Positive, SceneKind
 from faintfield.pipelines.errors import WrongUsage
 
 if TYPE_CHECKING:
@@ -91,14 +91,15 @@ def align(
     depth_range: Annotated[str | None, Parameter(allow_leading_hyphen=True)] = None,
     geometry: Path | None = None,
     scene: SceneKind = "dark_scene",
-    position_error: NotNegative = 0.0,
-    rotation_error_mrad: NotNegative = 0.0,
+    position_error: Positive | None = None,
+    rotation_error_mrad: Positive | None = None,
 ) -> Alignment:
     """Find where the camera was at every node from the views of the scene themselves, dark ones, too.
 
-    Writes geometry.json with source "views", its covariance, and a page that shows the scene before and after; give its
-    folder to `reconstruct --geometry`. The new poses are accepted only if they predict pixels that were held out better
-    than the old ones, beyond chance. Otherwise the command says so, and nothing is written.
+    Writes geometry.json with source "views", its covariance, and a page that shows the scene before and after. All
+    commands take the poses of SET-PATH from there; with --out, `reconstruct --geometry` takes them. The new poses are
+    accepted only if they predict pixels that were held out better than the old ones, beyond chance. Otherwise the
+    command says so, and nothing is written.
 
     Parameters
     ----------
@@ -117,10 +118,10 @@ def align(
     scene
         Set of the session whose views are aligned.
     position_error
-        Standard deviation of a node's position along each axis, in the unit of the poses; by default 0.6 % of the
-        distance between nodes. It is where an estimate from the views starts.
+        Standard deviation of a node's position along each axis, in the unit of the poses, where the estimate from the
+        views starts; by default 0.6 % of the distance between nodes, or 0.04 % if the poses were measured.
     rotation_error_mrad
-        Standard deviation of a node's rotation about each axis; by default 3.5.
+        The same of a node's rotation about each axis; by default 3.5, or 0.1 if the poses were measured.
     """
     from faintfield.pipelines.workflows.align import align_views
 

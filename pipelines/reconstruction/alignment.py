@@ -16,7 +16,6 @@ from faintfield.calib.homography import (
 )
 from faintfield.pipelines.console import inform, progress, working
 from faintfield.pipelines.errors import BadValue
-from faintfield.pipelines.formats.results.alignment import AlignmentOptions
 from faintfield.pipelines.formats.results.geometry import COVARIANCE_FILE
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.depth.autofocus import searched_range_mm, views_of_search
@@ -54,20 +53,20 @@ class Errors:
 
 @dataclass(frozen=True)
 class Aligned:
-    """What the views of a set tell: the alignment, the depths it used or found, nearest first, and the bins' width."""
+    """An alignment of a set, with the depths that it used or found, nearest first, and the width of its bins."""
 
     alignment: Alignment
     depths_mm: list[float]
     bins_px: int
 
 
-def assumed_errors(elemental_set: ElementalSet, options: AlignmentOptions) -> Errors:
+def assumed_errors(elemental_set: ElementalSet, position: float | None, rotation_mrad: float | None) -> Errors:
     """Return the errors of the poses: those stated, else what suits nominal or measured poses."""
     measured = elemental_set.poses == "measured"
     rad, share = (_CHANGE_RAD, _CHANGE) if measured else (_STAGE_RAD, _STAGE_ERROR)
     return Errors(
-        1e-3 * options.rotation_error_mrad or rad,
-        options.position_error_mm or share * distance_of_neighbours(elemental_set),
+        rad if rotation_mrad is None else 1e-3 * rotation_mrad,
+        share * distance_of_neighbours(elemental_set) if position is None else position,
     )
 
 

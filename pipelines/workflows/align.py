@@ -67,8 +67,8 @@ def align_views(
     depth_range: str | None = None,
     geometry: Path | None = None,
     scene: SceneKind = "dark_scene",
-    position_error: float = 0.0,
-    rotation_error_mrad: float = 0.0,
+    position_error: float | None = None,
+    rotation_error_mrad: float | None = None,
 ) -> AlignmentSummary:
     """Find the poses of a set or session by its views, and write them with their page if they are better.
 
@@ -85,11 +85,8 @@ def align_views(
         raise OutputExists(f"{out}: holds the geometry.json that the alignment starts from; name another --out")
     depths_mm = [elemental_set.depth_in_mm(value) for value in depth]
     range_mm = None if depth_range is None else range_in_mm(elemental_set, "--depth-range", depth_range)
-    asked = AlignmentOptions(tuple(depths_mm), range_mm, position_error, rotation_error_mrad, elemental_set.poses)
-    errors = assumed_errors(elemental_set, asked)
-    options = msgspec.structs.replace(
-        asked, position_error_mm=errors.sigma_mm, rotation_error_mrad=1e3 * errors.sigma_rad
-    )
+    errors = assumed_errors(elemental_set, position_error, rotation_error_mrad)
+    options = AlignmentOptions(tuple(depths_mm), range_mm, errors.sigma_mm, 1e3 * errors.sigma_rad, elemental_set.poses)
     try:
         aligned = align_set(elemental_set, out, depths_mm, range_mm, errors)
     except NothingInFocus as failure:

@@ -192,27 +192,27 @@ class Aligner:
         posed = self._at(bins)
         self._light.fit(posed.views, blur)
         precision = np.repeat([1 / self._prior.variances[0], 1 / self._prior.variances[1]], 3)
-        found = score(posed, self._light, cells, precision, bins)
-        solution = self._solved(found, _VARIANCE_STEPS if estimate_variances else 0)
+        scores = score(posed, self._light, cells, precision, bins)
+        solution = self._solved(scores, _VARIANCE_STEPS if estimate_variances else 0)
         self._poses, self._prior = moved(self._poses, solution.steps), solution.prior
         self._light.change_depth(solution.scene[POSE:])
         sigmas = np.sqrt(np.diag(solution.covariance))
         step = float(np.sqrt(np.mean((solution.steps[self._others].ravel() / sigmas) ** 2)))
-        self.rounds.append(Round(bins, step, found.dispersion))
-        return solution, found
+        self.rounds.append(Round(bins, step, scores.dispersion))
+        return solution, scores
 
-    def _solved(self, found: Score, variance_steps: int) -> _Solution:
+    def _solved(self, scores: Score, variance_steps: int) -> _Solution:
         """Return the step of all poses, without what changes of the scene explain as well."""
-        of_scene = found.information[:, POSE:, POSE:].sum(axis=0)
+        of_scene = scores.information[:, POSE:, POSE:].sum(axis=0)
         scale = 1 / np.sqrt(np.maximum(np.diag(of_scene), 1e-300))
         inverse = np.outer(scale, scale) * np.linalg.pinv(of_scene * np.outer(scale, scale), rcond=1e-9, hermitian=True)
-        cross = found.information[self._others, :POSE, POSE:].reshape(-1, len(of_scene))
+        cross = scores.information[self._others, :POSE, POSE:].reshape(-1, len(of_scene))
         information = -cross @ inverse @ cross.T
         for number, view in enumerate(self._others):
             part = slice(POSE * number, POSE * (number + 1))
-            information[part, part] += found.information[view, :POSE, :POSE]
-        by_scene = found.gradient[:, POSE:].sum(axis=0)
-        gradient = found.gradient[self._others, :POSE].ravel() - cross @ (inverse @ by_scene)
+            information[part, part] += scores.information[view, :POSE, :POSE]
+        by_scene = scores.gradient[:, POSE:].sum(axis=0)
+        gradient = scores.gradient[self._others, :POSE].ravel() - cross @ (inverse @ by_scene)
         error = steps_between(self._start, self._poses)[self._others].ravel()
         prior = self._prior
         for left in reversed(range(variance_steps + 1)):

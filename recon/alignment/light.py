@@ -245,15 +245,15 @@ def depth_shapes(x: Image, y: Image, inverse_depth: Image) -> Image:
     return np.array([np.ones_like(q), x, y, x * x, x * y, y * y, q, q * x, q * y])
 
 
-def gradient_products(light: Image, own: Image, count: Image, others: Image, blur: float) -> NDArray[np.float64]:
+def gradient_products(light: Image, own: Image, count: Image, other_count: Image, blur: float) -> NDArray[np.float64]:
     """Return sums of products of gradients (2, axis): of denoised light with the true one, and with itself.
 
     The true gradient is that of the sum `own` of a fold's views, `count` of them at each sample, whose noise the light
-    of `others` does not share.
+    of the others, `other_count` of them, does not share.
     """
     smooth = gaussian(light, blur) if blur else light
     true, slope = np.array(np.gradient(own / np.maximum(count, np.float32(0.5)))), np.array(np.gradient(smooth))
-    seen = ((count > _MIN_OWN) & (others > _MIN_OTHERS)).astype(np.float32)
+    seen = ((count > _MIN_OWN) & (other_count > _MIN_OTHERS)).astype(np.float32)
     weight = np.where(gaussian(seen, _AWAY) > 0.999, count, 0)
     return np.asarray(np.sum([weight * slope * true, weight * slope**2], axis=(2, 3), dtype=np.float64))
 

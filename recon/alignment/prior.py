@@ -1,4 +1,4 @@
-"""What is known of the errors of poses before the views are looked at: of each node, of the stage, of homings."""
+"""Errors of poses before the views are looked at: of each node, of the stage, of homings."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

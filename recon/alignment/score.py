@@ -1,4 +1,4 @@
-"""How the likelihood of each view changes with its pose, and with changes of the scene that all views share."""
+"""Gradient of each view's likelihood by its pose, and by changes of the scene that all views share."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

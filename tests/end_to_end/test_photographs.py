@@ -95,3 +95,32 @@ def test_colours_come_back(results: Path) -> None:
     expected_e = bright * _electrons_of_white(results)
     standard_error_e = (3.464**2 + expected_e.max()) ** 0.5 / (25 * 200 * 340) ** 0.5
     np.testing.assert_allclose(penalised, expected_e, atol=3 * standard_error_e)
+
+
+def test_photographs_that_were_shifted_and_turned_are_aligned_by_the_import(tmp_path: Path) -> None:
+    """The import finds by how much each view was shifted and turned, but for a drift, which is another depth."""
+    place = os.environ.get("FAINTFIELD_DATA")
+    if not place:
+        pytest.skip("FAINTFIELD_DATA does not name the folder of real data")
+    generator = np.random.default_rng(1)
+    moves = {node: (*generator.uniform(-3, 3, 2), generator.uniform(-0.5, 0.5)) for node in np.ndindex(7, 7)}
+    moves[3, 3] = (0.0, 0.0, 0.0)
+    (tmp_path / "photographs").mkdir()
+    for (row, column), (right, down, turn_deg) in moves.items():
+        photograph = cv2.imread(str(Path(place) / "lightfield-chess" / f"view_r{row + 1}_c{column + 1}.jpg"))
+        assert photograph is not None
+        height, width = photograph.shape[:2]
+        matrix = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), turn_deg, 1)
+        matrix[:, 2] += right, down
+        moved = cv2.warpAffine(
+            photograph, matrix, (width, height), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT
+        )
+        cv2.imwrite(str(tmp_path / "photographs" / f"view_r{row}_c{column}.png"), moved)
+    _run("import", "grid", tmp_path / "photographs", tmp_path / "set")
+    views = json.loads((tmp_path / "set" / "alignment" / "geometry.json").read_text())["views"]
+    wanted = np.array([moves[tuple(view["node"])] for view in views])
+    found = np.array([(*view["shift_px"], -np.degrees(view["turn_rad"])) for view in views])
+    drift = np.column_stack([np.ones(len(views)), [view["node"] for view in views]])
+    left = found - wanted
+    left -= drift @ np.linalg.lstsq(drift, left)[0]
+    assert np.sqrt(np.mean(left**2, axis=0)) == pytest.approx([0, 0, 0], abs=0.15)
