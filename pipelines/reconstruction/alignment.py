@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,14 +17,14 @@ from faintfield.pipelines.console import inform, progress, working
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.results.geometry import COVARIANCE_FILE
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
-from faintfield.pipelines.reconstruction.depth.autofocus import searched_range_mm, views_of_search
-from faintfield.pipelines.reconstruction.depth.comparison import check_places
-from faintfield.pipelines.reconstruction.depth.search import check_views, default_bins, luminance, naming_range
+from faintfield.pipelines.reconstruction.depth.autofocus import searched_range_mm
+from faintfield.pipelines.reconstruction.depth.search import check_views, default_bins, luminance
 from faintfield.pipelines.reconstruction.operators import principal_shift
 from faintfield.recon.alignment.cameras import POSE, PosedViews, moved
 from faintfield.recon.alignment.estimate import Aligner, Alignment
 from faintfield.recon.alignment.light import Folds, Light, PlanesLight, SurfaceLight
 from faintfield.recon.alignment.prior import PosePrior
+from faintfield.recon.errors import NothingInFocus
 from faintfield.recon.surface.estimate import found_range
 
 # Fewest views that are told apart from one another's noise.
@@ -80,15 +79,13 @@ def distance_of_neighbours(elemental_set: ElementalSet) -> float:
 
 def align_set(
     elemental_set: ElementalSet,
-    out: Path,
     depths_mm: Sequence[float],
     range_mm: tuple[float, float] | None,
     errors: Errors,
 ) -> Aligned:
     """Return the poses by the views, given light on planes at given depths, else on a surface in a range or any.
 
-    `out` is for a temporary file. Raises BadValue for too few or too small views, or two of one node, and
-    NothingInFocus if the views tell no depths, or shuffled ones agree as well.
+    Raises BadValue for too few or too small views, or two of one node, and NothingInFocus if the views tell no depths.
     """
     check_views(elemental_set, "an alignment")
     views = len(elemental_set.settings.view)
@@ -110,11 +107,13 @@ def align_set(
         light, depths = PlanesLight(folds, [1 / depth for depth in depths_mm]), sorted(depths_mm)
     else:
         searched = range_mm or searched_range_mm(elemental_set)
-        check_places(views_of_search(elemental_set, searched, out), searched)
         far, near = 1 / searched[1], 1 / searched[0]
         if range_mm is None:
-            with naming_range(elemental_set, far, near), working("searching the range of depths"):
-                far, near = found_range(posed.binned(_RANGE_BINS).views, far, near)
+            try:
+                with working("searching the range of depths"):
+                    far, near = found_range(posed.binned(_RANGE_BINS).views, far, near)
+            except NothingInFocus as failure:
+                raise NothingInFocus(f"{failure}; or give the range by --depth-range NEAR:FAR") from failure
         light, depths = SurfaceLight(folds, far, near), [1 / near, 1 / far]
         inform(
             f"depths between {elemental_set.depths_text(*(float(f'{depth:.3g}') for depth in depths), join=' and ')}"

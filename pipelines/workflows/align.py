@@ -88,7 +88,7 @@ def align_views(
     errors = assumed_errors(elemental_set, position_error, rotation_error_mrad)
     options = AlignmentOptions(tuple(depths_mm), range_mm, errors.sigma_mm, 1e3 * errors.sigma_rad, elemental_set.poses)
     try:
-        aligned = align_set(elemental_set, out, depths_mm, range_mm, errors)
+        aligned = align_set(elemental_set, depths_mm, range_mm, errors)
     except NothingInFocus as failure:
         return _unchanged(out, f"the views tell no poses: {failure}")
     gain = HeldOutGain(**vars(aligned.alignment.gain))

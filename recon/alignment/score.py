@@ -1,7 +1,8 @@
 """Gradient of each view's likelihood by its pose, and by changes of the scene that all views share."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,7 +111,7 @@ def score(posed: PosedViews, light: Light, cells: Cells, precision: NDArray[np.f
             ]
             if light.smooth_depth:
                 fields.append(_parallax(rays, views.ray_from_surface[view, :, 3], directions, layer.inverse_depth))
-            parts.append(_derivative(layer, np.concatenate(fields, axis=1), views.focal_px))
+            parts.append(_derivative(layer, fields, views.focal_px))
         derivative = np.sum(parts, axis=0) if len(parts) > 1 else parts[0]
         expected = np.sum([layer.picture for layer in layers], axis=0, dtype=np.float32)
         usable = _inside(seen) & ~cells.pixels(view, expected.shape, bins)
@@ -211,9 +212,15 @@ def _parallax(
     return moved[:, np.newaxis] * shapes
 
 
-def _derivative(layer: Layer, fields: Image, focal_px: tuple[float, float]) -> Image:
+def _derivative(layer: Layer, fields: Sequence[Image], focal_px: tuple[float, float]) -> Image:
     """Return the derivative (parameter, row, column) of a picture whose rays move by fields (2, parameter, …)."""
     along_rows, along_columns = np.gradient(layer.picture)
     along_rows *= np.float32(-focal_px[1] * layer.gain[0])
     along_columns *= np.float32(-focal_px[0] * layer.gain[1])
-    return np.asarray(along_columns * fields[0] + along_rows * fields[1], np.float32)
+    derivative = np.empty((sum(field.shape[1] for field in fields), *layer.picture.shape), np.float32)
+    rows = iter(derivative)
+    for right, down in zip(chain(*(field[0] for field in fields)), chain(*(field[1] for field in fields)), strict=True):
+        row = next(rows)
+        np.multiply(along_columns, right, out=row)
+        row += along_rows * down
+    return derivative
