@@ -16,7 +16,7 @@ def alignment_page(
     record: AlignmentRecord, pictures: tuple[NDArray[np.float32], NDArray[np.float32]], tone_curve: bool
 ) -> str:
     """Return alignment.html, with the light by the old and the new poses."""
-    white, window = white_level(pictures[1]), _most_detail(pictures[1])
+    white, window = white_level(pictures[1]), _detail_window(pictures[1])
     return template("alignment.html").render(
         record=record,
         pictures=[_uri(picture, white, tone_curve) for picture in pictures],
@@ -35,7 +35,7 @@ def _uri(picture: NDArray[np.float32], white: float, tone_curve: bool) -> str:
     return data_uri(encoded(shrunk(levels, _WIDTH_PX), ".webp"), ".webp")
 
 
-def _most_detail(picture: NDArray[np.float32]) -> tuple[slice, slice]:
+def _detail_window(picture: NDArray[np.float32]) -> tuple[slice, slice]:
     """Return the window of a share of the picture's width and height that has the steepest gradients."""
     energy = np.sum(np.square(np.gradient(picture.astype(np.float64))), axis=0)
     sums = np.pad(energy.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))

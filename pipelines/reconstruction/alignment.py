@@ -15,7 +15,9 @@ from faintfield.calib.homography import (
 )
 from faintfield.pipelines.console import inform, progress, working
 from faintfield.pipelines.errors import BadValue
-from faintfield.pipelines.formats.results.geometry import COVARIANCE_FILE
+from faintfield.pipelines.formats.reading import read_arrays
+from faintfield.pipelines.formats.results.alignment import PoseErrors
+from faintfield.pipelines.formats.results.geometry import COVARIANCE_FILE, CameraPoses, read_geometry
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.depth.autofocus import searched_range_mm
 from faintfield.pipelines.reconstruction.depth.search import check_views, default_bins, luminance
@@ -43,14 +45,6 @@ _STEP = 1e-6
 
 
 @dataclass(frozen=True)
-class Errors:
-    """Standard deviations of the poses of nodes before the views are looked at."""
-
-    sigma_rad: float
-    sigma_mm: float
-
-
-@dataclass(frozen=True)
 class Aligned:
     """An alignment of a set, with the depths that it used or found, nearest first, and the width of its bins."""
 
@@ -59,11 +53,11 @@ class Aligned:
     bins_px: int
 
 
-def assumed_errors(elemental_set: ElementalSet, position: float | None, rotation_mrad: float | None) -> Errors:
+def assumed_errors(elemental_set: ElementalSet, position: float | None, rotation_mrad: float | None) -> PoseErrors:
     """Return the errors of the poses: those stated, else what suits nominal or measured poses."""
     measured = elemental_set.poses == "measured"
     rad, share = (_CHANGE_RAD, _CHANGE) if measured else (_STAGE_RAD, _STAGE_ERROR)
-    return Errors(
+    return PoseErrors(
         rad if rotation_mrad is None else 1e-3 * rotation_mrad,
         share * distance_of_neighbours(elemental_set) if position is None else position,
     )
@@ -71,7 +65,7 @@ def assumed_errors(elemental_set: ElementalSet, position: float | None, rotation
 
 def distance_of_neighbours(elemental_set: ElementalSet) -> float:
     """Return the median distance of a camera from its nearest neighbour, in the unit of the poses."""
-    centres = elemental_set.poses_rt_cam_ref[:, 3:]  # rotations change no distance from the reference
+    centres = np.array([_centre(pose) for pose in elemental_set.poses_rt_cam_ref])
     apart = np.linalg.norm(centres[:, np.newaxis] - centres, axis=2)
     np.fill_diagonal(apart, np.inf)
     return float(np.median(apart.min(axis=1)))
@@ -81,7 +75,7 @@ def align_set(
     elemental_set: ElementalSet,
     depths_mm: Sequence[float],
     range_mm: tuple[float, float] | None,
-    errors: Errors,
+    errors: PoseErrors,
 ) -> Aligned:
     """Return the poses by the views, given light on planes at given depths, else on a surface in a range or any.
 
@@ -124,7 +118,7 @@ def align_set(
     return Aligned(aligner.result, depths, bins)
 
 
-def _prior(elemental_set: ElementalSet, errors: Errors) -> PosePrior:
+def _prior(elemental_set: ElementalSet, errors: PoseErrors) -> PosePrior:
     nodes, reference = np.array(elemental_set.nodes), elemental_set.reference_view
     known = _measured_covariance(elemental_set)
     if known is None:
@@ -140,11 +134,16 @@ def _measured_covariance(elemental_set: ElementalSet) -> NDArray[np.float64] | N
     path = elemental_set.measured_in.with_name(COVARIANCE_FILE)
     if not path.is_file():
         return None
-    with np.load(path, allow_pickle=False) as arrays:
-        covariance, nodes, lens = arrays["covariance"], arrays["nodes"].tolist(), len(arrays["intrinsics"])
+    geometry = read_geometry(elemental_set.measured_in, CameraPoses)
+    lens, places = 4 + len(geometry.lens.distortion), [entry.node for entry in geometry.nodes]
+    size = lens + POSE * len(places)
+    remedy = "run `faintfield geometry` again, or remove the file to align without it"
+    arrays = read_arrays(path, ["covariance"], shape=(size, size), max_bytes=8 * size**2, remedy=remedy)
+    if "covariance" not in arrays or not np.isfinite(arrays["covariance"]).all():
+        raise BadValue(f"{path}: holds no covariance, or numbers that are not finite; {remedy}")
     others = [node for number, node in enumerate(elemental_set.nodes) if number != elemental_set.reference_view]
-    rows = np.concatenate([lens + POSE * nodes.index(list(node)) + np.arange(POSE) for node in others])
-    return np.asarray(covariance[np.ix_(rows, rows)], np.float64)
+    rows = np.concatenate([lens + POSE * places.index(node) + np.arange(POSE) for node in others])
+    return np.asarray(arrays["covariance"][np.ix_(rows, rows)], np.float64)
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import OutputExists
 from faintfield.pipelines.formats.files import check_results_folder, exclusive, remove
 from faintfield.pipelines.formats.provenance import provenance
+from faintfield.pipelines.formats.reading import is_folder
 from faintfield.pipelines.formats.results.alignment import (
     ALIGNMENT_PAGE,
     AlignmentOptions,
@@ -78,7 +79,7 @@ def align_views(
         The set cannot be used, or its depths do not suit it.
     """
     check_exists(folder)
-    out = out or folder / ALIGNMENT_FOLDER
+    out = out or (folder if is_folder(folder) else folder.parent) / ALIGNMENT_FOLDER
     check_results_folder(out)
     elemental_set, _ = open_set(folder, out, scene, geometry, aligned=False)
     if elemental_set.measured_in is not None and out.resolve() == elemental_set.measured_in.parent.resolve():

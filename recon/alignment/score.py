@@ -170,10 +170,11 @@ def _layers_of_folds(light: Light) -> Iterator[list[tuple[int, list[Layer], NDAr
         ]
 
 
-def _inside(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    inside = np.zeros_like(seen)
+def _inside(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return a mask (row, column) without its borders."""
+    inside = np.zeros_like(mask)
     part = slice(_BORDER, -_BORDER)
-    inside[part, part] = seen[part, part]
+    inside[part, part] = mask[part, part]
     return inside
 
 

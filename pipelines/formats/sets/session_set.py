@@ -19,15 +19,14 @@ from faintfield.pipelines.formats.files import sha256
 from faintfield.pipelines.formats.reading import is_file, is_folder
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, CameraPoses, PosesOfSession, read_geometry
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, NOISE_MAPS, read_fitted_noise
-from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSetFile, View
-from faintfield.pipelines.formats.sets.elemental_set import (
-    ElementalSet,
+from faintfield.pipelines.formats.sets.aligned_poses import (
     alignment_of,
     check_match,
-    load_set,
     with_alignment,
     with_poses_of_views,
 )
+from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSetFile, View
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
 from faintfield.pipelines.formats.units import Pose
 from faintfield.rig.plan import CapturePlan, StepKind, Stop, planned_frames
 from faintfield.rig.session.homings import read_homing_groups

@@ -8,10 +8,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from faintfield.pipelines.formats.files import write_json
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.formats.results.alignment import AlignmentRecord
-from faintfield.pipelines.formats.results.geometry import COVARIANCE_FILE, read_geometry
+from faintfield.pipelines.formats.results.geometry import (
+    COVARIANCE_FILE,
+    GEOMETRY_FILE,
+    CameraPoses,
+    LensRecord,
+    NodeRecord,
+    read_geometry,
+)
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.formats.sets.ground_truth import read_truth
 from faintfield.pipelines.formats.sets.session_set import with_measured_geometry
@@ -117,3 +125,19 @@ def test_few_views_and_a_range_that_is_none_are_refused(
     assert (ended.returncode, "6 views" in ended.stderr, "at least 8" in ended.stderr) == (1, True, True)
     ended = faintfield("align", scene, "--depth-range", "800:800")
     assert (ended.returncode, "--depth-range 800:800: is no range" in ended.stderr) == (2, True)
+
+
+def test_damaged_covariance_of_boards_is_refused(scene: Path, tmp_path: Path, faintfield: Command) -> None:
+    elemental_set = load_set(scene)
+    camera = elemental_set.settings.camera
+    nodes = [
+        NodeRecord(node, view.rt_cam_ref, 0.01, 1e-5)
+        for node, view in zip(elemental_set.nodes, elemental_set.settings.view, strict=True)
+    ]
+    lens = LensRecord("opencv5", camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.distortion)
+    geometry = CameraPoses(lens=lens, size_px=camera.size_px, reference_node=(2, 2), nodes=nodes)
+    write_json(tmp_path / GEOMETRY_FILE, geometry)
+    np.savez(tmp_path / COVARIANCE_FILE, covariance=np.zeros((6, 6)), nodes=np.zeros((1, 2)), intrinsics=np.zeros(4))
+    ended = faintfield("align", scene, "--geometry", tmp_path, "--depth", 700, "--out", tmp_path / "out")
+    assert ended.returncode == 1
+    assert f"{COVARIANCE_FILE}: cannot be read (covariance has shape (6, 6)" in ended.stderr
