@@ -42,6 +42,7 @@ from faintfield.pipelines.reconstruction.alignment import (
     shifts_px,
     transfer_sigmas_px,
 )
+from faintfield.pipelines.reconstruction.request import distinct_depths
 from faintfield.pipelines.reconstruction.surface.request import range_in_mm
 from faintfield.pipelines.workflows.reconstruct import open_set
 from faintfield.recon.alignment.cameras import moved
@@ -84,7 +85,7 @@ def align_views(
     elemental_set, _ = open_set(folder, out, scene, geometry, aligned=False)
     if elemental_set.measured_in is not None and out.resolve() == elemental_set.measured_in.parent.resolve():
         raise OutputExists(f"{out}: holds the geometry.json that the alignment starts from; name another --out")
-    depths_mm = [elemental_set.depth_in_mm(value) for value in depth]
+    depths_mm = distinct_depths([elemental_set.depth_in_mm(value) for value in depth], elemental_set)
     range_mm = None if depth_range is None else range_in_mm(elemental_set, "--depth-range", depth_range)
     errors = assumed_errors(elemental_set, position_error, rotation_error_mrad)
     options = AlignmentOptions(tuple(depths_mm), range_mm, errors.sigma_mm, 1e3 * errors.sigma_rad, elemental_set.poses)

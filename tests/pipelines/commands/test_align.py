@@ -113,7 +113,7 @@ def test_true_poses_stay(tmp_path: Path, done: Command) -> None:
     assert not (tmp_path / "set" / "alignment" / "geometry.json").exists()
 
 
-def test_few_views_and_a_range_that_is_none_are_refused(
+def test_few_views_and_depths_that_are_none_are_refused(
     simulated_scene: Path, scene: Path, tmp_path: Path, faintfield: Command
 ) -> None:
     few = tmp_path / "few"
@@ -123,6 +123,8 @@ def test_few_views_and_a_range_that_is_none_are_refused(
     (few / "elemental.toml").write_text("[[view]]".join([head, *views[:6]]))
     ended = faintfield("align", few)
     assert (ended.returncode, "6 views" in ended.stderr, "at least 8" in ended.stderr) == (1, True, True)
+    ended = faintfield("align", scene, "--depth", -5)
+    assert (ended.returncode, "a plane at -5.0 mm is not in front of the camera" in ended.stderr) == (1, True)
     ended = faintfield("align", scene, "--depth-range", "800:800")
     assert (ended.returncode, "--depth-range 800:800: is no range" in ended.stderr) == (2, True)
 
