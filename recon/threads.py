@@ -2,14 +2,25 @@
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import cache
 from multiprocessing.util import register_after_fork
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from threadpoolctl import ThreadpoolController
 
 
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, "recon")
+
+
+@cache
+def _blas() -> "ThreadpoolController":
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()
 
 
 # A forked process inherits the pools, but not their threads
@@ -34,6 +45,7 @@ def run_in_threads[Part, Result](work: Callable[[Part], Result], parts: Sequence
 def map_in_threads[Item, Result](work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
     """Call `work` on each item, in as many threads as numba takes; return the results in order.
 
+    BLAS takes one thread meanwhile: many times as many threads as cores would wait for one another.
     No more items than threads are worked on at a time. After a failure or an interrupt no further item is begun, and no
     thread is left working. Of several failures, that of the first item is raised.
 
@@ -57,10 +69,12 @@ def map_in_threads[Item, Result](work: Callable[[Item], Result], items: Sequence
                 failures[index] = failure
 
     count = min(int(config.NUMBA_NUM_THREADS), len(items)) - 1
-    others = [_pool(count).submit(take) for _ in range(count)]
+    others: list[Future[None]] = []
     try:
-        take()
-        wait(others)
+        with _blas().limit(limits=1, user_api="blas"):
+            others += [_pool(count).submit(take) for _ in range(count)]
+            take()
+            wait(others)
     except BaseException:
         left.clear()
         wait(others)  # no thread may still be writing when an interrupt is handled

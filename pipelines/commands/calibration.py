@@ -93,6 +93,7 @@ def align(
     scene: SceneKind = "dark_scene",
     position_error: Positive | None = None,
     rotation_error_mrad: Positive | None = None,
+    with_lens: bool = False,
 ) -> Alignment:
     """Find where the camera was at every node from the views of the scene themselves, dark ones, too.
 
@@ -119,9 +120,12 @@ def align(
         Set of the session whose views are aligned.
     position_error
         Standard deviation of a node's position along each axis, in the unit of the poses, where the estimate from the
-        views starts; by default 0.6 % of the distance between nodes, or 0.04 % if the poses were measured.
+        views starts; by default 0.6 % of the distance between nodes, or 0.02 % if the poses were measured.
     rotation_error_mrad
-        The same of a node's rotation about each axis; by default 3.5, or 0.1 if the poses were measured.
+        The same of a node's rotation about each axis; by default 3.5, or 0.03 if the poses were measured.
+    with_lens
+        Find the focal length and the first distortion term, too. A stage that only translates tells its focal length
+        only with --depth.
     """
     from faintfield.pipelines.workflows.align import align_views
 
@@ -134,4 +138,5 @@ def align(
         scene=scene,
         position_error=position_error,
         rotation_error_mrad=rotation_error_mrad,
+        with_lens=with_lens,
     )

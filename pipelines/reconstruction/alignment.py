@@ -13,6 +13,7 @@ from faintfield.calib.homography import (
     transfer,
     transfer_sigma_px,
 )
+from faintfield.calib.lens import Lens
 from faintfield.pipelines.console import inform, progress, working
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.reading import read_arrays
@@ -22,10 +23,10 @@ from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.depth.autofocus import searched_range_mm
 from faintfield.pipelines.reconstruction.depth.search import check_views, default_bins, luminance
 from faintfield.pipelines.reconstruction.operators import principal_shift
-from faintfield.recon.alignment.cameras import POSE, PosedViews, moved
+from faintfield.recon.alignment.cameras import LENS, POSE, PosedViews, moved
 from faintfield.recon.alignment.estimate import Aligner, Alignment
 from faintfield.recon.alignment.light import Folds, Light, PlanesLight, SurfaceLight
-from faintfield.recon.alignment.prior import PosePrior
+from faintfield.recon.alignment.prior import MeasurementErrors, PosePrior
 from faintfield.recon.errors import NothingInFocus
 from faintfield.recon.surface.estimate import found_range
 
@@ -33,9 +34,9 @@ from faintfield.recon.surface.estimate import found_range
 MIN_VIEWS = 8
 
 # Errors of a stage's poses unless they are stated: translations relative to the distance of neighbours, and rotations;
-# and of poses that boards measured, since when little has changed but by homings.
+# and of poses that boards measured, since when little has changed but by homings, whose shifts are the last.
 _STAGE_ERROR, _STAGE_RAD = 0.006, 3.5e-3
-_CHANGE, _CHANGE_RAD = 4e-4, 1e-4
+_CHANGE, _CHANGE_RAD, _HOMING = 2e-4, 3e-5, 2e-3
 
 # Bins, on top of those of the finest pictures, in which the range of depths is found.
 _RANGE_BINS = 2
@@ -76,10 +77,13 @@ def align_set(
     depths_mm: Sequence[float],
     range_mm: tuple[float, float] | None,
     errors: PoseErrors,
+    *,
+    with_lens: bool = False,
 ) -> Aligned:
     """Return the poses by the views, given light on planes at given depths, else on a surface in a range or any.
 
-    Raises BadValue for too few or too small views, or two of one node, and NothingInFocus if the views tell no depths.
+    Raises BadValue for too few or too small views, two of one node, or a lens that cannot be found, and NothingInFocus
+    if the views tell no depths.
     """
     check_views(elemental_set, "an alignment")
     views = len(elemental_set.settings.view)
@@ -92,9 +96,12 @@ def align_set(
         raise BadValue(f"{elemental_set.folder}: two views are of one node; state a node of its own for each")
     bins, shift = default_bins(elemental_set), principal_shift(elemental_set)
     poses = elemental_set.poses_rt_cam_ref
-    posed = PosedViews(luminance(elemental_set, bins), poses, np.zeros((views, 2)) if shift is None else shift).at(
-        poses
-    )
+    if with_lens and shift is not None:
+        raise BadValue(f"{elemental_set.folder}: views have principal points of their own; leave out --with-lens")
+    if with_lens and elemental_set.poses == "measured":
+        raise BadValue(f"{elemental_set.folder}: boards measured its lens better than views; leave out --with-lens")
+    shifts = np.zeros((views, 2)) if shift is None else shift
+    posed = PosedViews(luminance(elemental_set, bins), poses, shifts, with_lens).at(poses)
     folds = Folds.of(views)
     light: Light
     if depths_mm:
@@ -124,7 +131,9 @@ def _prior(elemental_set: ElementalSet, errors: PoseErrors) -> PosePrior:
     if known is None:
         return PosePrior.of_grid(nodes, reference, errors.sigma_rad, errors.sigma_mm)
     groups = [view.homing for view in elemental_set.settings.view]
-    return PosePrior.of_measurement(known, groups, reference, errors.sigma_rad, errors.sigma_mm)
+    homing_mm = _HOMING * distance_of_neighbours(elemental_set)
+    changes = MeasurementErrors(errors.sigma_rad, errors.sigma_mm, homing_mm)
+    return PosePrior.of_measurement(known, groups, reference, changes)
 
 
 def _measured_covariance(elemental_set: ElementalSet) -> NDArray[np.float64] | None:
@@ -148,9 +157,10 @@ def _measured_covariance(elemental_set: ElementalSet) -> NDArray[np.float64] | N
 
 @dataclass(frozen=True)
 class PoseUncertainty:
-    """Covariance of the numbers of all poses (6·view, square), zero for the reference's, and σ of each view.
+    """Covariance of the numbers of the lens, then of all poses, as that of boards is written, and σ of each view.
 
-    `sigma_rad` and `sigma_mm` (view,) are of orientation and centre, each the root of the trace.
+    It is zero for the reference's pose and for what was taken as known. `sigma_rad` and `sigma_mm` (view,) are of
+    orientation and centre, each the root of the trace.
     """
 
     covariance: NDArray[np.float64]
@@ -158,23 +168,36 @@ class PoseUncertainty:
     sigma_mm: NDArray[np.float64]
 
 
-def pose_uncertainty(alignment: Alignment, reference: int) -> PoseUncertainty:
-    """Return the uncertainty of poses, by first-order propagation of that of their steps."""
+def changed_lens(lens: Lens, change: tuple[float, float]) -> Lens:
+    """Return a lens with another relative focal length and first distortion term."""
+    if not any(change):
+        return lens
+    longer, (first, *rest) = 1 + change[0], lens.distortion or (0.0,)
+    distortion = (first + change[1], *rest)
+    return Lens(lens.size_px, longer * lens.fx_px, longer * lens.fy_px, lens.cx_px, lens.cy_px, distortion)
+
+
+def pose_uncertainty(alignment: Alignment, reference: int, lens: Lens) -> PoseUncertainty:
+    """Return the uncertainty of the new poses and lens, by first-order propagation of that of their steps."""
     poses = alignment.rt_cam_ref
     others = np.delete(np.arange(len(poses)), reference)
-    rows = (POSE * others[:, np.newaxis] + np.arange(POSE)).ravel()
-    of_steps = np.zeros((POSE * len(poses),) * 2)
+    size, count = POSE * len(poses), len(lens.parameters)
+    rows = np.concatenate([(POSE * others[:, np.newaxis] + np.arange(POSE)).ravel(), [size, size + 1]])
+    rows = rows[: len(alignment.covariance)]
+    of_steps = np.zeros((size + LENS,) * 2)
     of_steps[np.ix_(rows, rows)] = alignment.covariance
-    numbers, centres = np.zeros_like(of_steps), np.zeros((3 * len(poses), POSE * len(poses)))
+    numbers, centres = np.zeros((count + size, size + LENS)), np.zeros((3 * len(poses), size + LENS))
+    numbers[:2, size] = lens.parameters[:2]
+    numbers[4 : min(count, 5), size + 1] = 1
     for view in range(len(poses)):
         part = slice(POSE * view, POSE * (view + 1))
         for axis in range(POSE):
             step = np.zeros((1, POSE))
             step[0, axis] = _STEP
             ahead, behind = moved(poses[view : view + 1], step)[0], moved(poses[view : view + 1], -step)[0]
-            numbers[part, POSE * view + axis] = (ahead - behind) / (2 * _STEP)
+            numbers[count:][part, POSE * view + axis] = (ahead - behind) / (2 * _STEP)
             centres[3 * view : 3 * view + 3, POSE * view + axis] = (_centre(ahead) - _centre(behind)) / (2 * _STEP)
-    variances = np.diag(of_steps).reshape(-1, POSE)
+    variances = np.diag(of_steps)[:size].reshape(-1, POSE)
     of_centres = np.einsum("ij,jk,ik->i", centres, of_steps, centres).reshape(-1, 3)
     return PoseUncertainty(
         numbers @ of_steps @ numbers.T,
@@ -188,31 +211,23 @@ def _centre(rt_cam_ref: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def shifts_px(
-    elemental_set: ElementalSet, before: NDArray[np.float64], after: NDArray[np.float64], depth_mm: float
+    before: tuple[Lens, NDArray[np.float64]], after: tuple[Lens, NDArray[np.float64]], depth_mm: float
 ) -> NDArray[np.float64]:
     """Return how the picture of a plane at a depth moves in each view, at some of its pixels (view, point, 2).
 
-    `before` and `after` are the poses (view, 6).
+    `before` and `after` are the lens and the poses (view, 6).
     """
-    plane, pixels = fronto_parallel_rt_ref_plane(depth_mm), image_lattice(elemental_set.lens.size_px)
-    lens = elemental_set.lens
-    return np.array(
-        [
-            transfer(lens, new, plane, pixels) - transfer(lens, old, plane, pixels)
-            for old, new in zip(before, after, strict=True)
-        ]
-    )
+    plane, pixels = fronto_parallel_rt_ref_plane(depth_mm), image_lattice(before[0].size_px)
+    old, new = (np.array([transfer(lens, pose, plane, pixels) for pose in poses]) for lens, poses in (before, after))
+    return np.asarray(new - old)
 
 
 def transfer_sigmas_px(
-    elemental_set: ElementalSet, alignment: Alignment, uncertainty: PoseUncertainty, depth_mm: float
+    lens: Lens, poses: NDArray[np.float64], reference: int, uncertainty: PoseUncertainty, depth_mm: float
 ) -> float:
     """Return σ of the transfer between views by a plane at a depth, rms over views and image, as boards' is stated."""
-    lens, reference = elemental_set.lens, elemental_set.reference_view
-    size = len(lens.parameters) + POSE
-    covariances = np.zeros((len(alignment.rt_cam_ref), size, size))
-    for view, of_view in enumerate(covariances):
-        part = slice(POSE * view, POSE * (view + 1))
-        of_view[-POSE:, -POSE:] = uncertainty.covariance[part, part]
-    sigma_px = transfer_sigma_px(lens, alignment.rt_cam_ref, list(covariances), fronto_parallel_rt_ref_plane(depth_mm))
+    count = len(lens.parameters)
+    rows = [[*range(count), *range(count + POSE * view, count + POSE * (view + 1))] for view in range(len(poses))]
+    covariances = [uncertainty.covariance[np.ix_(of_view, of_view)] for of_view in rows]
+    sigma_px = transfer_sigma_px(lens, poses, covariances, fronto_parallel_rt_ref_plane(depth_mm))
     return float(np.sqrt(np.nanmean(np.delete(sigma_px, reference, axis=0) ** 2)))

@@ -20,6 +20,7 @@ from faintfield.pipelines.formats.results.alignment import (
     AlignmentOptions,
     AlignmentRecord,
     HeldOutGain,
+    LensChange,
     PoseErrors,
     ViewChange,
 )
@@ -38,6 +39,7 @@ from faintfield.pipelines.reconstruction.alignment import (
     PoseUncertainty,
     align_set,
     assumed_errors,
+    changed_lens,
     pose_uncertainty,
     shifts_px,
     transfer_sigmas_px,
@@ -45,7 +47,8 @@ from faintfield.pipelines.reconstruction.alignment import (
 from faintfield.pipelines.reconstruction.request import distinct_depths
 from faintfield.pipelines.reconstruction.surface.request import range_in_mm
 from faintfield.pipelines.workflows.reconstruct import open_set
-from faintfield.recon.alignment.cameras import moved
+from faintfield.recon.alignment.cameras import LENS, moved
+from faintfield.recon.alignment.estimate import Alignment
 from faintfield.recon.errors import NothingInFocus
 
 
@@ -71,6 +74,7 @@ def align_views(
     scene: SceneKind = "dark_scene",
     position_error: float | None = None,
     rotation_error_mrad: float | None = None,
+    with_lens: bool = False,
 ) -> AlignmentSummary:
     """Find the poses of a set or session by its views, and write them with their page if they are better.
 
@@ -88,9 +92,11 @@ def align_views(
     depths_mm = distinct_depths([elemental_set.depth_in_mm(value) for value in depth], elemental_set)
     range_mm = None if depth_range is None else range_in_mm(elemental_set, "--depth-range", depth_range)
     errors = assumed_errors(elemental_set, position_error, rotation_error_mrad)
-    options = AlignmentOptions(tuple(depths_mm), range_mm, errors.sigma_mm, 1e3 * errors.sigma_rad, elemental_set.poses)
+    options = AlignmentOptions(
+        tuple(depths_mm), range_mm, errors.sigma_mm, 1e3 * errors.sigma_rad, elemental_set.poses, with_lens
+    )
     try:
-        aligned = align_set(elemental_set, depths_mm, range_mm, errors)
+        aligned = align_set(elemental_set, depths_mm, range_mm, errors, with_lens=with_lens)
     except NothingInFocus as failure:
         return _unchanged(out, f"the views tell no poses: {failure}")
     gain = HeldOutGain(**vars(aligned.alignment.gain))
@@ -102,7 +108,7 @@ def align_views(
         return msgspec.structs.replace(_unchanged(out, why), gain=gain)
     record, uncertainty = _record(elemental_set, aligned, options)
     page = alignment_page(record, aligned.alignment.pictures, elemental_set.units.tone_curve)
-    write_geometry(out, record, {COVARIANCE_FILE: _covariance_file(elemental_set, uncertainty), ALIGNMENT_PAGE: page})
+    write_geometry(out, record, {COVARIANCE_FILE: _covariance_file(record, uncertainty), ALIGNMENT_PAGE: page})
     _inform_of(record)
     figures = {name: getattr(record, name) for name in ("gain", "errors_found", "transfer_sigma_px")}
     said = f"the new poses predict held-out pixels better, by {gain.text}"
@@ -121,17 +127,19 @@ def _record(
     elemental_set: ElementalSet, aligned: Aligned, options: AlignmentOptions
 ) -> tuple[AlignmentRecord, PoseUncertainty]:
     alignment, reference = aligned.alignment, elemental_set.reference_view
-    uncertainty = pose_uncertainty(alignment, reference)
+    old, lens = elemental_set.lens, changed_lens(elemental_set.lens, alignment.lens_change)
+    uncertainty = pose_uncertainty(alignment, reference, lens)
     middle_mm = float(2 / (1 / aligned.depths_mm[0] + 1 / aligned.depths_mm[-1]))
     before, after = elemental_set.poses_rt_cam_ref, alignment.rt_cam_ref
-    shifts = shifts_px(elemental_set, before, after, middle_mm)
-    left = shifts_px(elemental_set, moved(after, -alignment.last_steps), after, middle_mm)
-    camera, nodes = elemental_set.settings.camera, elemental_set.nodes
+    shifts = shifts_px((old, before), (lens, after), middle_mm)
+    left = shifts_px((lens, moved(after, -alignment.last_steps)), (lens, after), middle_mm)
+    nodes = elemental_set.nodes
     turns = alignment.steps[:, 2]
     record = AlignmentRecord(
         source="views",
-        lens=LensRecord("opencv", camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, tuple(camera.distortion)),
-        size_px=camera.size_px,
+        lens=LensRecord("opencv", lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, tuple(lens.distortion)),
+        lens_change=_lens_change(alignment) if options.with_lens else UNSET,
+        size_px=lens.size_px,
         reference_node=nodes[reference],
         nodes=[
             NodeRecord(node, tuple(pose), sigma_mm, sigma_rad)
@@ -151,7 +159,7 @@ def _record(
         bins_px=aligned.bins_px,
         transfer_sigma_px={
             elemental_set.depth_text(float(f"{depth:.3g}")): transfer_sigmas_px(
-                elemental_set, alignment, uncertainty, depth
+                lens, after, reference, uncertainty, depth
             )
             for depth in (aligned.depths_mm[0], aligned.depths_mm[-1])
         },
@@ -160,18 +168,20 @@ def _record(
     return record, uncertainty
 
 
+def _lens_change(alignment: Alignment) -> LensChange:
+    (longer, bent), (sigma, sigma_bent) = alignment.lens_change, np.sqrt(np.diag(alignment.covariance))[-LENS:].tolist()
+    return LensChange(longer, sigma, bent, sigma_bent)
+
+
 def _mean_shift(shift: NDArray[np.float64]) -> tuple[float, float]:
     right, down = np.nanmean(shift, axis=0).tolist()
     return right, down
 
 
-def _covariance_file(elemental_set: ElementalSet, uncertainty: PoseUncertainty) -> bytes:
-    """Return the covariance as that of boards is written: of the lens, which is taken as known, and of all poses."""
-    lens = elemental_set.lens.parameters
-    covariance = np.zeros((len(lens) + len(uncertainty.covariance),) * 2)
-    covariance[len(lens) :, len(lens) :] = uncertainty.covariance
-    content = io.BytesIO()
-    np.savez_compressed(content, covariance=covariance, nodes=np.array(elemental_set.nodes), intrinsics=lens)
+def _covariance_file(record: AlignmentRecord, uncertainty: PoseUncertainty) -> bytes:
+    content, nodes = io.BytesIO(), np.array([entry.node for entry in record.nodes])
+    lens = record.camera_lens().parameters
+    np.savez_compressed(content, covariance=uncertainty.covariance, nodes=nodes, intrinsics=lens)
     return content.getvalue()
 
 
@@ -182,6 +192,12 @@ def _inform_of(record: AlignmentRecord) -> None:
         f"views move by {np.sqrt(np.mean(np.sum(shifts**2, axis=1))):.2f} px rms, at most "
         f"{np.abs(shifts).max():.2f} px, and turn by up to {np.abs(turns).max():.2f}°"
     )
+    if change := record.lens_change or None:
+        inform(
+            f"focal length {record.lens.fx_px:.6g} px, by {100 * change.focal_length:+.3f} ± "
+            f"{100 * change.focal_length_sigma:.3f} %; first distortion term {record.lens.distortion[0]:.4f}, by "
+            f"{change.distortion:+.4f} ± {change.distortion_sigma:.4f}"
+        )
     known = ", ".join(f"{sigma:.2f} px at {depth}" for depth, sigma in record.transfer_sigma_px.items())
     inform(f"transfer between views known to {known}")
     inform(f"held-out pixels are predicted better, by {record.gain.text}")

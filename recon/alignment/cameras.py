@@ -11,13 +11,13 @@ from faintfield.recon.surface.pinhole_views import PinholeViews
 
 type Poses = NDArray[np.float64]
 
-# Numbers of a pose: a rotation, then a translation.
-POSE = 6
+# Numbers of a pose: a rotation, then a translation. Numbers of a lens: focal length, first distortion term.
+POSE, LENS = 6, 2
 
 
 @dataclass(frozen=True)
 class PosedViews:
-    """Views of pinhole cameras whose poses can be moved.
+    """Views of pinhole cameras whose poses can be moved, and whose common lens can be changed.
 
     Attributes
     ----------
@@ -27,17 +27,21 @@ class PosedViews:
         Rodrigues rad and mm, from reference to camera.
     principal_shift : float array (view, 2)
         Subtracted from the rays of views with a principal point of their own.
+    free_lens : bool
+        True if the lens is to be found, too.
     """
 
     views: PinholeViews
     rt_cam_ref: Poses
     principal_shift: NDArray[np.float64]
+    free_lens: bool = False
 
-    def at(self, rt_cam_ref: Poses) -> "PosedViews":
-        """Return the views at other poses."""
+    def at(self, rt_cam_ref: Poses, lens_change: tuple[float, float] = (0.0, 0.0)) -> "PosedViews":
+        """Return the views at other poses, with a changed lens."""
         matrices = np.concatenate([_rotations(rt_cam_ref).as_matrix(), rt_cam_ref[:, 3:, np.newaxis]], axis=2)
         matrices[:, :2] -= self.principal_shift[:, :, np.newaxis] * matrices[:, 2:]
-        return replace(self, views=replace(self.views, ray_from_surface=matrices), rt_cam_ref=rt_cam_ref)
+        views = replace(self.views, ray_from_surface=matrices, lens_change=lens_change)
+        return replace(self, views=views, rt_cam_ref=rt_cam_ref)
 
     def binned(self, bins: int) -> "PosedViews":
         """Return the views with `bins` by `bins` pixels added up."""
@@ -69,6 +73,15 @@ def motion(x: Image, y: Image, inverse_depth: Image | float) -> NDArray[np.float
     along_x = [-x * y, 1 + x * x, -y, q, zero, -x * q]
     along_y = [-(1 + y * y), x * y, x, zero, q, -y * q]
     return np.array([along_x, along_y], np.float32)
+
+
+def lens_motion(x: Image, y: Image) -> NDArray[np.float32]:
+    """Return how the picture of a ray (x, y, 1) moves with the lens, in focal lengths (2, 2, …): outwards.
+
+    The first of the middle two is for the relative change of the focal length, the second for that of distortion.
+    """
+    square = x * x + y * y
+    return np.array([[x, x * square], [y, y * square]], np.float32)
 
 
 def motion_of_step(rt_cam_ref: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -6,11 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
-from faintfield.recon.alignment.cameras import POSE, PosedViews, Poses, moved, steps_between
+from faintfield.recon.alignment.cameras import LENS, POSE, PosedViews, Poses, moved, steps_between
 from faintfield.recon.alignment.light import Light
 from faintfield.recon.alignment.prior import PosePrior
-from faintfield.recon.alignment.score import Cells, Score, log_likelihood, score
+from faintfield.recon.alignment.score import Cells, Score, log_likelihood, partial_scores, score
 
 
 class _Level(NamedTuple):
@@ -38,6 +39,12 @@ _VARIANCE_STEPS, _SMALL_STEP = 3, 0.15
 # Share of the cells that are held out.
 _HELD_OUT = 0.12
 
+# Standard deviations of a lens that is to be found: of the relative focal length, of the first distortion term.
+_LENS_SIGMAS = np.array([0.02, 0.2])
+
+# Parts of the scene, each held out once.
+_PARTS = 4
+
 # Standard errors by which the gain on held-out pixels must exceed zero.
 _SURE = 3.0
 
@@ -52,11 +59,15 @@ class Gain:
         The gain and its standard error, by its scatter over cells.
     cells : int
         Number of cells that were held out.
+    by_gradient : bool
+        True if the value is the derivative along the step from the old to the new poses, which tells small steps
+        better: every part of the scene is held out once, from a step by the others.
     """
 
     value: float
     sigma: float
     cells: int
+    by_gradient: bool = False
 
     @property
     def sure(self) -> bool:
@@ -82,7 +93,10 @@ class Alignment:
     rt_cam_ref : float array (view, 6)
         The new poses, Rodrigues rad and mm.
     covariance : float array (parameter, parameter)
-        Covariance of the steps to all poses but the reference's: a rotation in the frame of the camera, then t.
+        Covariance of the steps to all poses but the reference's: a rotation in the frame of the camera, then t. If the
+        lens was to be found, two numbers of its change follow.
+    lens_change : (float, float)
+        Relative change of the focal length, and change of the first distortion term.
     prior : PosePrior
         The errors of the old poses, as they were estimated.
     gain : Gain
@@ -99,6 +113,7 @@ class Alignment:
 
     rt_cam_ref: Poses
     covariance: NDArray[np.float64]
+    lens_change: tuple[float, float]
     prior: PosePrior
     gain: Gain
     dispersion: float
@@ -111,7 +126,9 @@ class Alignment:
 class _Solution(NamedTuple):
     steps: Poses
     covariance: NDArray[np.float64]
+    lens: NDArray[np.float64]
     scene: NDArray[np.float64]
+    scene_by_cameras: NDArray[np.float64]
     prior: PosePrior
 
 
@@ -135,9 +152,10 @@ class Aligner:
     """
 
     def __init__(self, posed: PosedViews, reference: int, prior: PosePrior, light: Light) -> None:
-        self._posed, self._reference, self._light = posed, reference, light
+        self._reference, self._light, self._lens = reference, light, np.zeros(LENS if posed.free_lens else 0)
         self._others = np.delete(np.arange(len(posed.rt_cam_ref)), reference)
-        self._start, self._poses, self._prior = posed.rt_cam_ref, posed.rt_cam_ref.copy(), prior
+        self._start, self._first_prior = posed.rt_cam_ref, prior
+        self._poses, self._prior = self._start.copy(), prior
         self._binned = {level.bins: posed.binned(level.bins) for level in _LEVELS}
         self._cells = Cells.of(posed.views.light_e.shape, _HELD_OUT)
         self.rounds: list[Round] = []
@@ -168,15 +186,19 @@ class Aligner:
         gain = self._gain(np.nan_to_num(after - before))
         solution, last = self._round(1, _LEVELS[-1].blurs[-1], self._cells.none_held_out(), estimate_variances=True)
         yield self.rounds[-1]
+        new_picture = self._light.picture()
+        if not gain.sure:
+            gain = max(gain, self._gain_by_gradient(), key=lambda choice: choice.sure)
         self.result = Alignment(
             self._poses,
             solution.covariance,
+            self._lens_change(),
             self._prior,
             gain,
             last.dispersion,
             steps_between(self._start, self._poses),
             solution.steps,
-            (picture, self._light.picture()),
+            (picture, new_picture),
             self.rounds,
         )
 
@@ -185,42 +207,84 @@ class Aligner:
         of_cells = self._cells.sums(difference, 1)
         return Gain(float(of_cells.sum()), float(np.sqrt(np.sum(of_cells**2))), int(np.count_nonzero(of_cells)))
 
+    def _gain_by_gradient(self) -> Gain:
+        """Return the gain along a step from the old poses; not above zero unless the whole step is a gain."""
+        posed, dispersion = self._binned[1], self.rounds[-1].dispersion
+        self._light.find_depth(self._binned[_DEPTH_BINS].views)
+        self._light.fit(posed.views, afresh=True)
+        scores = partial_scores(posed, self._light, _PARTS)
+        slopes, curvature = np.zeros(len(scores.part)), 0.0
+        for part, information in enumerate(scores.information):
+            others, error = scores.without(part, dispersion), np.zeros(POSE * len(self._others) + len(self._lens))
+            solution = self._solved(others, error, self._first_prior, _VARIANCE_STEPS)
+            shared = np.concatenate([solution.lens, solution.scene_by_cameras])
+            step = np.hstack([solution.steps, np.broadcast_to(shared, (len(self._start), len(shared)))])
+            patches = scores.part == part
+            slopes[patches] = np.tensordot(scores.gradient[patches], step, 2)
+            curvature += float(np.einsum("vi,vij,vj", step, information, step))
+        value, sigma = float(slopes.sum()), float(np.sqrt(np.sum(slopes**2)))
+        better = value > 0.5 * curvature
+        return Gain(value if better else min(value, 0.0), sigma, int(np.count_nonzero(slopes)), by_gradient=True)
+
     def _at(self, bins: int) -> PosedViews:
-        return self._binned[bins].at(self._poses)
+        return self._binned[bins].at(self._poses, self._lens_change())
+
+    def _lens_change(self) -> tuple[float, float]:
+        return (float(self._lens[0]), float(self._lens[1])) if len(self._lens) else (0.0, 0.0)
 
     def _round(self, bins: int, blur: float, cells: Cells, *, estimate_variances: bool) -> tuple[_Solution, Score]:
         posed = self._at(bins)
         self._light.fit(posed.views, blur)
         precision = np.repeat([1 / self._prior.variances[0], 1 / self._prior.variances[1]], 3)
         scores = score(posed, self._light, cells, precision, bins)
-        solution = self._solved(scores, _VARIANCE_STEPS if estimate_variances else 0)
+        steps = _VARIANCE_STEPS if estimate_variances else 0
+        error = np.concatenate([steps_between(self._start, self._poses)[self._others].ravel(), self._lens])
+        solution = self._solved(scores, error, self._prior, steps)
         self._poses, self._prior = moved(self._poses, solution.steps), solution.prior
-        self._light.change_depth(solution.scene[POSE:])
-        sigmas = np.sqrt(np.diag(solution.covariance))
+        self._lens = self._lens + solution.lens
+        self._light.change_depth(solution.scene[POSE + len(self._lens) :])
+        sigmas = np.sqrt(np.diag(solution.covariance)[: POSE * len(self._others)])
         step = float(np.sqrt(np.mean((solution.steps[self._others].ravel() / sigmas) ** 2)))
         self.rounds.append(Round(bins, step, scores.dispersion))
         return solution, scores
 
-    def _solved(self, scores: Score, variance_steps: int) -> _Solution:
-        """Return the step of all poses, without what changes of the scene explain as well."""
-        of_scene = scores.information[:, POSE:, POSE:].sum(axis=0)
+    def _solved(self, scores: Score, error: NDArray[np.float64], prior: PosePrior, variance_steps: int) -> _Solution:
+        """Return the step of all poses and of the lens, without what changes of the scene explain as well.
+
+        `error` are the steps so far (parameter,).
+        """
+        lens = len(self._lens)
+        of_scene = scores.information[:, POSE + lens :, POSE + lens :].sum(axis=0)
         scale = 1 / np.sqrt(np.maximum(np.diag(of_scene), 1e-300))
         inverse = np.outer(scale, scale) * np.linalg.pinv(of_scene * np.outer(scale, scale), rcond=1e-9, hermitian=True)
-        cross = scores.information[self._others, :POSE, POSE:].reshape(-1, len(of_scene))
-        information = -cross @ inverse @ cross.T
-        for number, view in enumerate(self._others):
-            part = slice(POSE * number, POSE * (number + 1))
-            information[part, part] += scores.information[view, :POSE, :POSE]
-        by_scene = scores.gradient[:, POSE:].sum(axis=0)
-        gradient = scores.gradient[self._others, :POSE].ravel() - cross @ (inverse @ by_scene)
-        error = steps_between(self._start, self._poses)[self._others].ravel()
-        prior = self._prior
+        by_scene = scores.gradient[:, POSE + lens :].sum(axis=0)
+        information, cross, gradient = self._of_cameras(scores)
+        information -= cross @ inverse @ cross.T
+        gradient -= cross @ (inverse @ by_scene)
+        of_poses = slice(0, POSE * len(self._others))
         for left in reversed(range(variance_steps + 1)):
-            precision = prior.precision()
+            precision = block_diag(prior.precision(), np.diag(_LENS_SIGMAS[:lens] ** -2.0))
             covariance = np.linalg.inv(information + precision)
             step = covariance @ (gradient - precision @ error)
             if left:
-                prior = prior.updated(error + step, covariance)
-        steps = np.zeros_like(self._poses)
-        steps[self._others] = step.reshape(-1, POSE)
-        return _Solution(steps, covariance, inverse @ (by_scene - cross.T @ step), prior)
+                prior = prior.updated((error + step)[of_poses], covariance[of_poses, of_poses])
+        steps = np.zeros_like(self._start)
+        steps[self._others] = step[of_poses].reshape(-1, POSE)
+        by_cameras = -inverse @ (cross.T @ step)
+        of_lens = step[of_poses.stop :]
+        return _Solution(steps, covariance, of_lens, inverse @ by_scene + by_cameras, by_cameras, prior)
+
+    def _of_cameras(self, scores: Score) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return the information of poses and lens, what they share with that of the scene, and their gradient.
+
+        The reference's pose has none.
+        """
+        lens = slice(POSE, POSE + len(self._lens))
+        scene = slice(lens.stop, None)
+        of_views = scores.information[self._others]
+        poses = block_diag(*of_views[:, :POSE, :POSE])
+        between = of_views[:, :POSE, lens].reshape(len(poses), -1)
+        of_lens = scores.information[:, lens, lens].sum(axis=0)
+        cross = of_views[:, :POSE, scene].reshape(len(poses), -1), scores.information[:, lens, scene].sum(axis=0)
+        gradient = scores.gradient[self._others, :POSE].ravel(), scores.gradient[:, lens].sum(axis=0)
+        return np.block([[poses, between], [between.T, of_lens]]), np.concatenate(cross), np.concatenate(gradient)

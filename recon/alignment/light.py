@@ -21,8 +21,8 @@ from faintfield.recon.surface.evidence import DepthEvidence, denoised
 from faintfield.recon.surface.pinhole_views import UNKNOWN, PinholeViews, gaussian
 
 # Weight of total variation in units of the noise, for the light of a surface; passes over the data from the last light,
-# for that of planes.
-_STRENGTH, _PASSES = 1.0, 5
+# for that of planes, and from none.
+_STRENGTH, _PASSES, _PASSES_AFRESH = 1.0, 5, 20
 
 # Fewest views of a fold and of the others at samples whose gradient is compared, and the distance to where they lack.
 _MIN_OWN, _MIN_OTHERS, _AWAY = 0.9, 1.5, 2.0
@@ -199,7 +199,7 @@ class PlanesLight:
             last, dual = new if afresh else self._last.get((fold, start.size), new)
             fit = problem.fit(level_e, self.folds.others(fold))
             iterates = pmlem(fit, np.maximum(last, 1e-3 * start), penalty_weight=weight, dual=dual)
-            for _ in range(_PASSES):
+            for _ in range(_PASSES_AFRESH if afresh else _PASSES):
                 iterate = next(iterates)
             self._last[fold, start.size] = iterate.plane, iterate.dual
             self._lights.append(operator.planes_of(iterate.plane))

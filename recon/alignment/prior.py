@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,14 @@ from faintfield.recon.alignment.cameras import POSE
 
 # Least and most of an estimated variance relative to where it starts; most of that of drifts.
 _LEAST, _MOST, _MOST_DRIFT = 1e-6, 1e3, 1.0
+
+
+class MeasurementErrors(NamedTuple):
+    """Standard deviations of what changed since poses were measured: rotations, translations, shifts of a homing."""
+
+    sigma_rad: float
+    sigma_mm: float
+    homing_mm: float
 
 
 @dataclass(frozen=True)
@@ -57,7 +66,7 @@ class PosePrior:
 
     @classmethod
     def of_measurement(
-        cls, covariance: NDArray[np.float64], groups: Sequence[int], reference: int, sigma_rad: float, sigma_mm: float
+        cls, covariance: NDArray[np.float64], groups: Sequence[int], reference: int, errors: MeasurementErrors
     ) -> "PosePrior":
         """Return the prior of poses that were measured with some covariance, and may have changed since.
 
@@ -70,7 +79,7 @@ class PosePrior:
         parts = [(np.eye(len(others)), rotations), (np.eye(len(others)), translations)]
         if together.any():
             parts.append((together.astype(float), translations))
-        start = np.array([sigma_rad**2, sigma_mm**2, (5 * sigma_mm) ** 2])[: len(parts)]
+        start = np.square(errors)[: len(parts)]
         return cls._of(covariance, parts, start, np.column_stack([_LEAST * start, _MOST * start]))
 
     @classmethod

@@ -7,10 +7,11 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.recon.alignment.cameras import POSE, PosedViews, motion, motion_of_step
+from faintfield.recon.alignment.cameras import POSE, PosedViews, lens_motion, motion, motion_of_step
 from faintfield.recon.alignment.light import Layer, Light, depth_shapes
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.operator.surface_operator import homographies_of_surface
+from faintfield.recon.surface.pinhole_views import gaussian
 from faintfield.recon.threads import map_in_threads
 
 # Pixels along the edges of a view that do not count, where a blurred picture is not that of the scene.
@@ -26,15 +27,22 @@ _SIDE_PX, _MIN_CELLS = 16, 300
 # neighbouring pixels.
 _SCATTER_CELLS = 2
 
+# Most samples along the side of a patch of the reference view, and about as many patches at least.
+_PATCH, _MIN_PATCHES = 24, 150
+
+# Blur of the squared errors by which pixels count less where the light does not fit.
+_MISFIT_PX = 4.0
+
 # A view counts less if its gradient scatters this many times more than that of all views.
 _ODD = 4.0
 
 
 @dataclass(frozen=True)
 class Score:
-    """Gradient and information of the log-likelihood of each view, by the step of its pose and by changes of the scene.
+    """Gradient and information of the log-likelihood of each view.
 
-    The latter are motions of the light in its picture, six as those of a camera, then `depth_shapes`.
+    The parameters are the step of its pose, the change of the lens if that is to be found, and changes of the scene:
+    motions of the light in its picture, six as those of a camera and two as those of a lens, then `depth_shapes`.
 
     Attributes
     ----------
@@ -94,39 +102,21 @@ def score(posed: PosedViews, light: Light, cells: Cells, precision: NDArray[np.f
 
     `precision` (6,) is that of a step before the views are looked at, and `bins` the width of the pictures' bins.
     """
-    views, count = posed.views, len(posed.rt_cam_ref)
-    rays = views.rays()
-    at_infinity, slopes = homographies_of_surface(views.ray_from_surface)
+    terms = _Terms(posed, light)
     results: dict[int, tuple[NDArray[np.float64], NDArray[np.float64], float]] = {}
 
     def work(item: tuple[int, list[Layer], NDArray[np.bool_]]) -> None:
         view, layers, seen = item
-        camera = rays + posed.principal_shift[view].astype(np.float32)
-        parts: list[Image] = []
-        for layer in layers:
-            directions = _directions(rays, at_infinity[view], slopes[view], layer.inverse_depth)
-            fields = [
-                motion(camera[..., 0], camera[..., 1], layer.inverse_depth),
-                motion(*directions, layer.inverse_depth),
-            ]
-            if light.smooth_depth:
-                fields.append(_parallax(rays, views.ray_from_surface[view, :, 3], directions, layer.inverse_depth))
-            parts.append(_derivative(layer, fields, views.focal_px))
-        derivative = np.sum(parts, axis=0) if len(parts) > 1 else parts[0]
-        expected = np.sum([layer.picture for layer in layers], axis=0, dtype=np.float32)
-        usable = _inside(seen) & ~cells.pixels(view, expected.shape, bins)
-        weight, error = _weights(usable, views.light_e[view] - expected, views.pixel_variance(expected))
-        flat = derivative.reshape(len(derivative), -1)
-        weighted = flat * weight.ravel()
-        to_motion = np.eye(len(flat))
-        to_motion[:POSE, :POSE] = motion_of_step(posed.rt_cam_ref[view])
-        gradient = to_motion.T @ (weighted @ error.ravel())
+        held_out = cells.pixels(view, seen.shape, bins)
+        flat, weight, error, to_motion = terms.of_view(view, layers, _inside(seen) & ~held_out)
+        weighted = flat * weight
+        gradient = to_motion.T @ (weighted @ error)
         information = to_motion.T @ (weighted @ flat.T) @ to_motion
         own = information[:POSE, :POSE]
         step = to_motion[:POSE, :POSE] @ np.linalg.solve(own + np.diag(precision), gradient[:POSE])
-        left = error.ravel() - step.astype(np.float32) @ flat[:POSE]
+        left = error - step.astype(np.float32) @ flat[:POSE]
         of_cells = to_motion[:POSE, :POSE].T @ cells.sums(
-            (weighted[:POSE] * left).reshape(POSE, *error.shape), bins, _SCATTER_CELLS
+            (weighted[:POSE] * left).reshape(POSE, *seen.shape), bins, _SCATTER_CELLS
         )
         scatter = float(np.sum(of_cells * (np.linalg.pinv(own, hermitian=True) @ of_cells))) / POSE
         results[view] = gradient, information, scatter
@@ -134,12 +124,111 @@ def score(posed: PosedViews, light: Light, cells: Cells, precision: NDArray[np.f
     for item in _layers_of_folds(light):
         map_in_threads(work, item)
     gradients, informations, scatters = (
-        np.array(part) for part in zip(*(results[n] for n in range(count)), strict=True)
+        np.array(part) for part in zip(*(results[n] for n in range(len(results))), strict=True)
     )
     odd = scatters > _ODD * np.median(scatters)
     typical = max(1.0, float(scatters[~odd].mean()))
     dispersion = np.maximum(typical, scatters / _ODD)
     return Score(gradients / dispersion[:, None], informations / dispersion[:, None, None], typical)
+
+
+@dataclass(frozen=True)
+class PartialScores:
+    """Gradient and information of parts of the scene, each a number of square patches of the reference view.
+
+    Errors of the light at one place are alike in all views, so that a patch is the same place in all of them.
+
+    Attributes
+    ----------
+    gradient : float array (patch, view, parameter)
+        Of each patch.
+    part : int array (patch,)
+        The part that a patch belongs to.
+    information : float array (part, view, parameter, parameter)
+        Of each part.
+    """
+
+    gradient: NDArray[np.float64]
+    part: NDArray[np.intp]
+    information: NDArray[np.float64]
+
+    def without(self, part: int, dispersion: float) -> Score:
+        """Return the score of all other parts."""
+        gradient, information = self.gradient[self.part != part].sum(axis=0), np.delete(self.information, part, axis=0)
+        return Score(gradient / dispersion, information.sum(axis=0) / dispersion, dispersion)
+
+
+def partial_scores(posed: PosedViews, light: Light, parts: int) -> PartialScores:
+    """Return the scores of parts of the scene, whose patches are drawn at random."""
+    terms, grid = _Terms(posed, light), posed.views.grid
+    side = min(_PATCH, max(2, int(np.sqrt(np.prod(grid.shape) / _MIN_PATCHES))))
+    rows, columns = (-(-size // side) for size in grid.shape)
+    part_of_patch = np.random.default_rng(0).permutation(np.arange(rows * columns) % parts)
+    results: dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
+
+    def work(item: tuple[int, list[Layer], NDArray[np.bool_]]) -> None:
+        view, layers, seen = item
+        x, y = terms.directions(view, sum(layer.inverse_depth for layer in layers) / len(layers))
+        across, down = (
+            np.clip((place - origin) / (grid.pitch_mm * side), 0, count - 1).astype(np.intp)
+            for place, origin, count in zip((x, y), grid.origin_mm, (columns, rows), strict=True)
+        )
+        patch = (columns * down + across).ravel()
+        flat, weight, error, to_motion = terms.of_view(view, layers, _inside(seen))
+        weighted = flat * weight
+        gradient = np.array([np.bincount(patch, row * error, rows * columns) for row in weighted])
+        part = part_of_patch[patch]
+        informations = [
+            to_motion.T @ (weighted[:, chosen] @ flat[:, chosen].T) @ to_motion
+            for chosen in (part == number for number in range(parts))
+        ]
+        results[view] = gradient.T @ to_motion, np.array(informations)
+
+    for item in _layers_of_folds(light):
+        map_in_threads(work, item)
+    gradients, informations = zip(*(results[n] for n in range(len(results))), strict=True)
+    return PartialScores(np.stack(gradients, axis=1), part_of_patch, np.stack(informations, axis=1))
+
+
+class _Terms:
+    """The derivatives, weights and errors of views."""
+
+    def __init__(self, posed: PosedViews, light: Light) -> None:
+        self._posed, self._smooth_depth = posed, light.smooth_depth
+        self._rays = posed.views.rays()
+        self._at_infinity, self._slopes = homographies_of_surface(posed.views.ray_from_surface)
+
+    def directions(self, view: int, inverse_depth: Image | float) -> tuple[Image, Image]:
+        """Return the directions x and y (row, column) in which the reference view sees what a view's pixels see."""
+        return _directions(self._rays, self._at_infinity[view], self._slopes[view], inverse_depth)
+
+    def of_view(
+        self, view: int, layers: Sequence[Layer], usable: NDArray[np.bool_]
+    ) -> tuple[Image, Image, Image, NDArray[np.float64]]:
+        """Return the derivative (parameter, pixel) by motions of a view, weights and errors (pixel,).
+
+        The last is the matrix (parameter, parameter) from steps to motions.
+        """
+        views, rays = self._posed.views, self._rays
+        camera = rays + self._posed.principal_shift[view].astype(np.float32)
+        parts: list[Image] = []
+        for layer in layers:
+            directions = self.directions(view, layer.inverse_depth)
+            fields = [
+                motion(camera[..., 0], camera[..., 1], layer.inverse_depth),
+                motion(*directions, layer.inverse_depth),
+            ]
+            if self._posed.free_lens:
+                fields = [fields[0], lens_motion(rays[..., 0], rays[..., 1]), fields[1], lens_motion(*directions)]
+            if self._smooth_depth:
+                fields.append(_parallax(rays, views.ray_from_surface[view, :, 3], directions, layer.inverse_depth))
+            parts.append(_derivative(layer, fields, views.focal_px))
+        derivative = np.sum(parts, axis=0) if len(parts) > 1 else parts[0]
+        expected = np.sum([layer.picture for layer in layers], axis=0, dtype=np.float32)
+        weight, error = _weights(usable, views.light_e[view] - expected, views.pixel_variance(expected))
+        to_motion = np.eye(len(derivative))
+        to_motion[:POSE, :POSE] = motion_of_step(self._posed.rt_cam_ref[view])
+        return derivative.reshape(len(derivative), -1), weight.ravel(), error.ravel(), to_motion
 
 
 def log_likelihood(posed: PosedViews, light: Light, cells: Cells) -> NDArray[np.float32]:
@@ -185,8 +274,8 @@ def _weights(usable: NDArray[np.bool_], error: Image, variance: Image) -> tuple[
     """
     weight = np.where(usable, 1 / variance, np.float32(0))
     error = np.where(usable, error, np.float32(0))
-    squares = (weight * error**2)[usable]
-    weight /= np.float32(max(1.0, float(np.median(squares)) / _MEDIAN_SQUARE if squares.size else 1.0))
+    share = np.maximum(gaussian(usable.astype(np.float32), _MISFIT_PX), np.float32(1e-3))
+    weight /= np.maximum(1, gaussian(weight * error**2, _MISFIT_PX) / share)
     weight *= np.minimum(1, _LARGE / np.maximum(np.abs(error) * np.sqrt(weight), np.float32(1e-6)))
     return weight, error
 

@@ -16,6 +16,9 @@ from faintfield.recon.operator.surface_operator import SurfaceOperator
 # Light of a pixel without a valid number; a sum with any such light lies below the second.
 UNKNOWN, _SURELY_UNKNOWN = np.float32(-1e30), np.float32(-1e20)
 
+# Steps by which the change of a lens is undone; the error falls to its square with every two.
+_INVERSION_STEPS = 6
+
 
 @dataclass(frozen=True)
 class PinholeViews:
@@ -37,6 +40,9 @@ class PinholeViews:
         Row and column of each view in the grid of nodes.
     response, noise_share : float32 array (row, column) or float
         The response that the light was divided by, and the share of a pixel's variance that resampling has left.
+    lens_change : (float, float)
+        Relative change of the focal length and change of the first distortion term, which `rays` count, of the lens by
+        which the pictures were made those of a pinhole.
     """
 
     light_e: NDArray[np.float32]
@@ -48,6 +54,7 @@ class PinholeViews:
     nodes: NDArray[np.intp]
     response: NDArray[np.float32] | float = 1.0
     noise_share: NDArray[np.float32] | float = 1.0
+    lens_change: tuple[float, float] = (0.0, 0.0)
 
     def pixel_variance(self, light_e: Image) -> NDArray[np.float32]:
         """Return the variance of pixels of the given light ([view,] row, column)."""
@@ -58,12 +65,20 @@ class PinholeViews:
         """Return the direction of each pixel (row, column, 2), x, y at unit depth."""
         rows, columns = np.indices(self.light_e.shape[1:], np.float32)
         (cx, cy), (fx, fy) = self.centre_px, self.focal_px
-        return np.stack([(columns - np.float32(cx)) / np.float32(fx), (rows - np.float32(cy)) / np.float32(fy)], -1)
+        rays = np.stack([(columns - np.float32(cx)) / np.float32(fx), (rows - np.float32(cy)) / np.float32(fy)], -1)
+        if not any(self.lens_change):
+            return rays
+        longer, bent = np.array(self.lens_change, np.float32)
+        changed = rays
+        for _ in range(_INVERSION_STEPS):
+            square = np.sum(changed**2, axis=-1, keepdims=True)
+            changed = rays / ((1 + longer) * (1 + bent * square))
+        return changed
 
     @cached_property
     def pixel_from_surface(self) -> NDArray[np.float32]:
-        """Matrices (view, 3, 4) from (x, y, 1, 1/depth) to column, row, homogeneous."""
-        (cx, cy), (fx, fy) = self.centre_px, self.focal_px
+        """Matrices (view, 3, 4) from (x, y, 1, 1/depth) to column, row, homogeneous, without a change of distortion."""
+        (cx, cy), (fx, fy) = self.centre_px, np.array(self.focal_px) * (1 + self.lens_change[0])
         pixel_from_ray = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
         return np.asarray(pixel_from_ray @ self.ray_from_surface, np.float32)
 

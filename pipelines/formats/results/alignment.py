@@ -23,16 +23,21 @@ class ViewChange(Struct, frozen=True):
 
 
 class HeldOutGain(Struct, frozen=True):
-    """Log-likelihood of held-out pixels at the new poses less that at the old ones, and its standard error."""
+    """Log-likelihood of held-out pixels at the new poses less that at the old ones, and its standard error.
+
+    `by_gradient`: its derivative along the step from the old to the new poses.
+    """
 
     value: float
     sigma: float
     cells: int
+    by_gradient: bool = False
 
     @property
     def text(self) -> str:
         """The gain in standard errors."""
-        return f"{self.value / self.sigma if self.sigma else 0:.1f} standard errors"
+        along = " of the slope along the step" if self.by_gradient else ""
+        return f"{self.value / self.sigma if self.sigma else 0:.1f} standard errors{along}"
 
 
 class PoseErrors(Struct, frozen=True):
@@ -40,6 +45,15 @@ class PoseErrors(Struct, frozen=True):
 
     sigma_rad: float
     sigma_mm: float
+
+
+class LensChange(Struct, frozen=True):
+    """Relative change of the focal length and change of the first distortion term, each with its σ."""
+
+    focal_length: float
+    focal_length_sigma: float
+    distortion: float
+    distortion_sigma: float
 
 
 class AlignmentOptions(Struct, frozen=True):
@@ -50,6 +64,7 @@ class AlignmentOptions(Struct, frozen=True):
     position_error_mm: float
     rotation_error_mrad: float
     poses: Poses
+    with_lens: bool = False
 
 
 class AlignmentRecord(CameraPoses, frozen=True, kw_only=True):
@@ -60,6 +75,7 @@ class AlignmentRecord(CameraPoses, frozen=True, kw_only=True):
     """
 
     views: list[ViewChange]
+    lens_change: LensChange | UnsetType = UNSET
     gain: HeldOutGain
     errors_assumed: PoseErrors
     errors_found: PoseErrors

@@ -76,7 +76,7 @@ class HomingRecord(Struct, frozen=True):
 class CameraPoses(Struct, frozen=True, kw_only=True):
     """The part of `geometry.json` that a reconstruction needs; a file written by hand may hold nothing else.
 
-    Poses with the `source` "views" go with the lens of their set, and include what homings shifted.
+    Poses with the `source` "views" include what homings shifted.
     """
 
     format: Literal[1] = 1

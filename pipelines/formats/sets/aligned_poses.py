@@ -50,7 +50,7 @@ def alignment_of(folder: Path, images: Sequence[str], sources: Sequence[str]) ->
 def with_poses_of_views(elemental_set: "ElementalSet", path: Path) -> "ElementalSet":
     """Return a set at the poses of a geometry.json that were found by the views; BadValue if it does not fit.
 
-    The lens is that of the set, and the poses include what homings shifted.
+    The poses include what homings shifted.
     """
     geometry, settings = read_geometry(path, CameraPoses), elemental_set.settings
     check_match(path, geometry, elemental_set, elemental_set.nodes)
@@ -59,7 +59,7 @@ def with_poses_of_views(elemental_set: "ElementalSet", path: Path) -> "Elemental
         msgspec.structs.replace(view, rt_cam_ref=poses[node])
         for view, node in zip(settings.view, elemental_set.nodes, strict=True)
     ]
-    aligned = msgspec.structs.replace(settings, view=views)
+    aligned = msgspec.structs.replace(settings, view=views, camera=settings.camera.with_lens(geometry.camera_lens()))
     return replace(elemental_set, settings=aligned, measured_in=path, poses="aligned")
 
 

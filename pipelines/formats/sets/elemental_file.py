@@ -36,6 +36,11 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defau
         """The lens; ValueError if it is impossible."""
         return Lens(self.size_px, self.fx_px, self.fy_px, self.cx_px, self.cy_px, self.distortion)
 
+    def with_lens(self, lens: Lens) -> "Camera":
+        """Return the camera with another lens."""
+        numbers = {name: getattr(lens, name) for name in ("fx_px", "fy_px", "cx_px", "cy_px", "distortion")}
+        return msgspec.structs.replace(self, **numbers)
+
 
 class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """The `[noise]` table; a raw file's own masked pixels give the offset where it is not stated.

@@ -188,7 +188,7 @@ def nominal_view(stop: Stop, centre: Stop, names: list[str], homing: int) -> Vie
 def with_measured_geometry(elemental_set: ElementalSet, path: Path) -> ElementalSet:
     """Return a set with the lens of a geometry.json, each view at its node's measured pose; BadValue if one lacks.
 
-    Poses that were found by the views go with the lens of the set.
+    Poses that were found by the views include what homings shifted.
     """
     path = path / GEOMETRY_FILE if is_folder(path) else path
     geometry, settings = read_geometry(path, CameraPoses), elemental_set.settings
@@ -196,8 +196,7 @@ def with_measured_geometry(elemental_set: ElementalSet, path: Path) -> Elemental
         return with_poses_of_views(elemental_set, path)
     check_match(path, geometry, elemental_set, [view.node for view in settings.view])
     poses = {entry.node: entry.rt_cam_ref for entry in geometry.nodes}
-    stated = ("fx_px", "fy_px", "cx_px", "cy_px", "distortion")
-    camera = msgspec.structs.replace(settings.camera, **{name: getattr(geometry.lens, name) for name in stated})
+    camera = settings.camera.with_lens(geometry.camera_lens())
     shifts_mm = _homing_shifts_mm(path, geometry, elemental_set)
     views = [
         msgspec.structs.replace(

@@ -4,8 +4,10 @@ import shutil
 from json import loads
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
+import tomli_w
 from numpy.typing import NDArray
 
 from faintfield.pipelines.formats.files import write_json
@@ -20,7 +22,7 @@ from faintfield.pipelines.formats.results.geometry import (
     NodeRecord,
     read_geometry,
 )
-from faintfield.pipelines.formats.sets.elemental_set import load_set
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
 from faintfield.pipelines.formats.sets.ground_truth import read_truth
 from faintfield.pipelines.formats.sets.session_set import with_measured_geometry
 from tests.pipelines.conftest import Command
@@ -129,16 +131,67 @@ def test_few_views_and_depths_that_are_none_are_refused(
     assert (ended.returncode, "--depth-range 800:800: is no range" in ended.stderr) == (2, True)
 
 
-def test_damaged_covariance_of_boards_is_refused(scene: Path, tmp_path: Path, faintfield: Command) -> None:
-    elemental_set = load_set(scene)
+def write_geometry_of_boards(out: Path, elemental_set: ElementalSet, poses: NDArray[np.float64]) -> None:
     camera = elemental_set.settings.camera
     nodes = [
-        NodeRecord(node, view.rt_cam_ref, 0.01, 1e-5)
-        for node, view in zip(elemental_set.nodes, elemental_set.settings.view, strict=True)
+        NodeRecord(node, (*pose,), 0.01, 1e-5) for node, pose in zip(elemental_set.nodes, poses.tolist(), strict=True)
     ]
     lens = LensRecord("opencv5", camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.distortion)
     geometry = CameraPoses(lens=lens, size_px=camera.size_px, reference_node=(2, 2), nodes=nodes)
-    write_json(tmp_path / GEOMETRY_FILE, geometry)
+    out.mkdir(exist_ok=True)
+    write_json(out / GEOMETRY_FILE, geometry)
+
+
+def test_shift_of_a_homing_since_the_boards_is_taken_out(tmp_path: Path, done: Command) -> None:
+    done("simulate", tmp_path / "set", *GRID[:-4], "--snr", 4, "--seed", 4)
+    elemental_set = load_set(tmp_path / "set")
+    poses, later = (
+        elemental_set.poses_rt_cam_ref,
+        np.array([node is not None and node[0] > 2 for node in elemental_set.nodes]),
+    )
+    views = [
+        msgspec.structs.replace(view, homing=int(homing))
+        for view, homing in zip(elemental_set.settings.view, later, strict=True)
+    ]
+    settings = msgspec.structs.replace(elemental_set.settings, view=views)
+    (tmp_path / "set" / "elemental.toml").write_bytes(tomli_w.dumps(msgspec.to_builtins(settings)).encode())
+    measured = poses.copy()
+    measured[later, 3] += 0.6
+    write_geometry_of_boards(tmp_path / "boards", elemental_set, measured)
+    lens = len(elemental_set.lens.parameters)
+    covariance = np.zeros((lens + 150,) * 2)
+    covariance[lens:, lens:] = np.diag(np.tile(np.repeat([1e-5, 0.003], 3) ** 2, 25))
+    nodes, intrinsics = np.array(elemental_set.nodes), elemental_set.lens.parameters
+    np.savez(tmp_path / "boards" / COVARIANCE_FILE, covariance=covariance, nodes=nodes, intrinsics=intrinsics)
+
+    planes = ("--depth", 500, "--depth", 700)
+    done("align", tmp_path / "set", "--geometry", tmp_path / "boards", *planes, "--out", tmp_path / "out")
+    aligned = with_measured_geometry(elemental_set, tmp_path / "out").poses_rt_cam_ref
+    right_mm = (aligned - poses)[:, 3]
+    assert right_mm[later].mean() == pytest.approx(right_mm[~later].mean(), abs=0.15)
+
+
+def test_lens_is_found_beside_the_poses(scene: Path, tmp_path: Path, done: Command) -> None:
+    bent = tmp_path / "bent"
+    shutil.copytree(scene, bent)
+    settings = load_set(scene).settings
+    first, *rest = settings.camera.distortion
+    camera = msgspec.structs.replace(settings.camera, distortion=(first + 0.25, *rest))
+    wrong = msgspec.structs.replace(settings, camera=camera)
+    (bent / "elemental.toml").write_bytes(tomli_w.dumps(msgspec.to_builtins(wrong)).encode())
+    done("align", bent, "--with-lens")
+    record = read_geometry(bent / "alignment", AlignmentRecord)
+    assert record.lens_change
+    assert record.lens.distortion[0] == pytest.approx(first, abs=3 * record.lens_change.distortion_sigma)
+    assert record.lens_change.distortion_sigma < 0.06
+    # Depths are free, so that a longer focal length would only make them larger
+    assert record.lens_change.focal_length_sigma > 0.015
+    assert load_set(bent).settings.camera.distortion == record.lens.distortion
+
+
+def test_damaged_covariance_of_boards_is_refused(scene: Path, tmp_path: Path, faintfield: Command) -> None:
+    elemental_set = load_set(scene)
+    write_geometry_of_boards(tmp_path, elemental_set, elemental_set.poses_rt_cam_ref)
     np.savez(tmp_path / COVARIANCE_FILE, covariance=np.zeros((6, 6)), nodes=np.zeros((1, 2)), intrinsics=np.zeros(4))
     ended = faintfield("align", scene, "--geometry", tmp_path, "--depth", 700, "--out", tmp_path / "out")
     assert ended.returncode == 1

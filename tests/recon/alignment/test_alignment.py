@@ -1,5 +1,7 @@
 """Poses moved, and what is known of their errors; the whole of it is tested by `align` on a simulated set."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -7,9 +9,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from faintfield.recon.alignment.cameras import motion, motion_of_step, moved, steps_between
+from faintfield.calib.lens import Lens
+from faintfield.recon.alignment.cameras import lens_motion, motion, motion_of_step, moved, steps_between
 from faintfield.recon.alignment.light import Folds, gradient_gain, gradient_products
-from faintfield.recon.alignment.prior import PosePrior
+from faintfield.recon.alignment.prior import MeasurementErrors, PosePrior
+from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.surface.pinhole_views import PinholeViews
 
 NODES = np.array([(row, column) for row in range(5) for column in range(5)])
 
@@ -54,6 +59,30 @@ def test_motion_is_the_derivative_of_the_ray_by_the_step_of_a_pose() -> None:
         np.testing.assert_allclose(found[:, axis].T, slope, rtol=2e-4, atol=2e-6)
 
 
+def test_rays_of_a_changed_lens_are_those_of_the_lens() -> None:
+    rows, columns, focal_px, centre = 48, 64, 60.0, (31.0, 23.5)
+    grid = PlaneGrid((4, 4), 0.02, (0.0, 0.0))
+    pictures = np.zeros((1, rows, columns), np.float32)
+    views = PinholeViews(pictures, 1.0, np.zeros((1, 3, 4)), (focal_px, focal_px), centre, grid, np.zeros((1, 2), int))
+    lens = Lens((columns, rows), 1.03 * focal_px, 1.03 * focal_px, *centre, (-0.1,))
+    found = replace(views, lens_change=(0.03, -0.1)).rays().swapaxes(0, 1)
+    pixels = np.argwhere(np.ones((columns, rows))).astype(float)
+    np.testing.assert_allclose(found.reshape(-1, 2), np.asarray(lens.rays_at(pixels), float), atol=1e-4)
+
+
+def test_motion_by_the_lens_is_the_derivative_of_the_pixel() -> None:
+    points = np.random.default_rng(5).uniform(-0.5, 0.5, (20, 2))
+
+    def pixels(longer: float, bent: float) -> NDArray[np.float64]:
+        square = np.sum(points**2, axis=1, keepdims=True)
+        return (1 + longer) * points * (1 + bent * square)
+
+    found = lens_motion(points[:, 0].astype(np.float32), points[:, 1].astype(np.float32))
+    for number, step in enumerate(np.eye(2) * 1e-6):
+        slope = (pixels(*step) - pixels(*-step)) / 2e-6
+        np.testing.assert_allclose(found[:, number].T, slope, rtol=1e-4, atol=1e-6)
+
+
 def test_variances_of_poses_are_found_from_errors_that_are_known() -> None:
     generator = np.random.default_rng(1)
     start = PosePrior.of_grid(NODES, 12, sigma_rad=3e-3, sigma_mm=0.3)
@@ -68,7 +97,7 @@ def test_variances_of_poses_are_found_from_errors_that_are_known() -> None:
 
 def test_shift_of_one_group_is_told_from_errors_of_single_views() -> None:
     groups = [0] * 15 + [1] * 10
-    prior = PosePrior.of_measurement(np.zeros((144, 144)), groups, 12, sigma_rad=1e-4, sigma_mm=0.02)
+    prior = PosePrior.of_measurement(np.zeros((144, 144)), groups, 12, MeasurementErrors(1e-4, 0.02, 0.1))
     errors = np.random.default_rng(2).normal(size=(24, 6)) * np.repeat([1e-4, 0.01], 3)
     errors[14:, 3] += 0.4
     for _ in range(60):
