@@ -5,7 +5,7 @@ transfer between views compared as in `benchmarks.calibration.alignment`. COLMAP
 even noise, and all pairs of views. It starts once from the stated poses (points triangulated, then all adjusted
 together, by turns), and once from nothing (incremental mapping). Its model is turned and scaled to the stated poses.
 
-With `--set SET --out COPY`, a copy of a set with COLMAP's poses is written instead.
+With `--copy SET OUT`, a copy of a set with COLMAP's poses is written instead.
 
 COLMAP serves development only. Make an environment for it (`python -m venv build/colmap`, `build/colmap/bin/pip install
 --no-deps pycolmap`), and add its site-packages to the end of PYTHONPATH.
@@ -59,14 +59,12 @@ def main() -> None:
     parser.add_argument("--snr", type=float, nargs="+", default=[0.16, 1.0, 5.0, 20.0, 100.0, 1000.0])
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
     parser.add_argument("--objects", nargs="+", default=["toys", "surfaces"])
-    parser.add_argument("--set", type=Path)
-    parser.add_argument("--out", type=Path)
+    parser.add_argument("--copy", type=Path, nargs=2, metavar=("SET", "OUT"))
     asked = parser.parse_args()
     if pycolmap is None:
         parser.error("pycolmap is missing; install it into an environment of its own, see --help")
-    pycolmap.logging.minloglevel = 3
-    if asked.set:
-        _write_copy(asked.set, asked.out)
+    if asked.copy:
+        _write_copy(*asked.copy)
         return
     print("| scene | SNR | seed | stated px | align: px, s | COLMAP, from stated poses: px, views, s | from nothing |")
     print("|---|---|---|---|---|---|---|")
@@ -122,15 +120,15 @@ def _match_features(elemental_set: ElementalSet, folder: Path) -> None:
         stretched = np.clip((picture - low) * scale, 0, 255).astype(np.uint8)
         filtered = cv2.fastNlMeansDenoising(stretched, None, h=_FILTER * scale)
         cv2.imwrite(str(folder / "pictures" / f"{number:04}.png"), filtered)
-    files = folder / "features.db", folder / "pictures"
     pycolmap.extract_features(
-        *files,
+        folder / "features.db",
+        folder / "pictures",
         camera_mode=pycolmap.CameraMode.PER_IMAGE,
         reader_options=pycolmap.ImageReaderOptions(camera_model="PINHOLE", camera_params="1,1,0,0"),
         extraction_options=pycolmap.FeatureExtractionOptions(sift={"max_num_features": _FEATURES}),
     )
     settings = elemental_set.settings.camera
-    with pycolmap.Database.open(files[0]) as database:
+    with pycolmap.Database.open(folder / "features.db") as database:
         for image in database.read_all_images():
             camera = database.read_camera(image.camera_id)
             centre = elemental_set.principal_points_px[int(Path(image.name).stem)] + 0.5  # of the first pixel
@@ -138,7 +136,9 @@ def _match_features(elemental_set: ElementalSet, folder: Path) -> None:
             camera.has_prior_focal_length = True
             database.update_camera(camera)
     ransac = {"random_seed": _SEED}
-    pycolmap.match_exhaustive(files[0], verification_options=pycolmap.TwoViewGeometryOptions(ransac=ransac))
+    pycolmap.match_exhaustive(
+        folder / "features.db", verification_options=pycolmap.TwoViewGeometryOptions(ransac=ransac)
+    )
 
 
 def _options(error_px: float) -> Any:
