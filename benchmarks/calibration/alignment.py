@@ -77,17 +77,18 @@ def _row(objects: str, options: SyntheticOptions) -> str:
         summary = align_views(folder, out, depth=_DEPTHS_MM if objects == "planes" else ())
         used_s = time.process_time() - started
         aligned = with_measured_geometry(stated, out) if summary.accepted else stated
-        sets = (stated, aligned, _posed(stated, true_poses))
+        sets = (stated, aligned, with_poses(stated, true_poses))
         errors = ", ".join("/".join(f"{error:.4f}" for error in _errors(posed, truth)) for posed in sets)
-        places = _places_of_detail(stated, truth)
-        transfers = ", ".join(f"{_transfer_px(posed, true_poses, places):.2f}" for posed in sets[:2])
+        places = places_of_detail(stated, truth)
+        transfers = ", ".join(f"{transfer_px(posed, true_poses, places):.2f}" for posed in sets[:2])
         nees = f"{_nees(aligned, true_poses, out):.2f}" if summary.accepted else "–"
         gain = f"{summary.gain.value / summary.gain.sigma:.1f} σ" if summary.gain else "–"
         scene = f"| {objects} | {options.snr:g} | {options.seed} "
         return f"{scene}| {used_s:.0f} | {gain} | {nees} | {transfers} | {errors} |"
 
 
-def _posed(elemental_set: ElementalSet, poses: NDArray[np.float64]) -> ElementalSet:
+def with_poses(elemental_set: ElementalSet, poses: NDArray[np.float64]) -> ElementalSet:
+    """Return a set whose views state other poses (view, 6)."""
     views = [
         msgspec.structs.replace(view, rt_cam_ref=tuple(pose))
         for view, pose in zip(elemental_set.settings.view, poses.tolist(), strict=True)
@@ -119,7 +120,7 @@ def _errors(posed: ElementalSet, truth: Truth) -> list[float]:
     return [mean_square_error(found, picture, np.isfinite(depth_mm))]
 
 
-def _places_of_detail(elemental_set: ElementalSet, truth: Truth) -> dict[float, NDArray[np.float64]]:
+def places_of_detail(elemental_set: ElementalSet, truth: Truth) -> dict[float, NDArray[np.float64]]:
     """Return pixels (point, 2) of the reference view where there is detail, by depth."""
     generator, places = np.random.default_rng(0), {}
     if truth.surface is not None:
@@ -139,7 +140,7 @@ def _drawn(picture: NDArray[np.float64], generator: np.random.Generator) -> NDAr
     return np.column_stack([columns, rows]).astype(float)
 
 
-def _transfer_px(
+def transfer_px(
     posed: ElementalSet, true_poses: NDArray[np.float64], places: dict[float, NDArray[np.float64]]
 ) -> float:
     """Return the rms error of the transfer to the views, less what all views have in common."""
