@@ -25,7 +25,7 @@ from faintfield.pipelines.reconstruction.depth.search import check_views, defaul
 from faintfield.pipelines.reconstruction.operators import principal_shift
 from faintfield.recon.alignment.cameras import LENS, POSE, PosedViews, moved
 from faintfield.recon.alignment.estimate import Aligner, Alignment
-from faintfield.recon.alignment.light import Folds, Light, PlanesLight, SurfaceLight
+from faintfield.recon.alignment.light import Folds, PlanesLight, SurfaceLight
 from faintfield.recon.alignment.prior import MeasurementErrors, PosePrior
 from faintfield.recon.errors import NothingInFocus
 from faintfield.recon.surface.estimate import found_range
@@ -103,26 +103,31 @@ def align_set(
     shifts = np.zeros((views, 2)) if shift is None else shift
     posed = PosedViews(luminance(elemental_set, bins), poses, shifts, with_lens).at(poses)
     folds = Folds.of(views)
-    light: Light
+    light: PlanesLight | SurfaceLight
     if depths_mm:
-        light, depths = PlanesLight(folds, [1 / depth for depth in depths_mm]), sorted(depths_mm)
+        light = PlanesLight(folds, [1 / depth for depth in depths_mm])
     else:
         searched = range_mm or searched_range_mm(elemental_set)
-        far, near = 1 / searched[1], 1 / searched[0]
-        if range_mm is None:
-            try:
-                with working("searching the range of depths"):
-                    far, near = found_range(posed.binned(_RANGE_BINS).views, far, near)
-            except NothingInFocus as failure:
-                raise NothingInFocus(f"{failure}; or give the range by --depth-range NEAR:FAR") from failure
-        light, depths = SurfaceLight(folds, far, near), [1 / near, 1 / far]
-        inform(
-            f"depths between {elemental_set.depths_text(*(float(f'{depth:.3g}') for depth in depths), join=' and ')}"
-        )
+        limits = 1 / searched[1], 1 / searched[0]
+        light = SurfaceLight(folds, limits) if range_mm else _light_in_found_range(folds, posed, limits)
     aligner = Aligner(posed, elemental_set.reference_view, _prior(elemental_set, errors), light)
     for _ in progress(aligner.run(), "aligning views", aligner.total):
         pass
+    depths = sorted(depths_mm) if isinstance(light, PlanesLight) else [1 / q for q in reversed(light.limits)]
+    if not depths_mm:
+        inform(
+            f"depths between {elemental_set.depths_text(*(float(f'{depth:.3g}') for depth in depths), join=' and ')}"
+        )
     return Aligned(aligner.result, depths, bins)
+
+
+def _light_in_found_range(folds: Folds, posed: PosedViews, searched: tuple[float, float]) -> SurfaceLight:
+    try:
+        with working("searching the range of depths"):
+            limits = found_range(posed.binned(_RANGE_BINS).views, *searched)
+    except NothingInFocus as failure:
+        raise NothingInFocus(f"{failure}; or give the range by --depth-range NEAR:FAR") from failure
+    return SurfaceLight(folds, limits, searched)
 
 
 def _prior(elemental_set: ElementalSet, errors: PoseErrors) -> PosePrior:

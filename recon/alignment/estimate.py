@@ -1,7 +1,7 @@
 """The poses that explain the views best, given the light of other views: coarse to fine, with a test that they help."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -22,16 +22,21 @@ class _Level(NamedTuple):
 
     bins: int
     blurs: tuple[float, ...]
+    depth_bins: int
     estimate_variances: bool
 
 
 # Coarse to fine. Variances are left alone at first, when wrong poses look like noise.
-_LEVELS = (
-    _Level(4, (1.0, 0.5), estimate_variances=False),
-    _Level(2, (0.5,) * 4, estimate_variances=True),
-    _Level(1, (0.5,) * 3, estimate_variances=True),
-)
 _DEPTH_BINS = 2
+_LEVELS = (
+    _Level(4, (1.0, 0.5), _DEPTH_BINS, estimate_variances=False),
+    _Level(2, (0.5,) * 4, _DEPTH_BINS, estimate_variances=True),
+    _Level(1, (0.5,) * 3, _DEPTH_BINS, estimate_variances=True),
+)
+
+# The level for scenes so bright that the error of the depth is larger than that of the noise: the dispersion shows it.
+_BRIGHT = _Level(1, (0.5,) * 3, 1, estimate_variances=True)
+_BRIGHT_DISPERSION = 2.2
 
 # Steps of the variances in each round; step relative to its standard deviation below which a level is done.
 _VARIANCE_STEPS, _SMALL_STEP = 3, 0.15
@@ -39,8 +44,9 @@ _VARIANCE_STEPS, _SMALL_STEP = 3, 0.15
 # Share of the cells that are held out.
 _HELD_OUT = 0.12
 
-# Standard deviations of a lens that is to be found: of the relative focal length, of the first distortion term.
-_LENS_SIGMAS = np.array([0.02, 0.2])
+# Standard deviations of the relative focal length and of the first distortion term: of a lens that is to be found, and
+# of one that is not, which the covariance counts.
+_LENS_SIGMAS, _KNOWN_LENS_SIGMAS = np.array([0.02, 0.2]), np.array([1e-3, 2e-3])
 
 # Parts of the scene, each held out once.
 _PARTS = 4
@@ -163,7 +169,7 @@ class Aligner:
     @property
     def total(self) -> int:
         """Most rounds."""
-        return sum(len(level.blurs) for level in _LEVELS) + 1
+        return sum(len(level.blurs) for level in (*_LEVELS, _BRIGHT)) + 1
 
     def run(self) -> Iterator[Round]:
         """Do all rounds, and yield each; then `result` is known."""
@@ -172,27 +178,28 @@ class Aligner:
         self._light.fit(finest.views, afresh=True)
         before = log_likelihood(finest, self._light, self._cells)
         picture = self._light.picture()
-        for level in _LEVELS:
+        for level in (*_LEVELS, _BRIGHT):
+            if level is _BRIGHT and not self._bright:
+                break
             if level is not _LEVELS[0]:
-                self._light.find_depth(self._at(_DEPTH_BINS).views)
+                self._light.find_range(self._at(_DEPTH_BINS).views)
+                self._light.find_depth(self._at(level.depth_bins).views)
             for blur in level.blurs:
                 self._round(level.bins, blur, self._cells, estimate_variances=level.estimate_variances)
                 yield self.rounds[-1]
                 if self.rounds[-1].step < _SMALL_STEP:
                     break
-        self._light.find_depth(self._at(_DEPTH_BINS).views)  # as at first: a depth that was adapted would be better
-        self._light.fit(self._at(1).views, afresh=True)
-        after = log_likelihood(self._at(1), self._light, self._cells)
-        gain = self._gain(np.nan_to_num(after - before))
-        solution, last = self._round(1, _LEVELS[-1].blurs[-1], self._cells.none_held_out(), estimate_variances=True)
+        without_final = self._poses, self._lens
+        solution, last = self._round(1, _LEVELS[-1].blurs[-1], self._cells.none_held_out(), final=True)
         yield self.rounds[-1]
         new_picture = self._light.picture()
+        gain = self._gain(before, *without_final)
         if not gain.sure:
             gain = max(gain, self._gain_by_gradient(), key=lambda choice: choice.sure)
         self.result = Alignment(
             self._poses,
             solution.covariance,
-            self._lens_change(),
+            _lens_change(self._lens),
             self._prior,
             gain,
             last.dispersion,
@@ -202,8 +209,18 @@ class Aligner:
             self.rounds,
         )
 
-    def _gain(self, difference: NDArray[np.float32]) -> Gain:
-        """Return the gain, given the difference of log-likelihood of each pixel."""
+    @property
+    def _bright(self) -> bool:
+        """True if errors of a depth that can be found are larger than those by the noise."""
+        return self._light.smooth_depth and self.rounds[-1].dispersion > _BRIGHT_DISPERSION
+
+    def _gain(self, before: NDArray[np.float32], poses: Poses, lens: NDArray[np.float64]) -> Gain:
+        """Return the gain at poses and lens from which cells were held out, given the log-likelihood before."""
+        bins = self._binned
+        depth, finest = (bins[number].at(poses, _lens_change(lens)) for number in (_DEPTH_BINS, 1))
+        self._light.find_depth(depth.views)  # as at first: a depth that was adapted would be better
+        self._light.fit(finest.views, afresh=True)
+        difference = np.nan_to_num(log_likelihood(finest, self._light, self._cells) - before)
         of_cells = self._cells.sums(difference, 1)
         return Gain(float(of_cells.sum()), float(np.sqrt(np.sum(of_cells**2))), int(np.count_nonzero(of_cells)))
 
@@ -227,13 +244,12 @@ class Aligner:
         return Gain(value if better else min(value, 0.0), sigma, int(np.count_nonzero(slopes)), by_gradient=True)
 
     def _at(self, bins: int) -> PosedViews:
-        return self._binned[bins].at(self._poses, self._lens_change())
+        return self._binned[bins].at(self._poses, _lens_change(self._lens))
 
-    def _lens_change(self) -> tuple[float, float]:
-        return (float(self._lens[0]), float(self._lens[1])) if len(self._lens) else (0.0, 0.0)
-
-    def _round(self, bins: int, blur: float, cells: Cells, *, estimate_variances: bool) -> tuple[_Solution, Score]:
-        posed = self._at(bins)
+    def _round(
+        self, bins: int, blur: float, cells: Cells, *, estimate_variances: bool = True, final: bool = False
+    ) -> tuple[_Solution, Score]:
+        posed = replace(self._at(bins), free_lens=final or len(self._lens) > 0)
         self._light.fit(posed.views, blur)
         precision = np.repeat([1 / self._prior.variances[0], 1 / self._prior.variances[1]], 3)
         scores = score(posed, self._light, cells, precision, bins)
@@ -242,7 +258,7 @@ class Aligner:
         solution = self._solved(scores, error, self._prior, steps)
         self._poses, self._prior = moved(self._poses, solution.steps), solution.prior
         self._lens = self._lens + solution.lens
-        self._light.change_depth(solution.scene[POSE + len(self._lens) :])
+        self._light.change_depth(solution.scene[POSE + scores.lens :])
         sigmas = np.sqrt(np.diag(solution.covariance)[: POSE * len(self._others)])
         step = float(np.sqrt(np.mean((solution.steps[self._others].ravel() / sigmas) ** 2)))
         self.rounds.append(Round(bins, step, scores.dispersion))
@@ -253,7 +269,7 @@ class Aligner:
 
         `error` are the steps so far (parameter,).
         """
-        lens = len(self._lens)
+        lens, free = scores.lens, len(self._lens)
         of_scene = scores.information[:, POSE + lens :, POSE + lens :].sum(axis=0)
         scale = 1 / np.sqrt(np.maximum(np.diag(of_scene), 1e-300))
         inverse = np.outer(scale, scale) * np.linalg.pinv(of_scene * np.outer(scale, scale), rcond=1e-9, hermitian=True)
@@ -261,9 +277,11 @@ class Aligner:
         information, cross, gradient = self._of_cameras(scores)
         information -= cross @ inverse @ cross.T
         gradient -= cross @ (inverse @ by_scene)
-        of_poses = slice(0, POSE * len(self._others))
+        of_poses, count = slice(0, POSE * len(self._others)), POSE * len(self._others) + free
+        by_lens = information[:count, count:]
+        information, cross, gradient = information[:count, :count], cross[:count], gradient[:count]
         for left in reversed(range(variance_steps + 1)):
-            precision = block_diag(prior.precision(), np.diag(_LENS_SIGMAS[:lens] ** -2.0))
+            precision = block_diag(prior.precision(), np.diag(_LENS_SIGMAS[:free] ** -2.0))
             covariance = np.linalg.inv(information + precision)
             step = covariance @ (gradient - precision @ error)
             if left:
@@ -271,7 +289,8 @@ class Aligner:
         steps = np.zeros_like(self._start)
         steps[self._others] = step[of_poses].reshape(-1, POSE)
         by_cameras = -inverse @ (cross.T @ step)
-        of_lens = step[of_poses.stop :]
+        of_lens, turned = step[of_poses.stop :], covariance @ by_lens * _KNOWN_LENS_SIGMAS[: by_lens.shape[1]]
+        covariance += turned @ turned.T
         return _Solution(steps, covariance, of_lens, inverse @ by_scene + by_cameras, by_cameras, prior)
 
     def _of_cameras(self, scores: Score) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -279,7 +298,7 @@ class Aligner:
 
         The reference's pose has none.
         """
-        lens = slice(POSE, POSE + len(self._lens))
+        lens = slice(POSE, POSE + scores.lens)
         scene = slice(lens.stop, None)
         of_views = scores.information[self._others]
         poses = block_diag(*of_views[:, :POSE, :POSE])
@@ -288,3 +307,7 @@ class Aligner:
         cross = of_views[:, :POSE, scene].reshape(len(poses), -1), scores.information[:, lens, scene].sum(axis=0)
         gradient = scores.gradient[self._others, :POSE].ravel(), scores.gradient[:, lens].sum(axis=0)
         return np.block([[poses, between], [between.T, of_lens]]), np.concatenate(cross), np.concatenate(gradient)
+
+
+def _lens_change(lens: NDArray[np.float64]) -> tuple[float, float]:
+    return (float(lens[0]), float(lens[1])) if len(lens) else (0.0, 0.0)

@@ -1,12 +1,14 @@
 """The light that explains the views, on a surface or on planes: each view by that of the views in other folds."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from faintfield.recon.errors import NothingInFocus
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.scene_operator import SceneOperator
 from faintfield.recon.operator.single_plane import PlaneOperator
@@ -16,7 +18,7 @@ from faintfield.recon.solver.initialization import mean_light_e
 from faintfield.recon.solver.penalty_weight import MAX_FOLDS, universal_penalty_weight, validation_views
 from faintfield.recon.solver.pmlem import pmlem
 from faintfield.recon.solver.proximal import DualField
-from faintfield.recon.surface.estimate import equal_steps, first_depths, halves, next_depths
+from faintfield.recon.surface.estimate import equal_steps, first_depths, found_range, halves, next_depths
 from faintfield.recon.surface.evidence import DepthEvidence, denoised
 from faintfield.recon.surface.pinhole_views import UNKNOWN, PinholeViews, gaussian
 
@@ -80,6 +82,9 @@ class Light(Protocol):
     smooth_depth: bool
     """True if depth can change by `depth_shapes`."""
 
+    def find_range(self, views: PinholeViews) -> None:
+        """Find the range of depths again, if neither it nor the depth is given."""
+
     def find_depth(self, views: PinholeViews) -> None:
         """Find the depth again, if it is not given."""
 
@@ -100,16 +105,22 @@ class Light(Protocol):
 
 
 class SurfaceLight:
-    """Light on a surface, whose 1/depth is found between two limits."""
+    """Light on a surface, whose 1/depth is found between `limits`, which themselves are found within `searched`."""
 
     smooth_depth = True
 
-    def __init__(self, folds: Folds, far: float, near: float) -> None:
-        self.folds, self._limits = folds, (far, near)
+    def __init__(self, folds: Folds, limits: tuple[float, float], searched: tuple[float, float] | None = None) -> None:
+        self.folds, self.limits, self._searched = folds, limits, searched
+
+    def find_range(self, views: PinholeViews) -> None:
+        """Find the limits again; they stay if the views tell none."""
+        if self._searched is not None:
+            with suppress(NothingInFocus):
+                self.limits = found_range(views, *self._searched)
 
     def find_depth(self, views: PinholeViews) -> None:
         """Find the depth of each sample of these views."""
-        depths = equal_steps(views, *self._limits)
+        depths = equal_steps(views, *self.limits)
         evidence = DepthEvidence(views, depths, halves(views.nodes))
         index, _ = next_depths(evidence, evidence.explained(first_depths(evidence)))
         self._inverse_depth, self._grid = np.interp(index, np.arange(len(depths)), depths), views.grid
@@ -173,6 +184,9 @@ class PlanesLight:
     def __init__(self, folds: Folds, inverse_depths: Sequence[float]) -> None:
         self.folds, self._inverse_depths = folds, list(inverse_depths)
         self._last: dict[tuple[int, int], tuple[Image, DualField]] = {}
+
+    def find_range(self, views: PinholeViews) -> None:
+        """Do nothing: the depths are given."""
 
     def find_depth(self, views: PinholeViews) -> None:
         """Do nothing: the depths are given."""

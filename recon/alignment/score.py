@@ -7,7 +7,7 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.recon.alignment.cameras import POSE, PosedViews, lens_motion, motion, motion_of_step
+from faintfield.recon.alignment.cameras import LENS, POSE, PosedViews, lens_motion, motion, motion_of_step
 from faintfield.recon.alignment.light import Layer, Light, depth_shapes
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.operator.surface_operator import homographies_of_surface
@@ -50,11 +50,14 @@ class Score:
         Divided by the dispersion.
     dispersion : float
         Variance of the gradient relative to what the noise explains, by its scatter over cells of the pictures; ≥ 1.
+    lens : int
+        Number of parameters of the lens.
     """
 
     gradient: NDArray[np.float64]
     information: NDArray[np.float64]
     dispersion: float
+    lens: int
 
 
 @dataclass(frozen=True)
@@ -129,7 +132,8 @@ def score(posed: PosedViews, light: Light, cells: Cells, precision: NDArray[np.f
     odd = scatters > _ODD * np.median(scatters)
     typical = max(1.0, float(scatters[~odd].mean()))
     dispersion = np.maximum(typical, scatters / _ODD)
-    return Score(gradients / dispersion[:, None], informations / dispersion[:, None, None], typical)
+    lens = LENS if posed.free_lens else 0
+    return Score(gradients / dispersion[:, None], informations / dispersion[:, None, None], typical, lens)
 
 
 @dataclass(frozen=True)
@@ -146,16 +150,19 @@ class PartialScores:
         The part that a patch belongs to.
     information : float array (part, view, parameter, parameter)
         Of each part.
+    lens : int
+        Number of parameters of the lens.
     """
 
     gradient: NDArray[np.float64]
     part: NDArray[np.intp]
     information: NDArray[np.float64]
+    lens: int
 
     def without(self, part: int, dispersion: float) -> Score:
         """Return the score of all other parts."""
         gradient, information = self.gradient[self.part != part].sum(axis=0), np.delete(self.information, part, axis=0)
-        return Score(gradient / dispersion, information.sum(axis=0) / dispersion, dispersion)
+        return Score(gradient / dispersion, information.sum(axis=0) / dispersion, dispersion, self.lens)
 
 
 def partial_scores(posed: PosedViews, light: Light, parts: int) -> PartialScores:
@@ -187,7 +194,8 @@ def partial_scores(posed: PosedViews, light: Light, parts: int) -> PartialScores
     for item in _layers_of_folds(light):
         map_in_threads(work, item)
     gradients, informations = zip(*(results[n] for n in range(len(results))), strict=True)
-    return PartialScores(np.stack(gradients, axis=1), part_of_patch, np.stack(informations, axis=1))
+    lens = LENS if posed.free_lens else 0
+    return PartialScores(np.stack(gradients, axis=1), part_of_patch, np.stack(informations, axis=1), lens)
 
 
 class _Terms:
