@@ -141,17 +141,26 @@ def _drawn(picture: NDArray[np.float64], generator: np.random.Generator) -> NDAr
 
 
 def transfer_px(
-    posed: ElementalSet, true_poses: NDArray[np.float64], places: dict[float, NDArray[np.float64]]
+    posed: ElementalSet,
+    true_poses: NDArray[np.float64],
+    places: dict[float, NDArray[np.float64]],
+    *,
+    without_drift: bool = False,
 ) -> float:
-    """Return the rms error of the transfer to the views, less what all views have in common."""
-    squares = []
+    """Return the rms error of the transfer to the views, less what all views have in common.
+
+    Without drift: less what is linear in row and column of the nodes, too, as by another depth.
+    """
+    squares, ones = [], np.ones((len(true_poses), 1))
+    shared = np.hstack([ones, np.array(posed.nodes, float)]) if without_drift else ones
+    projection = np.eye(len(ones)) - shared @ np.linalg.pinv(shared)
     for depth_mm, pixels in places.items():
         plane = fronto_parallel_rt_ref_plane(depth_mm)
         moved = [
             transfer(posed.lens, found, plane, pixels) - transfer(posed.lens, true, plane, pixels)
             for found, true in zip(posed.poses_rt_cam_ref, true_poses, strict=True)
         ]
-        squares.append(np.sum((moved - np.mean(moved, axis=0)) ** 2, axis=2))
+        squares.append(np.sum(np.tensordot(projection, np.array(moved), 1) ** 2, axis=2))
     return float(np.sqrt(np.mean(squares)))
 
 
