@@ -5,10 +5,9 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import cache
 from multiprocessing.util import register_after_fork
-from typing import TYPE_CHECKING
+from threading import Lock
 
-if TYPE_CHECKING:
-    from threadpoolctl import ThreadpoolController
+from threadpoolctl import ThreadpoolController
 
 
 @cache
@@ -16,11 +15,26 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, "recon")
 
 
-@cache
-def _blas() -> "ThreadpoolController":
-    from threadpoolctl import ThreadpoolController
+class _OneBlasThread:
+    """A context in which BLAS takes one thread; the last of several that overlap ends it."""
 
-    return ThreadpoolController()
+    def __init__(self) -> None:
+        self._lock, self._users = Lock(), 0
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if self._users == 0:
+                self._limit = ThreadpoolController().limit(limits=1, user_api="blas")
+            self._users += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._users -= 1
+            if self._users == 0:
+                self._limit.restore_original_limits()
+
+
+_one_blas_thread = _OneBlasThread()
 
 
 # A forked process inherits the pools, but not their threads
@@ -71,7 +85,7 @@ def map_in_threads[Item, Result](work: Callable[[Item], Result], items: Sequence
     count = min(int(config.NUMBA_NUM_THREADS), len(items)) - 1
     others: list[Future[None]] = []
     try:
-        with _blas().limit(limits=1, user_api="blas"):
+        with _one_blas_thread:
             others += [_pool(count).submit(take) for _ in range(count)]
             take()
             wait(others)

@@ -41,6 +41,15 @@ _CHANGE, _CHANGE_RAD, _HOMING = 2e-4, 3e-5, 2e-3
 # Bins, on top of those of the finest pictures, in which the range of depths is found.
 _RANGE_BINS = 2
 
+# Powers of the ray that OpenCV's terms of distortion multiply: k1, k2, p1, p2, k3 to k6.
+_POWERS = np.array([2, 4, 1, 1, 6, 2, 4, 6])
+
+# Least errors that are assumed, relative to the distance of neighbours and in rad: smaller ones are none.
+_LEAST_ERROR, _LEAST_RAD = 1e-6, 1e-9
+
+# Negative eigenvalue of a covariance, relative to its largest, that is due to rounding.
+_ROUNDING = 1e-6
+
 # Step of a pose for derivatives.
 _STEP = 1e-6
 
@@ -58,9 +67,10 @@ def assumed_errors(elemental_set: ElementalSet, position: float | None, rotation
     """Return the errors of the poses: those stated, else what suits nominal or measured poses."""
     measured = elemental_set.poses == "measured"
     rad, share = (_CHANGE_RAD, _CHANGE) if measured else (_STAGE_RAD, _STAGE_ERROR)
+    apart = distance_of_neighbours(elemental_set)
     return PoseErrors(
-        rad if rotation_mrad is None else 1e-3 * rotation_mrad,
-        share * distance_of_neighbours(elemental_set) if position is None else position,
+        rad if rotation_mrad is None else max(1e-3 * rotation_mrad, _LEAST_RAD),
+        share * apart if position is None else max(position, _LEAST_ERROR * apart),
     )
 
 
@@ -68,7 +78,7 @@ def distance_of_neighbours(elemental_set: ElementalSet) -> float:
     """Return the median distance of a camera from its nearest neighbour, in the unit of the poses."""
     centres = np.array([_centre(pose) for pose in elemental_set.poses_rt_cam_ref])
     apart = np.linalg.norm(centres[:, np.newaxis] - centres, axis=2)
-    np.fill_diagonal(apart, np.inf)
+    apart[apart == 0] = np.inf  # from itself and from others at its place
     return float(np.median(apart.min(axis=1)))
 
 
@@ -99,7 +109,7 @@ def align_set(
     if with_lens and shift is not None:
         raise BadValue(f"{elemental_set.folder}: views have principal points of their own; leave out --with-lens")
     if with_lens and elemental_set.poses == "measured":
-        raise BadValue(f"{elemental_set.folder}: boards measured its lens better than views; leave out --with-lens")
+        raise BadValue(f"{elemental_set.folder}: boards know its lens better than views can; leave out --with-lens")
     shifts = np.zeros((views, 2)) if shift is None else shift
     posed = PosedViews(luminance(elemental_set, bins), poses, shifts, with_lens).at(poses)
     folds = Folds.of(views)
@@ -155,6 +165,9 @@ def _measured_covariance(elemental_set: ElementalSet) -> NDArray[np.float64] | N
     arrays = read_arrays(path, ["covariance"], shape=(size, size), max_bytes=8 * size**2, remedy=remedy)
     if "covariance" not in arrays or not np.isfinite(arrays["covariance"]).all():
         raise BadValue(f"{path}: holds no covariance, or numbers that are not finite; {remedy}")
+    least, *_, largest = np.linalg.eigvalsh(arrays["covariance"])
+    if least < -_ROUNDING * largest:
+        raise BadValue(f"{path}: holds a covariance that is not positive; {remedy}")
     others = [node for number, node in enumerate(elemental_set.nodes) if number != elemental_set.reference_view]
     rows = np.concatenate([lens + POSE * places.index(node) + np.arange(POSE) for node in others])
     return np.asarray(arrays["covariance"][np.ix_(rows, rows)], np.float64)
@@ -174,12 +187,18 @@ class PoseUncertainty:
 
 
 def changed_lens(lens: Lens, change: tuple[float, float]) -> Lens:
-    """Return a lens with another relative focal length and first distortion term."""
+    """Return the lens D((1 + l)(1 + b r²) r) of another lens D, to fourth order in the ray r, for a change (l, b)."""
     if not any(change):
         return lens
-    longer, (first, *rest) = 1 + change[0], lens.distortion or (0.0,)
-    distortion = (first + change[1], *rest)
-    return Lens(lens.size_px, longer * lens.fx_px, longer * lens.fy_px, lens.cx_px, lens.cy_px, distortion)
+    longer, bent = change
+    distortion = np.array(lens.distortion or (0.0,)) * (1 + longer) ** _POWERS[: max(len(lens.distortion), 1)]
+    if len(distortion) > 1:
+        distortion[1] += 3 * bent * distortion[0]
+    if len(distortion) > 6:
+        distortion[6] += 2 * bent * distortion[5]
+    distortion[0] += bent
+    focal_px = (1 + longer) * lens.fx_px, (1 + longer) * lens.fy_px
+    return Lens(lens.size_px, *focal_px, lens.cx_px, lens.cy_px, tuple(distortion.tolist()))
 
 
 def pose_uncertainty(alignment: Alignment, reference: int, lens: Lens) -> PoseUncertainty:

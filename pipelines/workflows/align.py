@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import msgspec
@@ -9,9 +10,10 @@ import numpy as np
 from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 
+from faintfield.calib.lens import Lens
 from faintfield.pipelines.arguments import SceneKind
 from faintfield.pipelines.console import inform
-from faintfield.pipelines.errors import OutputExists
+from faintfield.pipelines.errors import BadValue, MissingFile, OutputExists
 from faintfield.pipelines.formats.files import check_results_folder, exclusive, remove
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.reading import is_folder
@@ -28,8 +30,10 @@ from faintfield.pipelines.formats.results.geometry import (
     ALIGNMENT_FOLDER,
     COVARIANCE_FILE,
     GEOMETRY_FILE,
+    CameraPoses,
     LensRecord,
     NodeRecord,
+    read_geometry,
     write_geometry,
 )
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, check_exists
@@ -86,6 +90,7 @@ def align_views(
     check_exists(folder)
     out = out or (folder if is_folder(folder) else folder.parent) / ALIGNMENT_FOLDER
     check_results_folder(out)
+    _check_not_of_boards(out)
     elemental_set, _ = open_set(folder, out, scene, geometry, aligned=False)
     if elemental_set.measured_in is not None and out.resolve() == elemental_set.measured_in.parent.resolve():
         raise OutputExists(f"{out}: holds the geometry.json that the alignment starts from; name another --out")
@@ -102,8 +107,8 @@ def align_views(
     gain = HeldOutGain(**vars(aligned.alignment.gain))
     if not aligned.alignment.gain.sure:
         why = (
-            "the poses stay as they are: those by the views predict held-out pixels no better, beyond chance "
-            f"({gain.text}; 3 are needed)"
+            "the poses stay as they are: the new ones do not predict held-out pixels better, beyond chance (gain of "
+            f"{gain.text}; more than 3 are needed)"
         )
         return msgspec.structs.replace(_unchanged(out, why), gain=gain)
     record, uncertainty = _record(elemental_set, aligned, options)
@@ -115,10 +120,18 @@ def align_views(
     return AlignmentSummary(True, said, str(out), str(out / ALIGNMENT_PAGE), **figures)
 
 
+def _check_not_of_boards(out: Path) -> None:
+    """Refuse a folder with poses of another command (OutputExists); a damaged file is replaced."""
+    with suppress(BadValue, MissingFile):
+        if read_geometry(out, CameraPoses).source is UNSET:
+            raise OutputExists(f"{out}: holds a {GEOMETRY_FILE} that was not found by the views; name another --out")
+
+
 def _unchanged(out: Path, reason: str) -> AlignmentSummary:
     """Say that there are no new poses, and remove those of an earlier call."""
     with exclusive(out):
-        remove(out / GEOMETRY_FILE)
+        for name in (GEOMETRY_FILE, COVARIANCE_FILE, ALIGNMENT_PAGE):
+            remove(out / name)
     inform(reason)
     return AlignmentSummary(False, reason)
 
@@ -138,7 +151,7 @@ def _record(
     record = AlignmentRecord(
         source="views",
         lens=LensRecord("opencv", lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, tuple(lens.distortion)),
-        lens_change=_lens_change(alignment) if options.with_lens else UNSET,
+        lens_change=_lens_change(old, lens, alignment) if options.with_lens else UNSET,
         size_px=lens.size_px,
         reference_node=nodes[reference],
         nodes=[
@@ -168,9 +181,10 @@ def _record(
     return record, uncertainty
 
 
-def _lens_change(alignment: Alignment) -> LensChange:
-    (longer, bent), (sigma, sigma_bent) = alignment.lens_change, np.sqrt(np.diag(alignment.covariance))[-LENS:].tolist()
-    return LensChange(longer, sigma, bent, sigma_bent)
+def _lens_change(old: Lens, new: Lens, alignment: Alignment) -> LensChange:
+    sigma, sigma_bent = np.sqrt(np.diag(alignment.covariance))[-LENS:].tolist()
+    bent = new.distortion[0] - (*old.distortion, 0.0)[0]
+    return LensChange(alignment.lens_change[0], sigma, bent, sigma_bent)
 
 
 def _mean_shift(shift: NDArray[np.float64]) -> tuple[float, float]:

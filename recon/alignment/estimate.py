@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -48,9 +49,6 @@ _HELD_OUT = 0.12
 # of one that is not, which the covariance counts.
 _LENS_SIGMAS, _KNOWN_LENS_SIGMAS = np.array([0.02, 0.2]), np.array([1e-3, 2e-3])
 
-# Parts of the scene, each held out once.
-_PARTS = 4
-
 # Standard errors by which the gain on held-out pixels must exceed zero.
 _SURE = 3.0
 
@@ -66,8 +64,8 @@ class Gain:
     cells : int
         Number of cells that were held out.
     by_gradient : bool
-        True if the value is the derivative along the step from the old to the new poses, which tells small steps
-        better: every part of the scene is held out once, from a step by the others.
+        True if the value is the slope along a first step from the old poses, which tells small steps better: each part
+        of the scene is held out once, and the step found from the others.
     """
 
     value: float
@@ -174,10 +172,6 @@ class Aligner:
     def run(self) -> Iterator[Round]:
         """Do all rounds, and yield each; then `result` is known."""
         self._light.find_depth(self._binned[_DEPTH_BINS].views)
-        finest = self._binned[1]
-        self._light.fit(finest.views, afresh=True)
-        before = log_likelihood(finest, self._light, self._cells)
-        picture = self._light.picture()
         for level in (*_LEVELS, _BRIGHT):
             if level is _BRIGHT and not self._bright:
                 break
@@ -193,9 +187,11 @@ class Aligner:
         solution, last = self._round(1, _LEVELS[-1].blurs[-1], self._cells.none_held_out(), final=True)
         yield self.rounds[-1]
         new_picture = self._light.picture()
-        gain = self._gain(before, *without_final)
-        if not gain.sure:
-            gain = max(gain, self._gain_by_gradient(), key=lambda choice: choice.sure)
+        after, before = self._log_likelihood(*without_final), self._log_likelihood(self._start, np.zeros(0))
+        old_picture, gain = self._light.picture(), self._gain(np.nan_to_num(after - before))
+        if abs(gain.value) <= _SURE * gain.sigma:  # a sure loss is an answer, too
+            slope = self._slope()
+            gain = gain if slope is None or not slope.sure else slope
         self.result = Alignment(
             self._poses,
             solution.covariance,
@@ -205,7 +201,7 @@ class Aligner:
             last.dispersion,
             steps_between(self._start, self._poses),
             solution.steps,
-            (picture, new_picture),
+            (old_picture, new_picture),
             self.rounds,
         )
 
@@ -214,22 +210,22 @@ class Aligner:
         """True if errors of a depth that can be found are larger than those by the noise."""
         return self._light.smooth_depth and self.rounds[-1].dispersion > _BRIGHT_DISPERSION
 
-    def _gain(self, before: NDArray[np.float32], poses: Poses, lens: NDArray[np.float64]) -> Gain:
-        """Return the gain at poses and lens from which cells were held out, given the log-likelihood before."""
-        bins = self._binned
-        depth, finest = (bins[number].at(poses, _lens_change(lens)) for number in (_DEPTH_BINS, 1))
-        self._light.find_depth(depth.views)  # as at first: a depth that was adapted would be better
-        self._light.fit(finest.views, afresh=True)
-        difference = np.nan_to_num(log_likelihood(finest, self._light, self._cells) - before)
+    def _log_likelihood(self, poses: Poses, lens: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Return the log-likelihood of held-out pixels, with light and depth found afresh."""
+        for bins, find in ((_DEPTH_BINS, self._light.find_depth), (1, partial(self._light.fit, afresh=True))):
+            posed = self._binned[bins].at(poses, _lens_change(lens))
+            find(posed.views)
+        return log_likelihood(posed, self._light, self._cells)
+
+    def _gain(self, difference: NDArray[np.float32]) -> Gain:
+        """Return the gain, given the difference of log-likelihood of each pixel."""
         of_cells = self._cells.sums(difference, 1)
         return Gain(float(of_cells.sum()), float(np.sqrt(np.sum(of_cells**2))), int(np.count_nonzero(of_cells)))
 
-    def _gain_by_gradient(self) -> Gain:
-        """Return the gain along a step from the old poses; not above zero unless the whole step is a gain."""
+    def _slope(self) -> Gain | None:
+        """Return the slope along a first step from the old poses, at their light; None if the whole step is no gain."""
         posed, dispersion = self._binned[1], self.rounds[-1].dispersion
-        self._light.find_depth(self._binned[_DEPTH_BINS].views)
-        self._light.fit(posed.views, afresh=True)
-        scores = partial_scores(posed, self._light, _PARTS)
+        scores = partial_scores(posed, self._light)
         slopes, curvature = np.zeros(len(scores.part)), 0.0
         for part, information in enumerate(scores.information):
             others, error = scores.without(part, dispersion), np.zeros(POSE * len(self._others) + len(self._lens))
@@ -240,8 +236,9 @@ class Aligner:
             slopes[patches] = np.tensordot(scores.gradient[patches], step, 2)
             curvature += float(np.einsum("vi,vij,vj", step, information, step))
         value, sigma = float(slopes.sum()), float(np.sqrt(np.sum(slopes**2)))
-        better = value > 0.5 * curvature
-        return Gain(value if better else min(value, 0.0), sigma, int(np.count_nonzero(slopes)), by_gradient=True)
+        if value <= 0.5 * curvature:
+            return None
+        return Gain(value, sigma, int(np.count_nonzero(slopes)), by_gradient=True)
 
     def _at(self, bins: int) -> PosedViews:
         return self._binned[bins].at(self._poses, _lens_change(self._lens))

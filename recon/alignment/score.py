@@ -28,7 +28,7 @@ _SIDE_PX, _MIN_CELLS = 16, 300
 _SCATTER_CELLS = 2
 
 # Most samples along the side of a patch of the reference view, and about as many patches at least.
-_PATCH, _MIN_PATCHES = 24, 150
+_PATCH, _MIN_PATCHES = 24, 40
 
 # Blur of the squared errors by which pixels count less where the light does not fit.
 _MISFIT_PX = 4.0
@@ -92,12 +92,11 @@ class Cells:
         return np.asarray(cells[np.ix_(rows, columns)])
 
     def sums(self, values: Image, bins: int, cells: int = 1) -> NDArray[np.float64]:
-        """Return sums (number, square) of values (number, row, column) over whole squares of `cells` by `cells`."""
+        """Return sums (number, square) of values (number, row, column) over squares of `cells` by `cells`."""
         side = max(self.side_px * cells // bins, 1)
-        count, rows, columns = values.shape
-        down, right = rows // side, columns // side
-        whole = values[:, : down * side, : right * side].reshape(count, down, side, right, side)
-        return np.asarray(whole.sum(axis=(2, 4)).reshape(count, -1), np.float64)
+        rows, columns = (np.arange(0, size, side) for size in values.shape[1:])
+        sums = np.add.reduceat(np.add.reduceat(values, rows, axis=1), columns, axis=2)
+        return np.asarray(sums.reshape(len(values), -1), np.float64)
 
 
 def score(posed: PosedViews, light: Light, cells: Cells, precision: NDArray[np.float64], bins: int) -> Score:
@@ -165,12 +164,13 @@ class PartialScores:
         return Score(gradient / dispersion, information.sum(axis=0) / dispersion, dispersion, self.lens)
 
 
-def partial_scores(posed: PosedViews, light: Light, parts: int) -> PartialScores:
-    """Return the scores of parts of the scene, whose patches are drawn at random."""
+def partial_scores(posed: PosedViews, light: Light) -> PartialScores:
+    """Return the scores of the four quarters of the scene: neighbours share errors of light and depth."""
     terms, grid = _Terms(posed, light), posed.views.grid
     side = min(_PATCH, max(2, int(np.sqrt(np.prod(grid.shape) / _MIN_PATCHES))))
     rows, columns = (-(-size // side) for size in grid.shape)
-    part_of_patch = np.random.default_rng(0).permutation(np.arange(rows * columns) % parts)
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    part_of_patch = 2 * (2 * row // rows) + 2 * column // columns
     results: dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
 
     def work(item: tuple[int, list[Layer], NDArray[np.bool_]]) -> None:
@@ -187,7 +187,7 @@ def partial_scores(posed: PosedViews, light: Light, parts: int) -> PartialScores
         part = part_of_patch[patch]
         informations = [
             to_motion.T @ (weighted[:, chosen] @ flat[:, chosen].T) @ to_motion
-            for chosen in (part == number for number in range(parts))
+            for chosen in (part == number for number in range(4))
         ]
         results[view] = gradient.T @ to_motion, np.array(informations)
 

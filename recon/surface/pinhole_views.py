@@ -16,7 +16,7 @@ from faintfield.recon.operator.surface_operator import SurfaceOperator
 # Light of a pixel without a valid number; a sum with any such light lies below the second.
 UNKNOWN, _SURELY_UNKNOWN = np.float32(-1e30), np.float32(-1e20)
 
-# Steps by which the change of a lens is undone; the error falls to its square with every two.
+# Steps by which the change of a lens is undone: enough while the change b of distortion moves rays r by b r² < 0.1.
 _INVERSION_STEPS = 6
 
 

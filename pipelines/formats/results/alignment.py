@@ -25,7 +25,7 @@ class ViewChange(Struct, frozen=True):
 class HeldOutGain(Struct, frozen=True):
     """Log-likelihood of held-out pixels at the new poses less that at the old ones, and its standard error.
 
-    `by_gradient`: its derivative along the step from the old to the new poses.
+    `by_gradient`: its slope along a first step from the old poses, found without the part that is held out.
     """
 
     value: float
@@ -36,7 +36,7 @@ class HeldOutGain(Struct, frozen=True):
     @property
     def text(self) -> str:
         """The gain in standard errors."""
-        along = " of the slope along the step" if self.by_gradient else ""
+        along = " of the slope along a first step" if self.by_gradient else ""
         return f"{self.value / self.sigma if self.sigma else 0:.1f} standard errors{along}"
 
 

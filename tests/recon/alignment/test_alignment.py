@@ -13,6 +13,7 @@ from faintfield.calib.lens import Lens
 from faintfield.recon.alignment.cameras import lens_motion, motion, motion_of_step, moved, steps_between
 from faintfield.recon.alignment.light import Folds, gradient_gain, gradient_products
 from faintfield.recon.alignment.prior import MeasurementErrors, PosePrior
+from faintfield.recon.alignment.score import Cells
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.surface.pinhole_views import PinholeViews
 
@@ -81,6 +82,13 @@ def test_motion_by_the_lens_is_the_derivative_of_the_pixel() -> None:
     for number, step in enumerate(np.eye(2) * 1e-6):
         slope = (pixels(*step) - pixels(*-step)) / 2e-6
         np.testing.assert_allclose(found[:, number].T, slope, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(48, 64), (30, 43)])
+def test_sums_of_cells_leave_out_no_pixel(shape: tuple[int, int]) -> None:
+    values = np.random.default_rng(6).normal(size=(2, *shape)).astype(np.float32)
+    sums = Cells.of((3, *shape), 0.1).sums(values, 1, 2)
+    np.testing.assert_allclose(sums.sum(axis=1), values.sum(axis=(1, 2)), rtol=1e-4)
 
 
 def test_variances_of_poses_are_found_from_errors_that_are_known() -> None:
