@@ -124,8 +124,8 @@ def align(
     rotation_error_mrad
         The same of a node's rotation about each axis; by default 3.5, or 0.03 if the poses were measured.
     with_lens
-        Find the focal length and the first distortion term, too. A stage that only translates tells its focal length
-        only with --depth.
+        Find the first term of distortion, too, and with --depth the focal length: at unknown depths, a longer one and
+        depths further away look alike.
     """
     from faintfield.pipelines.workflows.align import align_views
 

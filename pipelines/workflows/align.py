@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.arguments import SceneKind
 from faintfield.pipelines.console import inform
-from faintfield.pipelines.errors import BadValue, MissingFile, OutputExists
+from faintfield.pipelines.errors import BadValue, MissingFile, OutputExists, WrongUsage
 from faintfield.pipelines.formats.files import check_results_folder, exclusive, remove
 from faintfield.pipelines.formats.provenance import provenance
-from faintfield.pipelines.formats.reading import is_folder
+from faintfield.pipelines.formats.reading import is_file, is_folder
 from faintfield.pipelines.formats.results.alignment import (
     ALIGNMENT_PAGE,
     AlignmentOptions,
@@ -87,6 +87,8 @@ def align_views(
     InputError, ReconstructionError
         The set cannot be used, or its depths do not suit it.
     """
+    if depth and depth_range is not None:
+        raise WrongUsage("--depth names planes and --depth-range searches for depths; leave out one of the two")
     check_exists(folder)
     out = out or (folder if is_folder(folder) else folder.parent) / ALIGNMENT_FOLDER
     check_results_folder(out)
@@ -130,6 +132,8 @@ def _check_not_of_boards(out: Path) -> None:
 def _unchanged(out: Path, reason: str) -> AlignmentSummary:
     """Say that there are no new poses, and remove those of an earlier call."""
     with exclusive(out):
+        if is_file(out / GEOMETRY_FILE):
+            reason = f"{reason}; those of an earlier alignment are removed"
         for name in (GEOMETRY_FILE, COVARIANCE_FILE, ALIGNMENT_PAGE):
             remove(out / name)
     inform(reason)

@@ -46,8 +46,9 @@ _VARIANCE_STEPS, _SMALL_STEP = 3, 0.15
 _HELD_OUT = 0.12
 
 # Standard deviations of the relative focal length and of the first distortion term: of a lens that is to be found, and
-# of one that is not, which the covariance counts.
+# of one that is not, which the covariance counts. Unknown depths would explain a longer focal length as well.
 _LENS_SIGMAS, _KNOWN_LENS_SIGMAS = np.array([0.02, 0.2]), np.array([1e-3, 2e-3])
+_LENS_SIGMAS_AT_UNKNOWN_DEPTH = np.array([_KNOWN_LENS_SIGMAS[0], _LENS_SIGMAS[1]])
 
 # Standard errors by which the gain on held-out pixels must exceed zero.
 _SURE = 3.0
@@ -267,6 +268,7 @@ class Aligner:
         `error` are the steps so far (parameter,).
         """
         lens, free = scores.lens, len(self._lens)
+        lens_sigmas = _LENS_SIGMAS_AT_UNKNOWN_DEPTH if self._light.smooth_depth else _LENS_SIGMAS
         of_scene = scores.information[:, POSE + lens :, POSE + lens :].sum(axis=0)
         scale = 1 / np.sqrt(np.maximum(np.diag(of_scene), 1e-300))
         inverse = np.outer(scale, scale) * np.linalg.pinv(of_scene * np.outer(scale, scale), rcond=1e-9, hermitian=True)
@@ -278,7 +280,7 @@ class Aligner:
         by_lens = information[:count, count:]
         information, cross, gradient = information[:count, :count], cross[:count], gradient[:count]
         for left in reversed(range(variance_steps + 1)):
-            precision = block_diag(prior.precision(), np.diag(_LENS_SIGMAS[:free] ** -2.0))
+            precision = block_diag(prior.precision(), np.diag(lens_sigmas[:free] ** -2.0))
             covariance = np.linalg.inv(information + precision)
             step = covariance @ (gradient - precision @ error)
             if left:

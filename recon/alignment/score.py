@@ -27,11 +27,14 @@ _SIDE_PX, _MIN_CELLS = 16, 300
 # neighbouring pixels.
 _SCATTER_CELLS = 2
 
-# Most samples along the side of a patch of the reference view, and about as many patches at least.
-_PATCH, _MIN_PATCHES = 24, 40
+# Side of a patch of the reference view in samples: smaller ones would share errors of the light.
+_PATCH = 24
 
 # Blur of the squared errors by which pixels count less where the light does not fit.
 _MISFIT_PX = 4.0
+
+# Parts of the scene along rows and along columns.
+_PARTS = 3
 
 # A view counts less if its gradient scatters this many times more than that of all views.
 _ODD = 4.0
@@ -165,19 +168,18 @@ class PartialScores:
 
 
 def partial_scores(posed: PosedViews, light: Light) -> PartialScores:
-    """Return the scores of the four quarters of the scene: neighbours share errors of light and depth."""
+    """Return the scores of parts of the scene, each of neighbours, which share errors of light and depth."""
     terms, grid = _Terms(posed, light), posed.views.grid
-    side = min(_PATCH, max(2, int(np.sqrt(np.prod(grid.shape) / _MIN_PATCHES))))
-    rows, columns = (-(-size // side) for size in grid.shape)
+    rows, columns = (-(-size // _PATCH) for size in grid.shape)
     row, column = np.divmod(np.arange(rows * columns), columns)
-    part_of_patch = 2 * (2 * row // rows) + 2 * column // columns
+    part_of_patch = _PARTS * (_PARTS * row // rows) + _PARTS * column // columns
     results: dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
 
     def work(item: tuple[int, list[Layer], NDArray[np.bool_]]) -> None:
         view, layers, seen = item
         x, y = terms.directions(view, sum(layer.inverse_depth for layer in layers) / len(layers))
         across, down = (
-            np.clip((place - origin) / (grid.pitch_mm * side), 0, count - 1).astype(np.intp)
+            np.clip((place - origin) / (grid.pitch_mm * _PATCH), 0, count - 1).astype(np.intp)
             for place, origin, count in zip((x, y), grid.origin_mm, (columns, rows), strict=True)
         )
         patch = (columns * down + across).ravel()
@@ -187,7 +189,7 @@ def partial_scores(posed: PosedViews, light: Light) -> PartialScores:
         part = part_of_patch[patch]
         informations = [
             to_motion.T @ (weighted[:, chosen] @ flat[:, chosen].T) @ to_motion
-            for chosen in (part == number for number in range(4))
+            for chosen in (part == number for number in range(_PARTS**2))
         ]
         results[view] = gradient.T @ to_motion, np.array(informations)
 

@@ -30,7 +30,10 @@ def with_alignment(elemental_set: "ElementalSet", *sources: str) -> "ElementalSe
     `sources` are files that state the poses from which the alignment started: it holds as long as they do.
     """
     path = alignment_of(elemental_set.folder, [view.image for view in elemental_set.settings.view], sources)
-    return elemental_set if path is None else with_poses_of_views(elemental_set, path)
+    if path is None:
+        return elemental_set
+    inform(f"poses by the views: {path}")
+    return with_poses_of_views(elemental_set, path)
 
 
 def alignment_of(folder: Path, images: Sequence[str], sources: Sequence[str]) -> Path | None:
