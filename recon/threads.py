@@ -19,6 +19,10 @@ class _OneBlasThread:
     """A context in which BLAS takes one thread; the last of several that overlap ends it."""
 
     def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all users, as a forked process has to."""
         self._lock, self._users = Lock(), 0
 
     def __enter__(self) -> None:
@@ -39,6 +43,7 @@ _one_blas_thread = _OneBlasThread()
 
 # A forked process inherits the pools, but not their threads
 register_after_fork(_pool, lambda pools: pools.cache_clear())
+register_after_fork(_one_blas_thread, lambda context: context.reset())
 
 
 def run_in_threads[Part, Result](work: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
@@ -86,7 +91,7 @@ def map_in_threads[Item, Result](work: Callable[[Item], Result], items: Sequence
     others: list[Future[None]] = []
     try:
         with _one_blas_thread:
-            others += [_pool(count).submit(take) for _ in range(count)]
+            others.extend(_pool(count).submit(take) for _ in range(count))
             take()
             wait(others)
     except BaseException:

@@ -36,6 +36,11 @@ class PosedViews:
     principal_shift: NDArray[np.float64]
     free_lens: bool = False
 
+    @property
+    def lens_parameters(self) -> int:
+        """Number of parameters of a lens that is to be found."""
+        return LENS if self.free_lens else 0
+
     def at(self, rt_cam_ref: Poses, lens_change: tuple[float, float] = (0.0, 0.0)) -> "PosedViews":
         """Return the views at other poses, with a changed lens."""
         matrices = np.concatenate([_rotations(rt_cam_ref).as_matrix(), rt_cam_ref[:, 3:, np.newaxis]], axis=2)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from faintfield.recon.alignment.cameras import LENS, POSE, PosedViews, Poses, moved, steps_between
+from faintfield.recon.alignment.cameras import POSE, PosedViews, Poses, moved, steps_between
 from faintfield.recon.alignment.light import Light
 from faintfield.recon.alignment.prior import PosePrior
 from faintfield.recon.alignment.score import Cells, Score, log_likelihood, partial_scores, score
@@ -157,7 +157,7 @@ class Aligner:
     """
 
     def __init__(self, posed: PosedViews, reference: int, prior: PosePrior, light: Light) -> None:
-        self._reference, self._light, self._lens = reference, light, np.zeros(LENS if posed.free_lens else 0)
+        self._reference, self._light, self._lens = reference, light, np.zeros(posed.lens_parameters)
         self._others = np.delete(np.arange(len(posed.rt_cam_ref)), reference)
         self._start, self._first_prior = posed.rt_cam_ref, prior
         self._poses, self._prior = self._start.copy(), prior

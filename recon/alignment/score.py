@@ -7,7 +7,7 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.recon.alignment.cameras import LENS, POSE, PosedViews, lens_motion, motion, motion_of_step
+from faintfield.recon.alignment.cameras import POSE, PosedViews, lens_motion, motion, motion_of_step
 from faintfield.recon.alignment.light import Layer, Light, depth_shapes
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.operator.surface_operator import homographies_of_surface
@@ -17,8 +17,8 @@ from faintfield.recon.threads import map_in_threads
 # Pixels along the edges of a view that do not count, where a blurred picture is not that of the scene.
 _BORDER = 2
 
-# Errors beyond this many standard deviations count less (Huber); median of a squared normal error of variance 1.
-_LARGE, _MEDIAN_SQUARE = 3.0, 0.455
+# Errors beyond this many standard deviations count less (Huber).
+_LARGE = 3.0
 
 # Side of a cell, and half of it where fewer would be held out.
 _SIDE_PX, _MIN_CELLS = 16, 300
@@ -134,8 +134,8 @@ def score(posed: PosedViews, light: Light, cells: Cells, precision: NDArray[np.f
     odd = scatters > _ODD * np.median(scatters)
     typical = max(1.0, float(scatters[~odd].mean()))
     dispersion = np.maximum(typical, scatters / _ODD)
-    lens = LENS if posed.free_lens else 0
-    return Score(gradients / dispersion[:, None], informations / dispersion[:, None, None], typical, lens)
+    weights = 1 / dispersion
+    return Score(weights[:, None] * gradients, weights[:, None, None] * informations, typical, posed.lens_parameters)
 
 
 @dataclass(frozen=True)
@@ -196,8 +196,8 @@ def partial_scores(posed: PosedViews, light: Light) -> PartialScores:
     for item in _layers_of_folds(light):
         map_in_threads(work, item)
     gradients, informations = zip(*(results[n] for n in range(len(results))), strict=True)
-    lens = LENS if posed.free_lens else 0
-    return PartialScores(np.stack(gradients, axis=1), part_of_patch, np.stack(informations, axis=1), lens)
+    stacked = np.stack(gradients, axis=1), part_of_patch, np.stack(informations, axis=1)
+    return PartialScores(*stacked, posed.lens_parameters)
 
 
 class _Terms:
@@ -280,7 +280,7 @@ def _inside(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _weights(usable: NDArray[np.bool_], error: Image, variance: Image) -> tuple[Image, Image]:
     """Return weights and errors of pixels (row, column), zero where they are not usable.
 
-    A weight is the inverse variance, of the noise or, where it is larger, of all errors; less for large errors.
+    A weight is the inverse variance, of the noise or, where it is larger, of the errors nearby; less for large errors.
     """
     weight = np.where(usable, 1 / variance, np.float32(0))
     error = np.where(usable, error, np.float32(0))
