@@ -50,7 +50,7 @@ COMMANDS: dict[tuple[Group, str], tuple[str, ...]] = {
     (Group("Calibrate", sort_key=3), "calibration"): (
         "noise session --out results",
         "geometry boards --depth-mm 500 --depth-mm 700",
-        "align set --out alignment",
+        "align set --depth 500 --depth 700",
     ),
     (Group("Reconstruct", sort_key=4), "reconstruction"): (
         "run session --depth-mm 500 --depth-mm 700",
@@ -217,6 +217,8 @@ def _launch(
     log
         Append to this file: the command, versions, all messages with their times, and how the command ended.
     """
+    if any(not token or (token.startswith("--") and token.endswith("=")) for token in tokens):
+        raise WrongUsage("an argument is empty; give it a value, or leave its option out")
     with logged(log, tokens, one_line=(CycloptsError, WrongUsage, *NAMED_FAILURES)), _named_system_errors():
         result: object = app(tokens, exit_on_error=False, print_error=True)
         if json and result is not None:

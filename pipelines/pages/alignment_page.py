@@ -23,6 +23,8 @@ def alignment_page(
         details=[_uri(picture[window], white, tone_curve) for picture in pictures],
         drawing=_drawing(record),
         longest_px=_longest_px(record),
+        rms_px=float(np.sqrt(np.mean(np.sum(np.square([view.shift_px for view in record.views]), axis=1)))),
+        depths=list(record.transfer_sigma_px),
         options=msgspec.to_builtins(record.options),
         unit=record.units.length if record.units and record.units.depth == "mm" else "",
         turns=[float(np.degrees(view.turn_rad)) for view in record.views],

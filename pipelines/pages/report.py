@@ -8,9 +8,10 @@ import msgspec
 import numpy as np
 from msgspec import UNSET
 
-from faintfield.pipelines.formats.files import files_below, write_whole
+from faintfield.pipelines.formats.files import files_below, sha256, write_whole
+from faintfield.pipelines.formats.results.alignment import AlignmentRecord
 from faintfield.pipelines.formats.results.figures import OVERVIEW_FILE, GeometryErrors
-from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE
+from faintfield.pipelines.formats.results.geometry import ALIGNMENT_FOLDER, GEOMETRY_FILE, read_geometry
 from faintfield.pipelines.formats.results.noise import NOISE_FILE
 from faintfield.pipelines.formats.results.records import (
     RECONSTRUCTION_FILE,
@@ -84,7 +85,7 @@ def write_report(directory: Path, *, noise: Path | None = None, geometry: Path |
     facts = _light(the_set) if the_set else []
     if not planes:
         facts = [*of_surfaces[0].facts, *([] if facts else [_no_snr(the_set)]), *facts]
-    facts.append(_poses(lead, of_geometry, errors.geometry_off))
+    facts.append(_poses_by_views(directory, lead) or _poses(lead, of_geometry, errors.geometry_off))
     facts += _noise(lead, of_noise, the_set)
     led_by = [plane for plane in planes if shown.best and plane.column == shown.best.column]
     if best := errors.of(led_by):
@@ -241,6 +242,16 @@ def _poses(
     if against_truth:
         means += f". Against the truth: {_length(against_truth.centre_rms_mm)} rms"
     return Fact("Poses, measured", known, means)
+
+
+def _poses_by_views(directory: Path, lead: ReconstructionRecord | SurfaceFileRecord) -> Fact | None:
+    """Return how well the poses by the views are known, None if it was not made with these or their record is away."""
+    path = find_calibration(directory, f"{ALIGNMENT_FOLDER}/{GEOMETRY_FILE}")
+    if lead.options.poses != "aligned" or path is None or sha256(path) not in lead.inputs.values():
+        return None
+    record = read_geometry(path, AlignmentRecord)
+    depth, sigma_px = max(record.transfer_sigma_px.items(), key=lambda item: item[1])
+    return Fact("Poses, by the views", f"± {figure(sigma_px, 2)} px", f"σ of the transfer between views at {depth}")
 
 
 def _noise(

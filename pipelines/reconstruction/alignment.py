@@ -16,14 +16,15 @@ from faintfield.calib.homography import (
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.console import inform, progress, working
 from faintfield.pipelines.errors import BadValue
+from faintfield.pipelines.formats.files import problem_of_file
 from faintfield.pipelines.formats.reading import read_arrays
 from faintfield.pipelines.formats.results.alignment import PoseErrors
-from faintfield.pipelines.formats.results.geometry import COVARIANCE_FILE, CameraPoses, read_geometry
+from faintfield.pipelines.formats.results.geometry import COVARIANCE_FILE, PosesOfSession, read_geometry
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.depth.autofocus import searched_range_mm
 from faintfield.pipelines.reconstruction.depth.search import check_views, default_bins, luminance
 from faintfield.pipelines.reconstruction.operators import principal_shift
-from faintfield.recon.alignment.cameras import LENS, POSE, PosedViews, moved
+from faintfield.recon.alignment.cameras import LENS, POSE, PosedViews, move_poses
 from faintfield.recon.alignment.estimate import Aligner, Alignment
 from faintfield.recon.alignment.light import Folds, PlanesLight, SurfaceLight
 from faintfield.recon.alignment.prior import MeasurementErrors, PosePrior
@@ -158,10 +159,12 @@ def _measured_covariance(elemental_set: ElementalSet) -> NDArray[np.float64] | N
     path = elemental_set.measured_in.with_name(COVARIANCE_FILE)
     if not path.is_file():
         return None
-    geometry = read_geometry(elemental_set.measured_in, CameraPoses)
+    geometry = read_geometry(elemental_set.measured_in, PosesOfSession)
+    remedy = "run `faintfield geometry` again, or remove the file to align without it"
+    if (digest := geometry.sha256.get(path.name)) and (fault := problem_of_file(path, path.parent, digest)):
+        raise BadValue(f"{path}: {fault}; {remedy}")
     lens, places = 4 + len(geometry.lens.distortion), [entry.node for entry in geometry.nodes]
     size = lens + POSE * len(places)
-    remedy = "run `faintfield geometry` again, or remove the file to align without it"
     arrays = read_arrays(path, ["covariance"], shape=(size, size), max_bytes=8 * size**2, remedy=remedy)
     if "covariance" not in arrays or not np.isfinite(arrays["covariance"]).all():
         raise BadValue(f"{path}: holds no covariance, or numbers that are not finite; {remedy}")
@@ -186,18 +189,18 @@ class PoseUncertainty:
     sigma_mm: NDArray[np.float64]
 
 
-def changed_lens(lens: Lens, change: tuple[float, float]) -> Lens:
-    """Return the lens D((1 + l)(1 + b r²) r) of another lens D, to fourth order in the ray r, for a change (l, b)."""
+def change_lens(lens: Lens, change: tuple[float, float]) -> Lens:
+    """Return the lens D((1 + s)(1 + b r²) r) of another lens D, to fourth order in the ray r, for a change (s, b)."""
     if not any(change):
         return lens
-    longer, bent = change
-    distortion = np.array(lens.distortion or (0.0,)) * (1 + longer) ** _POWERS[: max(len(lens.distortion), 1)]
+    scale, added = 1 + change[0], change[1]
+    distortion = np.array(lens.distortion or (0.0,)) * scale ** _POWERS[: max(len(lens.distortion), 1)]
     if len(distortion) > 1:
-        distortion[1] += 3 * bent * distortion[0]
+        distortion[1] += 3 * added * distortion[0]
     if len(distortion) > 6:
-        distortion[6] += 2 * bent * distortion[5]
-    distortion[0] += bent
-    focal_px = (1 + longer) * lens.fx_px, (1 + longer) * lens.fy_px
+        distortion[6] += 2 * added * distortion[5]
+    distortion[0] += added
+    focal_px = scale * lens.fx_px, scale * lens.fy_px
     return Lens(lens.size_px, *focal_px, lens.cx_px, lens.cy_px, tuple(distortion.tolist()))
 
 
@@ -218,7 +221,7 @@ def pose_uncertainty(alignment: Alignment, reference: int, lens: Lens) -> PoseUn
         for axis in range(POSE):
             step = np.zeros((1, POSE))
             step[0, axis] = _STEP
-            ahead, behind = moved(poses[view : view + 1], step)[0], moved(poses[view : view + 1], -step)[0]
+            ahead, behind = move_poses(poses[view : view + 1], step)[0], move_poses(poses[view : view + 1], -step)[0]
             numbers[count:][part, POSE * view + axis] = (ahead - behind) / (2 * _STEP)
             centres[3 * view : 3 * view + 3, POSE * view + axis] = (_centre(ahead) - _centre(behind)) / (2 * _STEP)
     variances = np.diag(of_steps)[:size].reshape(-1, POSE)

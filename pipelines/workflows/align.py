@@ -43,7 +43,7 @@ from faintfield.pipelines.reconstruction.alignment import (
     PoseUncertainty,
     align_set,
     assumed_errors,
-    changed_lens,
+    change_lens,
     pose_uncertainty,
     shifts_px,
     transfer_sigmas_px,
@@ -51,7 +51,7 @@ from faintfield.pipelines.reconstruction.alignment import (
 from faintfield.pipelines.reconstruction.request import distinct_depths
 from faintfield.pipelines.reconstruction.surface.request import range_in_mm
 from faintfield.pipelines.workflows.reconstruct import open_set
-from faintfield.recon.alignment.cameras import LENS, moved
+from faintfield.recon.alignment.cameras import LENS, move_poses
 from faintfield.recon.alignment.estimate import Alignment
 from faintfield.recon.errors import NothingInFocus
 
@@ -112,14 +112,16 @@ def align_views(
             "the poses stay as they are: the new ones do not predict held-out pixels better, beyond chance (gain of "
             f"{gain.text}; more than 3 are needed)"
         )
+        if not depths_mm:
+            why += "; known depths tell more than unknown ones: give --depth for each plane of the scene"
         return msgspec.structs.replace(_unchanged(out, why), gain=gain)
     record, uncertainty = _record(elemental_set, aligned, options)
     page = alignment_page(record, aligned.alignment.pictures, elemental_set.units.tone_curve)
     write_geometry(out, record, {COVARIANCE_FILE: _covariance_file(record, uncertainty), ALIGNMENT_PAGE: page})
     _inform_of(record)
     figures = {name: getattr(record, name) for name in ("gain", "errors_found", "transfer_sigma_px")}
-    said = f"the new poses predict held-out pixels better, by {gain.text}"
-    return AlignmentSummary(True, said, str(out), str(out / ALIGNMENT_PAGE), **figures)
+    reason = f"the new poses predict held-out pixels better, by {gain.text}"
+    return AlignmentSummary(True, reason, str(out), str(out / ALIGNMENT_PAGE), **figures)
 
 
 def _check_not_of_boards(out: Path) -> None:
@@ -144,12 +146,12 @@ def _record(
     elemental_set: ElementalSet, aligned: Aligned, options: AlignmentOptions
 ) -> tuple[AlignmentRecord, PoseUncertainty]:
     alignment, reference = aligned.alignment, elemental_set.reference_view
-    old, lens = elemental_set.lens, changed_lens(elemental_set.lens, alignment.lens_change)
+    old, lens = elemental_set.lens, change_lens(elemental_set.lens, alignment.lens_change)
     uncertainty = pose_uncertainty(alignment, reference, lens)
     middle_mm = float(2 / (1 / aligned.depths_mm[0] + 1 / aligned.depths_mm[-1]))
     before, after = elemental_set.poses_rt_cam_ref, alignment.rt_cam_ref
     shifts = shifts_px((old, before), (lens, after), middle_mm)
-    left = shifts_px((lens, moved(after, -alignment.last_steps)), (lens, after), middle_mm)
+    left = shifts_px((lens, move_poses(after, -alignment.last_steps)), (lens, after), middle_mm)
     nodes = elemental_set.nodes
     turns = alignment.steps[:, 2]
     record = AlignmentRecord(
@@ -186,9 +188,9 @@ def _record(
 
 
 def _lens_change(old: Lens, new: Lens, alignment: Alignment) -> LensChange:
-    sigma, sigma_bent = np.sqrt(np.diag(alignment.covariance))[-LENS:].tolist()
-    bent = new.distortion[0] - (*old.distortion, 0.0)[0]
-    return LensChange(alignment.lens_change[0], sigma, bent, sigma_bent)
+    sigma, sigma_added = np.sqrt(np.diag(alignment.covariance))[-LENS:].tolist()
+    added = new.distortion[0] - (*old.distortion, 0.0)[0]
+    return LensChange(alignment.lens_change[0], sigma, added, sigma_added)
 
 
 def _mean_shift(shift: NDArray[np.float64]) -> tuple[float, float]:

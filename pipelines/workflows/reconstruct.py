@@ -124,6 +124,8 @@ def open_set(
         elemental_set = load_session(folder, scene, geometry, aligned=aligned)
         out = out or folder / RECONSTRUCTIONS / ("" if scene == "dark_scene" else scene)
     else:
+        if scene != "dark_scene":
+            raise WrongUsage(f"--scene {scene} names a set of a session, and {folder} is a set itself; leave it out")
         elemental_set = load_set(folder, aligned=aligned and geometry is None)
         if out is None:
             raise WrongUsage("no folder for the results is named; give --out")

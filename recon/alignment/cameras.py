@@ -53,14 +53,14 @@ class PosedViews:
         return replace(self, views=self.views.binned(bins))
 
 
-def moved(rt_cam_ref: Poses, steps: Poses) -> Poses:
+def move_poses(rt_cam_ref: Poses, steps: Poses) -> Poses:
     """Return poses (view, 6) after small steps (ω, τ) (view, 6): `R ← exp([ω]×) R` and `t ← t + τ`."""
     turned = (_rotations(steps) * _rotations(rt_cam_ref)).as_rotvec()
     return np.column_stack([turned, rt_cam_ref[:, 3:] + steps[:, 3:]])
 
 
 def steps_between(start: Poses, end: Poses) -> Poses:
-    """Return the steps (view, 6) for which `moved(start, steps)` is `end`."""
+    """Return the steps (view, 6) for which `move_poses(start, steps)` is `end`."""
     turned = (_rotations(end) * _rotations(start).inv()).as_rotvec()
     return np.column_stack([turned, end[:, 3:] - start[:, 3:]])
 

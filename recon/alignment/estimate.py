@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from faintfield.recon.alignment.cameras import POSE, PosedViews, Poses, moved, steps_between
+from faintfield.recon.alignment.cameras import POSE, PosedViews, Poses, move_poses, steps_between
 from faintfield.recon.alignment.light import Light
 from faintfield.recon.alignment.prior import PosePrior
-from faintfield.recon.alignment.score import Cells, Score, log_likelihood, partial_scores, score
+from faintfield.recon.alignment.score import Cells, Comparison, Score, compare, partial_scores, predictions, score
 
 
 class _Level(NamedTuple):
@@ -61,9 +61,9 @@ class Gain:
     Attributes
     ----------
     value, sigma : float
-        The gain and its standard error, by its scatter over cells.
-    cells : int
-        Number of cells that were held out.
+        The gain and its standard error, by its scatter over patches of the scene.
+    patches : int
+        Number of patches.
     by_gradient : bool
         True if the value is the slope along a first step from the old poses, which tells small steps better: each part
         of the scene is held out once, and the step found from the others.
@@ -71,7 +71,7 @@ class Gain:
 
     value: float
     sigma: float
-    cells: int
+    patches: int
     by_gradient: bool = False
 
     @property
@@ -188,8 +188,8 @@ class Aligner:
         solution, last = self._round(1, _LEVELS[-1].blurs[-1], self._cells.none_held_out(), final=True)
         yield self.rounds[-1]
         new_picture = self._light.picture()
-        after, before = self._log_likelihood(*without_final), self._log_likelihood(self._start, np.zeros(0))
-        old_picture, gain = self._light.picture(), self._gain(np.nan_to_num(after - before))
+        after, before = self._predictions(*without_final), self._predictions(self._start, np.zeros(0))
+        old_picture, gain = self._light.picture(), _gain(compare(self._binned[1], self._light, before, after))
         if abs(gain.value) <= _SURE * gain.sigma:  # a sure loss is an answer, too
             slope = self._slope()
             gain = gain if slope is None or not slope.sure else slope
@@ -211,17 +211,12 @@ class Aligner:
         """True if errors of a depth that can be found are larger than those by the noise."""
         return self._light.smooth_depth and self.rounds[-1].dispersion > _BRIGHT_DISPERSION
 
-    def _log_likelihood(self, poses: Poses, lens: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Return the log-likelihood of held-out pixels, with light and depth found afresh."""
+    def _predictions(self, poses: Poses, lens: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Return the expected electrons of held-out pixels, with light and depth found afresh."""
         for bins, find in ((_DEPTH_BINS, self._light.find_depth), (1, partial(self._light.fit, afresh=True))):
             posed = self._binned[bins].at(poses, _lens_change(lens))
             find(posed.views)
-        return log_likelihood(posed, self._light, self._cells)
-
-    def _gain(self, difference: NDArray[np.float32]) -> Gain:
-        """Return the gain, given the difference of log-likelihood of each pixel."""
-        of_cells = self._cells.sums(difference, 1)
-        return Gain(float(of_cells.sum()), float(np.sqrt(np.sum(of_cells**2))), int(np.count_nonzero(of_cells)))
+        return predictions(posed, self._light, self._cells)
 
     def _slope(self) -> Gain | None:
         """Return the slope along a first step from the old poses, at their light; None if the whole step is no gain."""
@@ -230,7 +225,7 @@ class Aligner:
         slopes, curvature = np.zeros(len(scores.part)), 0.0
         for part, information in enumerate(scores.information):
             others, error = scores.without(part, dispersion), np.zeros(POSE * len(self._others) + len(self._lens))
-            solution = self._solved(others, error, self._first_prior, _VARIANCE_STEPS)
+            solution = self._solve(others, error, self._first_prior, _VARIANCE_STEPS)
             shared = np.concatenate([solution.lens, solution.scene_by_cameras])
             step = np.hstack([solution.steps, np.broadcast_to(shared, (len(self._start), len(shared)))])
             patches = scores.part == part
@@ -253,8 +248,8 @@ class Aligner:
         scores = score(posed, self._light, cells, precision, bins)
         steps = _VARIANCE_STEPS if estimate_variances else 0
         error = np.concatenate([steps_between(self._start, self._poses)[self._others].ravel(), self._lens])
-        solution = self._solved(scores, error, self._prior, steps)
-        self._poses, self._prior = moved(self._poses, solution.steps), solution.prior
+        solution = self._solve(scores, error, self._prior, steps)
+        self._poses, self._prior = move_poses(self._poses, solution.steps), solution.prior
         self._lens = self._lens + solution.lens
         self._light.change_depth(solution.scene[POSE + scores.lens :])
         sigmas = np.sqrt(np.diag(solution.covariance)[: POSE * len(self._others)])
@@ -262,7 +257,7 @@ class Aligner:
         self.rounds.append(Round(bins, step, scores.dispersion))
         return solution, scores
 
-    def _solved(self, scores: Score, error: NDArray[np.float64], prior: PosePrior, variance_steps: int) -> _Solution:
+    def _solve(self, scores: Score, error: NDArray[np.float64], prior: PosePrior, variance_steps: int) -> _Solution:
         """Return the step of all poses and of the lens, without what changes of the scene explain as well.
 
         `error` are the steps so far (parameter,).
@@ -273,7 +268,7 @@ class Aligner:
         scale = 1 / np.sqrt(np.maximum(np.diag(of_scene), 1e-300))
         inverse = np.outer(scale, scale) * np.linalg.pinv(of_scene * np.outer(scale, scale), rcond=1e-9, hermitian=True)
         by_scene = scores.gradient[:, POSE + lens :].sum(axis=0)
-        information, cross, gradient = self._of_cameras(scores)
+        information, cross, gradient = self._camera_equations(scores)
         information -= cross @ inverse @ cross.T
         gradient -= cross @ (inverse @ by_scene)
         of_poses, count = slice(0, POSE * len(self._others)), POSE * len(self._others) + free
@@ -292,7 +287,7 @@ class Aligner:
         covariance += turned @ turned.T
         return _Solution(steps, covariance, of_lens, inverse @ by_scene + by_cameras, by_cameras, prior)
 
-    def _of_cameras(self, scores: Score) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def _camera_equations(self, scores: Score) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Return the information of poses and lens, what they share with that of the scene, and their gradient.
 
         The reference's pose has none.
@@ -306,6 +301,16 @@ class Aligner:
         cross = of_views[:, :POSE, scene].reshape(len(poses), -1), scores.information[:, lens, scene].sum(axis=0)
         gradient = scores.gradient[self._others, :POSE].ravel(), scores.gradient[:, lens].sum(axis=0)
         return np.block([[poses, between], [between.T, of_lens]]), np.concatenate(cross), np.concatenate(gradient)
+
+
+def _gain(compared: Comparison) -> Gain:
+    """Return the gain; its variance is the information, times the dispersion of patches about gains in proportion."""
+    patches = compared.information > 0
+    gain, information = compared.gain[patches], compared.information[patches]
+    value, number = float(gain.sum()), len(gain)
+    left = gain - information * (value / max(information.sum(), 1e-300))
+    dispersion = max(1.0, float(np.sum(left**2 / information)) / max(number - 1, 1))
+    return Gain(value, float(np.sqrt(dispersion * information.sum())), number)
 
 
 def _lens_change(lens: NDArray[np.float64]) -> tuple[float, float]:

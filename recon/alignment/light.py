@@ -34,17 +34,17 @@ class Layer(NamedTuple):
     """A part of the light in some views.
 
     `picture` (view, row, column) are its electrons, and `inverse_depth` is 1/depth at each of its pixels, or one number
-    for all. `gain` (2,) is by how much the true gradient exceeds that of the picture along rows and columns.
+    for all. `gradient_scale` (2,) is by how much the true gradient exceeds that of the picture along rows and columns.
     """
 
     picture: NDArray[np.float32]
     inverse_depth: NDArray[np.float32] | float
-    gain: NDArray[np.float64]
+    gradient_scale: NDArray[np.float64]
 
     def of_view(self, number: int) -> "Layer":
         """Return the layer in one view (row, column)."""
         depth = self.inverse_depth
-        return Layer(self.picture[number], depth if isinstance(depth, float) else depth[number], self.gain)
+        return Layer(self.picture[number], depth if isinstance(depth, float) else depth[number], self.gradient_scale)
 
 
 @dataclass(frozen=True)
@@ -138,18 +138,18 @@ class SurfaceLight:
     def fit(self, views: PinholeViews, blur: float = 0.0, *, afresh: bool = False) -> None:
         """Take for each fold the mean of the other views on the surface, denoised."""
         self._operator = operator = views.surface_operator(_enlarged(self._inverse_depth, views.grid.shape))
-        self._inverse_depths, self._usable, self._blur = (
-            operator.inverse_depth_of_pixels(),
-            views.light_e > UNKNOWN,
-            blur,
-        )
+        self._inverse_depths, self._blur = operator.inverse_depth_of_pixels(), blur
+        self._usable, self._covered = views.light_e > UNKNOWN, np.empty(views.light_e.shape, np.bool_)
+        even = np.ones(views.grid.shape, np.float32)
+        for fold in map(self.folds.views, self.folds.numbers):
+            self._covered[fold] = operator.forward(even, fold) > 0
         parts = [self.folds.views(fold) for fold in self.folds.numbers]
         sums = [operator.adjoint(views.light_e, part) for part in parts]
         counts = [operator.sensitivity(part) for part in parts]
         self._sum, self._count = np.sum(sums, axis=0), np.sum(counts, axis=0)
         level = float(np.median(self._sum[self._count > 0] / self._count[self._count > 0]))
-        even = np.full(views.light_e.shape[1:], max(level, 0), np.float32)
-        self._variance = np.float32(views.pixel_variance(even).mean())
+        level_e = np.full(views.light_e.shape[1:], max(level, 0), np.float32)
+        self._variance = np.float32(views.pixel_variance(level_e).mean())
         self._lights = [
             denoised(self._sum - own, self._count - count, self._variance, _STRENGTH, workers=None)
             for own, count in zip(sums, counts, strict=True)
@@ -158,18 +158,19 @@ class SurfaceLight:
             gradient_products(light, own, count, self._count - count, blur)
             for light, own, count in zip(self._lights, sums, counts, strict=True)
         ]
-        self._gain = gradient_gain(products)
+        self._gradient_scale = gradient_scale(products)
 
     def layers(self, fold: int) -> tuple[list[Layer], NDArray[np.bool_]]:
         """Return the light in the views of a fold, and which of their pixels see it."""
         views, light = self.folds.views(fold), self._lights[self.folds.numbers.index(fold)]
-        covered = self._operator.forward(np.ones_like(light), views) > 0
         picture = self._operator.forward(light, views)
         if self._blur:
-            for image, seen in zip(picture, covered, strict=True):
+            for image, seen in zip(picture, self._covered[views], strict=True):
                 share = np.maximum(gaussian(seen.astype(np.float32), self._blur), np.float32(1e-3))
                 image[:] = gaussian(image, self._blur) / share
-        return [Layer(picture, self._inverse_depths[views], self._gain)], covered & self._usable[views]
+        return [Layer(picture, self._inverse_depths[views], self._gradient_scale)], self._covered[views] & self._usable[
+            views
+        ]
 
     def picture(self) -> NDArray[np.float32]:
         """Return the light by all views (row, column)."""
@@ -218,15 +219,15 @@ class PlanesLight:
             self._last[fold, start.size] = iterate.plane, iterate.dual
             self._lights.append(operator.planes_of(iterate.plane))
         products = [self._products(fold, electrons) for fold in self.folds.numbers]
-        self._gains = [gradient_gain(list(of_plane)) for of_plane in zip(*products, strict=True)]
+        self._gradient_scales = [gradient_scale(list(of_plane)) for of_plane in zip(*products, strict=True)]
 
     def layers(self, fold: int) -> tuple[list[Layer], NDArray[np.bool_]]:
         """Return the light in the views of a fold, and which of their pixels are usable."""
         pictures = self._pictures(fold)
         if self._blur:
             pictures = [np.stack([gaussian(image, self._blur) for image in of_plane]) for of_plane in pictures]
-        layers = [Layer(*of_plane) for of_plane in zip(pictures, self._inverse_depths, self._gains, strict=True)]
-        return layers, self._usable[self.folds.views(fold)]
+        planes = zip(pictures, self._inverse_depths, self._gradient_scales, strict=True)
+        return [Layer(*of_plane) for of_plane in planes], self._usable[self.folds.views(fold)]
 
     def picture(self) -> NDArray[np.float32]:
         """Return the sum of all planes (row, column)."""
@@ -272,7 +273,7 @@ def gradient_products(light: Image, own: Image, count: Image, other_count: Image
     return np.asarray(np.sum([weight * slope * true, weight * slope**2], axis=(2, 3), dtype=np.float64))
 
 
-def gradient_gain(products: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+def gradient_scale(products: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
     """Return by how much the true gradient exceeds that of denoised light (2,): the slope of a regression.
 
     It is above 1 where denoising took too much, and below where noise was left.

@@ -1,8 +1,10 @@
 """Gradient of each view's likelihood by its pose, and by changes of the scene that all views share."""
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +12,7 @@ from numpy.typing import NDArray
 from faintfield.recon.alignment.cameras import POSE, PosedViews, lens_motion, motion, motion_of_step
 from faintfield.recon.alignment.light import Layer, Light, depth_shapes
 from faintfield.recon.likelihood.images import Image
+from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.surface_operator import homographies_of_surface
 from faintfield.recon.surface.pinhole_views import gaussian
 from faintfield.recon.threads import map_in_threads
@@ -27,8 +30,9 @@ _SIDE_PX, _MIN_CELLS = 16, 300
 # neighbouring pixels.
 _SCATTER_CELLS = 2
 
-# Side of a patch of the reference view in samples: smaller ones would share errors of the light.
-_PATCH = 24
+# Side of a patch of the reference view in samples, and half of it if there would be fewer: neighbours in smaller ones
+# would share errors of the light.
+_PATCH, _MIN_PATCHES = 24, 100
 
 # Blur of the squared errors by which pixels count less where the light does not fit.
 _MISFIT_PX = 4.0
@@ -37,7 +41,7 @@ _MISFIT_PX = 4.0
 _PARTS = 3
 
 # A view counts less if its gradient scatters this many times more than that of all views.
-_ODD = 4.0
+_OUTLYING = 4.0
 
 
 @dataclass(frozen=True)
@@ -131,9 +135,8 @@ def score(posed: PosedViews, light: Light, cells: Cells, precision: NDArray[np.f
     gradients, informations, scatters = (
         np.array(part) for part in zip(*(results[n] for n in range(len(results))), strict=True)
     )
-    odd = scatters > _ODD * np.median(scatters)
-    typical = max(1.0, float(scatters[~odd].mean()))
-    dispersion = np.maximum(typical, scatters / _ODD)
+    typical = max(1.0, float(scatters[scatters <= _OUTLYING * np.median(scatters)].mean()))
+    dispersion = np.maximum(typical, scatters / _OUTLYING)
     weights = 1 / dispersion
     return Score(weights[:, None] * gradients, weights[:, None, None] * informations, typical, posed.lens_parameters)
 
@@ -169,23 +172,16 @@ class PartialScores:
 
 def partial_scores(posed: PosedViews, light: Light) -> PartialScores:
     """Return the scores of parts of the scene, each of neighbours, which share errors of light and depth."""
-    terms, grid = _Terms(posed, light), posed.views.grid
-    rows, columns = (-(-size // _PATCH) for size in grid.shape)
-    row, column = np.divmod(np.arange(rows * columns), columns)
-    part_of_patch = _PARTS * (_PARTS * row // rows) + _PARTS * column // columns
+    terms, patches = _Terms(posed, light), _Patches(posed.views.grid)
+    part_of_patch = patches.parts()
     results: dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
 
     def work(item: tuple[int, list[Layer], NDArray[np.bool_]]) -> None:
         view, layers, seen = item
-        x, y = terms.directions(view, sum(layer.inverse_depth for layer in layers) / len(layers))
-        across, down = (
-            np.clip((place - origin) / (grid.pitch_mm * _PATCH), 0, count - 1).astype(np.intp)
-            for place, origin, count in zip((x, y), grid.origin_mm, (columns, rows), strict=True)
-        )
-        patch = (columns * down + across).ravel()
+        patch = patches.of(*terms.directions(view, _mean_inverse_depth(layers))).ravel()
         flat, weight, error, to_motion = terms.of_view(view, layers, _inside(seen))
         weighted = flat * weight
-        gradient = np.array([np.bincount(patch, row * error, rows * columns) for row in weighted])
+        gradient = np.array([np.bincount(patch, row * error, patches.number) for row in weighted])
         part = part_of_patch[patch]
         informations = [
             to_motion.T @ (weighted[:, chosen] @ flat[:, chosen].T) @ to_motion
@@ -198,6 +194,33 @@ def partial_scores(posed: PosedViews, light: Light) -> PartialScores:
     gradients, informations = zip(*(results[n] for n in range(len(results))), strict=True)
     stacked = np.stack(gradients, axis=1), part_of_patch, np.stack(informations, axis=1)
     return PartialScores(*stacked, posed.lens_parameters)
+
+
+class _Patches:
+    """Square patches of a plane's samples, row by row."""
+
+    def __init__(self, grid: PlaneGrid) -> None:
+        self._side = _PATCH if math.prod(grid.shape) >= _MIN_PATCHES * _PATCH**2 else _PATCH // 2
+        self._grid, self._shape = grid, [-(-size // self._side) for size in grid.shape]
+
+    @property
+    def number(self) -> int:
+        return math.prod(self._shape)
+
+    def of(self, x: Image, y: Image) -> NDArray[np.intp]:
+        """Return the patch of each point, the nearest for those outside."""
+        side_mm = self._grid.pitch_mm * self._side
+        column, row = (
+            np.clip((place - origin) / side_mm, 0, count - 1).astype(np.intp)
+            for place, origin, count in zip((x, y), self._grid.origin_mm, reversed(self._shape), strict=True)
+        )
+        return np.asarray(self._shape[1] * row + column)
+
+    def parts(self) -> NDArray[np.intp]:
+        """Return the part of the scene (patch,) that each patch belongs to."""
+        pairs = zip(np.indices(self._shape), self._shape, strict=True)
+        row, column = (_PARTS * place // count for place, count in pairs)
+        return np.asarray((_PARTS * row + column).ravel())
 
 
 class _Terms:
@@ -233,30 +256,50 @@ class _Terms:
             if self._smooth_depth:
                 fields.append(_parallax(rays, views.ray_from_surface[view, :, 3], directions, layer.inverse_depth))
             parts.append(_derivative(layer, fields, views.focal_px))
-        derivative = np.sum(parts, axis=0) if len(parts) > 1 else parts[0]
-        expected = np.sum([layer.picture for layer in layers], axis=0, dtype=np.float32)
+        derivative, expected = sum(parts[1:], parts[0]), _picture(layers)
         weight, error = _weights(usable, views.light_e[view] - expected, views.pixel_variance(expected))
         to_motion = np.eye(len(derivative))
         to_motion[:POSE, :POSE] = motion_of_step(self._posed.rt_cam_ref[view])
         return derivative.reshape(len(derivative), -1), weight.ravel(), error.ravel(), to_motion
 
 
-def log_likelihood(posed: PosedViews, light: Light, cells: Cells) -> NDArray[np.float32]:
-    """Return the log-likelihood of each pixel (view, row, column) that is held out, up to a constant; NaN of others."""
-    views = posed.views
-    found = np.full_like(views.light_e, np.nan)
+def predictions(posed: PosedViews, light: Light, cells: Cells) -> NDArray[np.float32]:
+    """Return the expected electrons of each pixel (view, row, column) that is held out; NaN of all others."""
+    expected = np.full_like(posed.views.light_e, np.nan)
+    for view, layers, seen in chain.from_iterable(_layers_of_folds(light)):
+        usable = _inside(seen) & cells.pixels(view, seen.shape, 1)
+        expected[view] = np.where(usable, _picture(layers), np.float32(np.nan))
+    return expected
 
-    def work(item: tuple[int, list[Layer], NDArray[np.bool_]]) -> None:
-        view, layers, seen = item
-        expected = np.sum([layer.picture for layer in layers], axis=0, dtype=np.float32)
-        usable = _inside(seen) & cells.pixels(view, expected.shape, 1)
-        variance = views.pixel_variance(expected)
-        error = np.where(usable, views.light_e[view] - expected, np.float32(0))
-        found[view] = np.where(usable, -0.5 * (error**2 / variance + np.log(variance)), np.float32(np.nan))
 
-    for item in _layers_of_folds(light):
-        map_in_threads(work, item)
-    return found
+class Comparison(NamedTuple):
+    """Two predictions compared over patches of the scene.
+
+    `gain` (patch,) is the log-likelihood of the second less that of the first, and `information` (patch,) the squared
+    difference of the two over the variance of the noise, which is the variance of the gain if the noise is all.
+    """
+
+    gain: NDArray[np.float64]
+    information: NDArray[np.float64]
+
+
+def compare(posed: PosedViews, light: Light, before: NDArray[np.float32], after: NDArray[np.float32]) -> Comparison:
+    """Compare two predictions (view, row, column) where both are known; patches are assigned by the light."""
+    terms, patches, views = _Terms(posed, light), _Patches(posed.views.grid), posed.views
+    comparison = Comparison(np.zeros(patches.number), np.zeros(patches.number))
+    for view, layers, _ in chain.from_iterable(_layers_of_folds(light)):
+        known = np.isfinite(before[view]) & np.isfinite(after[view])
+        patch = patches.of(*terms.directions(view, _mean_inverse_depth(layers)))[known]
+        light_e, variances = views.light_e[view][known], []
+        for sign, expected in ((-1, before[view]), (1, after[view])):
+            variance = views.pixel_variance(expected)[known]
+            error = light_e - expected[known]
+            likelihood = -0.5 * (error**2 / variance + np.log(variance))
+            comparison.gain[:] += sign * np.bincount(patch, likelihood, patches.number)
+            variances.append(variance)
+        square = (after[view] - before[view])[known] ** 2 / np.mean(variances, axis=0)
+        comparison.information[:] += np.bincount(patch, square, patches.number)
+    return comparison
 
 
 def _layers_of_folds(light: Light) -> Iterator[list[tuple[int, list[Layer], NDArray[np.bool_]]]]:
@@ -267,6 +310,15 @@ def _layers_of_folds(light: Light) -> Iterator[list[tuple[int, list[Layer], NDAr
             (int(view), [layer.of_view(number) for layer in layers], seen[number])
             for number, view in enumerate(light.folds.views(fold))
         ]
+
+
+def _picture(layers: Sequence[Layer]) -> Image:
+    """Return the electrons of all layers (row, column)."""
+    return sum((layer.picture for layer in layers[1:]), layers[0].picture)
+
+
+def _mean_inverse_depth(layers: Sequence[Layer]) -> Image | float:
+    return sum(layer.inverse_depth for layer in layers) / len(layers)
 
 
 def _inside(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -307,16 +359,16 @@ def _parallax(
 ) -> Image:
     """Return how a ray (x, y, 1) moves with each of the `depth_shapes`: (2, shape, row, column)."""
     x, y, z = translation.astype(np.float32)
-    moved = np.stack([x - rays[..., 0] * z, y - rays[..., 1] * z])
+    along = np.stack([x - rays[..., 0] * z, y - rays[..., 1] * z])
     shapes = depth_shapes(*directions, np.broadcast_to(np.float32(inverse_depth), directions[0].shape))
-    return moved[:, np.newaxis] * shapes
+    return np.asarray(along[:, np.newaxis] * shapes)
 
 
 def _derivative(layer: Layer, fields: Sequence[Image], focal_px: tuple[float, float]) -> Image:
     """Return the derivative (parameter, row, column) of a picture whose rays move by fields (2, parameter, …)."""
     along_rows, along_columns = np.gradient(layer.picture)
-    along_rows *= np.float32(-focal_px[1] * layer.gain[0])
-    along_columns *= np.float32(-focal_px[0] * layer.gain[1])
+    along_rows *= np.float32(-focal_px[1] * layer.gradient_scale[0])
+    along_columns *= np.float32(-focal_px[0] * layer.gradient_scale[1])
     derivative = np.empty((sum(field.shape[1] for field in fields), *layer.picture.shape), np.float32)
     rows = iter(derivative)
     for right, down in zip(chain(*(field[0] for field in fields)), chain(*(field[1] for field in fields)), strict=True):

@@ -220,7 +220,7 @@ def found_range(views: PinholeViews, far: float, near: float) -> tuple[float, fl
         if np.count_nonzero(likely) < _MIN_SAMPLES:
             needed = _MIN_SAMPLES / likely.size
             raise NothingInFocus(
-                f"the views tell the depth of {likely.mean():.1%} of the picture, and {needed:.1%} are needed; "
+                f"depths are clear in {likely.mean():.1%} of the picture, and must be in {needed:.1%}; "
                 "use more light or views"
             )
         first, last = np.quantile(index[likely], _QUANTILES)

@@ -68,11 +68,11 @@ class PinholeViews:
         rays = np.stack([(columns - np.float32(cx)) / np.float32(fx), (rows - np.float32(cy)) / np.float32(fy)], -1)
         if not any(self.lens_change):
             return rays
-        longer, bent = np.array(self.lens_change, np.float32)
+        focal_change, distortion_change = np.array(self.lens_change, np.float32)
         changed = rays
         for _ in range(_INVERSION_STEPS):
             square = np.sum(changed**2, axis=-1, keepdims=True)
-            changed = rays / ((1 + longer) * (1 + bent * square))
+            changed = rays / ((1 + focal_change) * (1 + distortion_change * square))
         return changed
 
     @cached_property

@@ -284,7 +284,7 @@ def _irregularities(inspection: GridInspection) -> Iterator[str]:
     if max(abs(x_px), abs(y_px)) > _NOTABLE_PX:
         yield (
             f"views are shifted against their neighbours, by up to ({x_px:.1f}, {y_px:.1f}) px: the camera was off the "
-            "grid; planes are sharper at the poses that `faintfield align` finds"
+            "grid, and `faintfield align` finds where it was"
         )
     turn_deg = float(np.degrees(np.abs(fits.turn_rad).max()))
     if turn_deg > _NOTABLE_DEG:

@@ -30,7 +30,7 @@ class HeldOutGain(Struct, frozen=True):
 
     value: float
     sigma: float
-    cells: int
+    patches: int
     by_gradient: bool = False
 
     @property

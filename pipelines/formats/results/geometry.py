@@ -3,6 +3,8 @@
 Keys stand in the file in the order of the fields. Lengths are in mm, angles in rad, poses Rodrigues vectors and mm.
 """
 
+import os
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -16,7 +18,16 @@ from numpy.typing import NDArray
 from faintfield.calib.estimate import Repeatability, StageReport
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.errors import BadValue, MissingFile
-from faintfield.pipelines.formats.files import exclusive, remove, remove_leftovers, sha256, write_record, write_whole
+from faintfield.pipelines.formats.files import (
+    UNFINISHED,
+    exclusive,
+    remove,
+    remove_leftovers,
+    sha256,
+    translated_write_errors,
+    write_record,
+    write_whole,
+)
 from faintfield.pipelines.formats.reading import is_file, is_folder, read_json
 from faintfield.pipelines.formats.units import Node, Pose, Shift
 
@@ -127,9 +138,13 @@ def _homing_record(shift: "HomingShift") -> HomingRecord:
 
 
 class PosesOfSession(CameraPoses, frozen=True, kw_only=True):
-    """The poses, and what they were measured from: the homings are those of one session only."""
+    """The poses, what they were measured from, and the hashes of the files beside them, if any.
+
+    The homings are those of one session only.
+    """
 
     inputs: dict[str, str] = {}
+    sha256: dict[str, str] = {}
 
 
 class BoardRecord(Struct, frozen=True):
@@ -199,16 +214,24 @@ def read_geometry[Kind: CameraPoses](path: Path, kind: type[Kind]) -> Kind:
 def write_geometry(out: Path, record: "GeometryRecord | AlignmentRecord", files: Mapping[str, bytes | str]) -> None:
     """Write geometry.json and the files beside it into `out`.
 
-    geometry.json is removed first and written last: where it stands, it vouches for the files beside it.
+    All are written aside first, so that an earlier result stays if the disk is full. geometry.json is removed first and
+    put in place last: where it stands, it vouches for the files beside it.
     """
-    with exclusive(out):
-        remove(out / GEOMETRY_FILE)
-        if (cameras := (out / CAMERA_FILE).parent).is_symlink():  # files are written and removed in `out` alone
-            remove(cameras)
-        remove_leftovers(cameras)
-        for earlier in out.glob(CAMERA_FILE.format("*", "*")):
-            remove(earlier)  # the node may not be part of the new geometry
-        for name, content in files.items():
-            write_whole(out / name, content)
-        hashes = {name: sha256(out / name) for name in files}
-        write_record(out / GEOMETRY_FILE, msgspec.structs.replace(record, sha256=hashes))
+    with exclusive(out), translated_write_errors(out):
+        new = out / f".geometry{UNFINISHED}"
+        try:
+            for name, content in files.items():
+                write_whole(new / name, content)
+            hashes = {name: sha256(new / name) for name in files}
+            write_record(new / GEOMETRY_FILE, msgspec.structs.replace(record, sha256=hashes))
+            remove(out / GEOMETRY_FILE)
+            if (cameras := (out / CAMERA_FILE).parent).is_symlink():  # files are written and removed in `out` alone
+                remove(cameras)
+            remove_leftovers(cameras)
+            for earlier in out.glob(CAMERA_FILE.format("*", "*")):
+                remove(earlier)  # the node may not be part of the new geometry
+            for name in (*files, GEOMETRY_FILE):
+                (out / name).parent.mkdir(exist_ok=True)
+                os.replace(new / name, out / name)
+        finally:
+            shutil.rmtree(new, ignore_errors=True)

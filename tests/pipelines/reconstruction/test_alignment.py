@@ -9,7 +9,7 @@ import pytest
 
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.formats.sets.elemental_set import load_set
-from faintfield.pipelines.reconstruction.alignment import changed_lens, distance_of_neighbours
+from faintfield.pipelines.reconstruction.alignment import change_lens, distance_of_neighbours
 
 
 @pytest.mark.parametrize("distortion", [(), (-0.2, 0.05), (-0.2, 0.05, 1e-3, -5e-4, 0.01, 0.1, -0.02, 0.0)])
@@ -19,7 +19,7 @@ def test_changed_lens_is_the_old_one_after_the_change(distortion: tuple[float, .
     turned = (1 + longer) * (1 + bent * np.sum(rays**2, axis=1, keepdims=True)) * rays
     ones = np.ones((50, 1))
     wanted = old.project(np.hstack([turned, ones]))
-    np.testing.assert_allclose(changed_lens(old, (longer, bent)).project(np.hstack([rays, ones])), wanted, atol=0.05)
+    np.testing.assert_allclose(change_lens(old, (longer, bent)).project(np.hstack([rays, ones])), wanted, atol=0.05)
 
 
 def test_cameras_at_one_place_are_no_neighbours(simulated_scene: Path) -> None:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from faintfield.calib.lens import Lens
-from faintfield.recon.alignment.cameras import lens_motion, motion, motion_of_step, moved, steps_between
-from faintfield.recon.alignment.light import Folds, gradient_gain, gradient_products
+from faintfield.recon.alignment.cameras import lens_motion, motion, motion_of_step, move_poses, steps_between
+from faintfield.recon.alignment.light import Folds, gradient_products, gradient_scale
 from faintfield.recon.alignment.prior import MeasurementErrors, PosePrior
 from faintfield.recon.alignment.score import Cells
 from faintfield.recon.operator.grid import PlaneGrid
@@ -34,7 +34,7 @@ def matrix_exponential(vector: NDArray[np.float64]) -> NDArray[np.float64]:
 @given(st.lists(st.floats(-1, 1), min_size=12, max_size=12))
 def test_step_turns_in_the_frame_of_the_camera_and_steps_are_found_again(numbers: list[float]) -> None:
     pose, step = np.array(numbers).reshape(2, 1, 6)
-    after = moved(pose, step)
+    after = move_poses(pose, step)
     wanted = matrix_exponential(step[0, :3]) @ matrix_exponential(pose[0, :3])
     np.testing.assert_allclose(matrix_exponential(after[0, :3]), wanted, atol=1e-9)
     np.testing.assert_allclose(after[0, 3:], pose[0, 3:] + step[0, 3:])
@@ -56,7 +56,7 @@ def test_motion_is_the_derivative_of_the_ray_by_the_step_of_a_pose() -> None:
     for axis in range(6):
         step = np.zeros((1, 6))
         step[0, axis] = 1e-6
-        slope = (rays(moved(pose[np.newaxis], step)[0]) - rays(moved(pose[np.newaxis], -step)[0])) / 2e-6
+        slope = (rays(move_poses(pose[np.newaxis], step)[0]) - rays(move_poses(pose[np.newaxis], -step)[0])) / 2e-6
         np.testing.assert_allclose(found[:, axis].T, slope, rtol=2e-4, atol=2e-6)
 
 
@@ -120,7 +120,7 @@ def test_gain_of_the_gradient_undoes_what_denoising_took() -> None:
     views = np.full(true.shape, 5.0, np.float32)
     own = (5 * true + generator.normal(0, 1, true.shape)).astype(np.float32)
     light = (true * [0.5]).astype(np.float32)
-    found = gradient_gain([gradient_products(light, own, views, views, blur=0.0)])
+    found = gradient_scale([gradient_products(light, own, views, views, blur=0.0)])
     np.testing.assert_allclose(found, 2.0, rtol=0.05)
 
 

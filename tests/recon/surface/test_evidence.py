@@ -68,7 +68,7 @@ def test_noise_alone_has_no_range() -> None:
     views = surface_scene.noisy_views_of(np.full((25, *SHAPE), 5.0), 1)
     with pytest.raises(
         NothingInFocus,
-        match=r"^the views tell the depth of [0-9.]+% of the picture, and [0-9.]+% are needed; use more light",
+        match=r"^depths are clear in [0-9.]+% of the picture, and must be in [0-9.]+%; use more light",
     ):
         found_range(views, 1 / 1000, 1 / 380)
 
