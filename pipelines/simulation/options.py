@@ -30,7 +30,7 @@ class SyntheticOptions:
     exposure_s
         Exposure of each view.
     position_error_mm
-        Standard deviation of each node's position along each axis; the centre node has no error.
+        Standard deviation of the translation of each node's pose along each axis; the centre node has no error.
     rotation_error_mrad
         Standard deviation of each node's rotation about each axis; the centre node has no error.
     poses

@@ -74,6 +74,19 @@ class Gain:
     patches: int
     by_gradient: bool = False
 
+    @classmethod
+    def of(cls, compared: Comparison) -> "Gain":
+        """Return the gain of a comparison.
+
+        Its variance is the information, times the dispersion of patches about gains in proportion to theirs.
+        """
+        patches = compared.information > 0
+        gain, information = compared.gain[patches], compared.information[patches]
+        value, number = float(gain.sum()), len(gain)
+        left = gain - information * (value / max(information.sum(), 1e-300))
+        dispersion = max(1.0, float(np.sum(left**2 / information)) / max(number - 1, 1))
+        return cls(value, float(np.sqrt(dispersion * information.sum())), number)
+
     @property
     def sure(self) -> bool:
         """True if the gain is beyond chance."""
@@ -189,7 +202,7 @@ class Aligner:
         yield self.rounds[-1]
         new_picture = self._light.picture()
         after, before = self._predictions(*without_final), self._predictions(self._start, np.zeros(0))
-        old_picture, gain = self._light.picture(), _gain(compare(self._binned[1], self._light, before, after))
+        old_picture, gain = self._light.picture(), Gain.of(compare(self._binned[1], self._light, before, after))
         if abs(gain.value) <= _SURE * gain.sigma:  # a sure loss is an answer, too
             slope = self._slope()
             gain = gain if slope is None or not slope.sure else slope
@@ -301,16 +314,6 @@ class Aligner:
         cross = of_views[:, :POSE, scene].reshape(len(poses), -1), scores.information[:, lens, scene].sum(axis=0)
         gradient = scores.gradient[self._others, :POSE].ravel(), scores.gradient[:, lens].sum(axis=0)
         return np.block([[poses, between], [between.T, of_lens]]), np.concatenate(cross), np.concatenate(gradient)
-
-
-def _gain(compared: Comparison) -> Gain:
-    """Return the gain; its variance is the information, times the dispersion of patches about gains in proportion."""
-    patches = compared.information > 0
-    gain, information = compared.gain[patches], compared.information[patches]
-    value, number = float(gain.sum()), len(gain)
-    left = gain - information * (value / max(information.sum(), 1e-300))
-    dispersion = max(1.0, float(np.sum(left**2 / information)) / max(number - 1, 1))
-    return Gain(value, float(np.sqrt(dispersion * information.sum())), number)
 
 
 def _lens_change(lens: NDArray[np.float64]) -> tuple[float, float]:

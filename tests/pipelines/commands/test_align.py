@@ -10,6 +10,7 @@ import pytest
 import tomli_w
 from numpy.typing import NDArray
 
+from faintfield.pipelines.errors import CannotWrite
 from faintfield.pipelines.formats.files import write_json
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import write_frame
@@ -21,6 +22,7 @@ from faintfield.pipelines.formats.results.geometry import (
     LensRecord,
     NodeRecord,
     read_geometry,
+    write_geometry,
 )
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
 from faintfield.pipelines.formats.sets.ground_truth import read_truth
@@ -85,9 +87,17 @@ def test_poses_by_the_views_are_nearer_to_the_truth_by_what_they_state(
     assert 0.5 < errors @ np.linalg.solve(covariance[np.ix_(rows, rows)], errors) / len(errors) < 1.5
 
     done("verify", tmp_path / "aligned", "--inputs", scene)
-    planes = ("--geometry", tmp_path / "aligned", "--depth-mm", 700, "--prior", "tv", "--out", tmp_path / "planes")
+    (tmp_path / "aligned").rename(tmp_path / "alignment")
+    planes = ("--geometry", tmp_path / "alignment", "--depth-mm", 700, "--prior", "tv", "--out", tmp_path / "planes")
     done("reconstruct", scene, *planes)
     assert read_record(tmp_path / "planes")["options"]["poses"] == "aligned"
+    assert "Poses, by the views" in (tmp_path / "planes" / "report.html").read_text()
+
+    # A second result that cannot be written leaves the first
+    before = {path.name: path.read_bytes() for path in (tmp_path / "alignment").iterdir()}
+    with pytest.raises(CannotWrite):
+        write_geometry(tmp_path / "alignment", record, {COVARIANCE_FILE: b"new", "a" * 300: b"no such name"})
+    assert {path.name: path.read_bytes() for path in (tmp_path / "alignment").iterdir()} == before
 
 
 def test_noise_alone_gives_no_poses_and_removes_earlier_ones(scene: Path, tmp_path: Path, faintfield: Command) -> None:
@@ -127,6 +137,10 @@ def test_few_views_and_depths_that_are_none_are_refused(
     assert (ended.returncode, "6 views" in ended.stderr, "at least 8" in ended.stderr) == (1, True, True)
     ended = faintfield("align", scene, "--depth", -5)
     assert (ended.returncode, "a plane at -5.0 mm is not in front of the camera" in ended.stderr) == (1, True)
+    ended = faintfield("align", scene, "--scene", "bright")
+    assert (ended.returncode, "--scene bright names a set of a session" in ended.stderr) == (2, True)
+    ended = faintfield("align", scene, "--out", "")
+    assert (ended.returncode, "an argument is empty; give it a value" in ended.stderr) == (2, True)
     ended = faintfield("align", scene, "--depth-range", "800:800")
     assert (ended.returncode, "--depth-range 800:800: is no range" in ended.stderr) == (2, True)
 
@@ -174,21 +188,21 @@ def test_shift_of_a_homing_since_the_boards_is_taken_out(tmp_path: Path, done: C
 
 
 def test_lens_is_found_beside_the_poses(scene: Path, tmp_path: Path, done: Command) -> None:
-    bent = tmp_path / "bent"
-    shutil.copytree(scene, bent)
+    wrong = tmp_path / "wrong"
+    shutil.copytree(scene, wrong)
     settings = load_set(scene).settings
     first, *rest = settings.camera.distortion
     camera = msgspec.structs.replace(settings.camera, distortion=(first + 0.15, *rest))
-    wrong = msgspec.structs.replace(settings, camera=camera)
-    (bent / "elemental.toml").write_bytes(tomli_w.dumps(msgspec.to_builtins(wrong)).encode())
-    done("align", bent, "--with-lens")
-    record = read_geometry(bent / "alignment", AlignmentRecord)
+    changed = msgspec.structs.replace(settings, camera=camera)
+    (wrong / "elemental.toml").write_bytes(tomli_w.dumps(msgspec.to_builtins(changed)).encode())
+    done("align", wrong, "--with-lens")
+    record = read_geometry(wrong / "alignment", AlignmentRecord)
     assert record.lens_change
     assert record.lens.distortion[0] == pytest.approx(first, abs=3 * record.lens_change.distortion_sigma)
     assert record.lens_change.distortion_sigma < 0.06
     # Depths are free, so that a longer focal length would only make them larger
     assert abs(record.lens_change.focal_length) < 3e-3
-    assert load_set(bent).settings.camera.distortion == record.lens.distortion
+    assert load_set(wrong).settings.camera.distortion == record.lens.distortion
 
 
 def test_damaged_covariance_of_boards_is_refused(scene: Path, tmp_path: Path, faintfield: Command) -> None:
@@ -203,6 +217,11 @@ def test_damaged_covariance_of_boards_is_refused(scene: Path, tmp_path: Path, fa
     np.savez(tmp_path / COVARIANCE_FILE, covariance=-np.eye(size))
     ended = faintfield("align", scene, "--geometry", tmp_path, "--depth", 700, "--out", tmp_path / "out")
     assert (ended.returncode, "a covariance that is not positive" in ended.stderr) == (1, True)
+
+    geometry = loads((tmp_path / GEOMETRY_FILE).read_text())
+    write_json(tmp_path / GEOMETRY_FILE, geometry | {"sha256": {COVARIANCE_FILE: "0" * 64}})
+    ended = faintfield("align", scene, "--geometry", tmp_path, "--depth", 700, "--out", tmp_path / "out")
+    assert (ended.returncode, f"{COVARIANCE_FILE}: was altered; run" in ended.stderr) == (1, True)
 
     ended = faintfield("align", scene, "--out", tmp_path)
     assert (ended.returncode, "that was not found by the views; name another --out" in ended.stderr) == (1, True)

@@ -14,12 +14,12 @@ from faintfield.pipelines.reconstruction.alignment import change_lens, distance_
 
 @pytest.mark.parametrize("distortion", [(), (-0.2, 0.05), (-0.2, 0.05, 1e-3, -5e-4, 0.01, 0.1, -0.02, 0.0)])
 def test_changed_lens_is_the_old_one_after_the_change(distortion: tuple[float, ...]) -> None:
-    old, longer, bent = Lens((640, 480), 900.0, 910.0, 320.0, 240.0, distortion), 0.02, 0.01
+    old, change = Lens((640, 480), 900.0, 910.0, 320.0, 240.0, distortion), (0.02, 0.01)
     rays = np.random.default_rng(1).uniform(-0.25, 0.25, (50, 2))
-    turned = (1 + longer) * (1 + bent * np.sum(rays**2, axis=1, keepdims=True)) * rays
+    turned = (1 + change[0]) * (1 + change[1] * np.sum(rays**2, axis=1, keepdims=True)) * rays
     ones = np.ones((50, 1))
     wanted = old.project(np.hstack([turned, ones]))
-    np.testing.assert_allclose(change_lens(old, (longer, bent)).project(np.hstack([rays, ones])), wanted, atol=0.05)
+    np.testing.assert_allclose(change_lens(old, change).project(np.hstack([rays, ones])), wanted, atol=0.05)
 
 
 def test_cameras_at_one_place_are_no_neighbours(simulated_scene: Path) -> None:

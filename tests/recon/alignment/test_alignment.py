@@ -1,4 +1,4 @@
-"""Poses moved, and what is known of their errors; the whole of it is tested by `align` on a simulated set."""
+"""Poses and their steps, and what is known of their errors; the whole of it is tested by `align` on a simulated set."""
 
 from dataclasses import replace
 
@@ -11,9 +11,10 @@ from scipy.ndimage import gaussian_filter
 
 from faintfield.calib.lens import Lens
 from faintfield.recon.alignment.cameras import lens_motion, motion, motion_of_step, move_poses, steps_between
+from faintfield.recon.alignment.estimate import Gain
 from faintfield.recon.alignment.light import Folds, gradient_products, gradient_scale
 from faintfield.recon.alignment.prior import MeasurementErrors, PosePrior
-from faintfield.recon.alignment.score import Cells
+from faintfield.recon.alignment.score import Cells, Comparison
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.surface.pinhole_views import PinholeViews
 
@@ -74,9 +75,9 @@ def test_rays_of_a_changed_lens_are_those_of_the_lens() -> None:
 def test_motion_by_the_lens_is_the_derivative_of_the_pixel() -> None:
     points = np.random.default_rng(5).uniform(-0.5, 0.5, (20, 2))
 
-    def pixels(longer: float, bent: float) -> NDArray[np.float64]:
+    def pixels(focal_change: float, distortion_change: float) -> NDArray[np.float64]:
         square = np.sum(points**2, axis=1, keepdims=True)
-        return (1 + longer) * points * (1 + bent * square)
+        return (1 + focal_change) * points * (1 + distortion_change * square)
 
     found = lens_motion(points[:, 0].astype(np.float32), points[:, 1].astype(np.float32))
     for number, step in enumerate(np.eye(2) * 1e-6):
@@ -114,7 +115,7 @@ def test_shift_of_one_group_is_told_from_errors_of_single_views() -> None:
     assert np.sqrt(prior.variances[2]) == pytest.approx(0.4 / np.sqrt(3), rel=0.1)
 
 
-def test_gain_of_the_gradient_undoes_what_denoising_took() -> None:
+def test_scale_of_gradients_undoes_what_denoising_took() -> None:
     generator = np.random.default_rng(4)
     true = gaussian_filter(generator.normal(size=(60, 80)), 3) * 50
     views = np.full(true.shape, 5.0, np.float32)
@@ -122,6 +123,22 @@ def test_gain_of_the_gradient_undoes_what_denoising_took() -> None:
     light = (true * [0.5]).astype(np.float32)
     found = gradient_scale([gradient_products(light, own, views, views, blur=0.0)])
     np.testing.assert_allclose(found, 2.0, rtol=0.05)
+
+
+def test_standard_error_of_the_gain_counts_errors_that_the_pixels_of_a_patch_share() -> None:
+    generator = np.random.default_rng(7)
+    information = generator.gamma(0.5, 20.0, 60)
+
+    def gains(slope: float) -> list[Gain]:
+        errors = np.sqrt(4 * information) * generator.normal(size=(400, 60))
+        return [Gain.of(Comparison(slope * information + error, information)) for error in errors]
+
+    scores = np.array([gain.value / gain.sigma for gain in gains(0.0)])
+    assert scores.std() == pytest.approx(1, abs=0.1)
+    assert np.mean([gain.sure for gain in gains(0.0)]) < 0.01
+    # Gains in few patches do not make it larger
+    wanted = 0.5 * np.sqrt(information.sum() / 4)
+    assert np.mean([gain.value / gain.sigma for gain in gains(0.5)]) == pytest.approx(wanted, rel=0.1)
 
 
 @pytest.mark.parametrize("views", [8, 25, 49, 81])
