@@ -107,11 +107,12 @@ class GridInspection:
 
 
 def inspect_grid(
-    nodes: Sequence[Node], pictures: GridPictures, prescribed: Orientation | None = None
+    nodes: Sequence[Node], pictures: GridPictures, prescribed: Orientation | None = None, *, square: bool = False
 ) -> GridInspection:
     """Inspect the pictures of a grid at different nodes; views may be missing.
 
-    The orientation is found, or only checked if a person prescribed it.
+    The orientation is found, or only checked if a person prescribed it. A `square` grid has the same pitch along rows
+    and columns; so has one whose views are shifted by as much as another pitch would shift them.
     """
     if (failure := _failure_at_sight(nodes, pictures)) is not None:
         return GridInspection(prescribed or Orientation(), failure)
@@ -128,7 +129,7 @@ def inspect_grid(
     orientation = prescribed or Orientation(transpose, opposed and not transpose, opposed and transpose)
     no_sign_px = _NO_SIGN_PX / pictures.fine_scale
     arranged = Axes(orientation.transpose, orientation.opposed)
-    ratio = pitch_ratio(fine, replace(arranged, ratio=axes.ratio), no_sign_px)
+    ratio = 1.0 if square else pitch_ratio(fine, replace(arranged, ratio=axes.ratio), no_sign_px)
     least_px, largest_px = disparity_range(fine, replace(arranged, ratio=ratio)) or (-fine_px, fine_px)
     if orientation.flip_rows if orientation.transpose else orientation.flip_columns:
         least_px, largest_px = -largest_px, -least_px
@@ -144,6 +145,9 @@ def inspect_grid(
         orientation, side_z, least_px, largest_px = orientation.turned(), -side_z, -largest_px, -least_px
     arranged_views = dict(zip(orientation.apply(nodes), pictures.fine, strict=True))
     fits = compare_neighbours(arranged_views, (least_px, largest_px), ratio)
+    off_px = float(np.sqrt(np.nanmean(np.square(fits.shift_px))))
+    if abs(ratio - 1) * max(-least_px, largest_px) * distance < SURE * off_px:
+        return inspect_grid(nodes, pictures, prescribed, square=True)
     fitting = {nodes[index]: pictures.coarse[index] for index in range(len(nodes)) if index not in fits.odd}
     return GridInspection(
         orientation,

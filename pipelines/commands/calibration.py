@@ -100,7 +100,7 @@ def align(
     Writes geometry.json with source "views", its covariance, and a page that shows the scene before and after. All
     commands take the poses of SET-PATH from there; with --out, `reconstruct --geometry` takes them. The new poses are
     accepted only if they predict pixels that were held out better than the old ones do, beyond chance. Otherwise the
-    command says so, and removes the poses of an earlier call.
+    command says so, and removes the poses of an earlier call; its exit status is 0 in both cases, and --json tells.
 
     Parameters
     ----------

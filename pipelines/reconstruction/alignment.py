@@ -14,7 +14,7 @@ from faintfield.calib.homography import (
     transfer_sigma_px,
 )
 from faintfield.calib.lens import Lens
-from faintfield.pipelines.console import inform, progress, working
+from faintfield.pipelines.console import progress, working
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import problem_of_file
 from faintfield.pipelines.formats.reading import read_arrays
@@ -75,6 +75,12 @@ def assumed_errors(elemental_set: ElementalSet, position: float | None, rotation
     )
 
 
+def plausible_errors(elemental_set: ElementalSet, assumed: PoseErrors) -> PoseErrors:
+    """Return the errors that are assumed, or those of a stage if they are larger."""
+    stage_mm = _STAGE_ERROR * distance_of_neighbours(elemental_set)
+    return PoseErrors(max(assumed.sigma_rad, _STAGE_RAD), max(assumed.sigma_mm, stage_mm))
+
+
 def distance_of_neighbours(elemental_set: ElementalSet) -> float:
     """Return the median distance of a camera from its nearest neighbour, in the unit of the poses."""
     centres = np.array([_centre(pose) for pose in elemental_set.poses_rt_cam_ref])
@@ -125,10 +131,6 @@ def align_set(
     for _ in progress(aligner.run(), "aligning views", aligner.total):
         pass
     depths = sorted(depths_mm) if isinstance(light, PlanesLight) else [1 / q for q in reversed(light.limits)]
-    if not depths_mm:
-        inform(
-            f"depths between {elemental_set.depths_text(*(float(f'{depth:.3g}') for depth in depths), join=' and ')}"
-        )
     return Aligned(aligner.result, depths, bins)
 
 

@@ -33,6 +33,7 @@ from faintfield.pipelines.formats.results.geometry import (
     CameraPoses,
     LensRecord,
     NodeRecord,
+    PosesOfSession,
     read_geometry,
     write_geometry,
 )
@@ -44,6 +45,7 @@ from faintfield.pipelines.reconstruction.alignment import (
     align_set,
     assumed_errors,
     change_lens,
+    plausible_errors,
     pose_uncertainty,
     shifts_px,
     transfer_sigmas_px,
@@ -53,7 +55,11 @@ from faintfield.pipelines.reconstruction.surface.request import range_in_mm
 from faintfield.pipelines.workflows.reconstruct import open_set
 from faintfield.recon.alignment.cameras import LENS, move_poses
 from faintfield.recon.alignment.estimate import Alignment
+from faintfield.recon.alignment.prior import PosePrior
 from faintfield.recon.errors import NothingInFocus
+
+# Errors that are found may be so many times the plausible ones; beyond, what was aligned is hardly the scene.
+_MOST_EXCESS = 6.0
 
 
 class AlignmentSummary(msgspec.Struct, frozen=True):
@@ -96,6 +102,8 @@ def align_views(
     elemental_set, _ = open_set(folder, out, scene, geometry, aligned=False)
     if elemental_set.measured_in is not None and out.resolve() == elemental_set.measured_in.parent.resolve():
         raise OutputExists(f"{out}: holds the geometry.json that the alignment starts from; name another --out")
+    if geometry is not None:
+        _check_not_by_these_views(geometry, elemental_set)
     depths_mm = distinct_depths([elemental_set.depth_in_mm(value) for value in depth], elemental_set)
     range_mm = None if depth_range is None else range_in_mm(elemental_set, "--depth-range", depth_range)
     errors = assumed_errors(elemental_set, position_error, rotation_error_mrad)
@@ -107,15 +115,26 @@ def align_views(
     except NothingInFocus as failure:
         return _unchanged(out, f"the views tell no poses: {failure}")
     gain = HeldOutGain(**vars(aligned.alignment.gain))
+    if (excess := _excess(aligned.alignment.prior, plausible_errors(elemental_set, errors))) > _MOST_EXCESS:
+        why = (
+            f"the poses stay as they are: they would be wrong by {1e3 * aligned.alignment.prior.sigma_rad:.3g} mrad, "
+            f"{excess:.0f} times what is plausible; the depths may be wrong, or the pictures show what does not move "
+            "with the scene, such as a vignette or stray light; if errors are that large, state --rotation-error-mrad "
+            "and --position-error"
+        )
+        return msgspec.structs.replace(_unchanged(out, why), gain=gain)
     if not aligned.alignment.gain.sure:
         why = (
             "the poses stay as they are: the new ones do not predict held-out pixels better, beyond chance (gain of "
             f"{gain.text}; more than 3 are needed)"
         )
+        why += "; they may be right, or light or views too few"
         if not depths_mm:
-            why += "; known depths tell more than unknown ones: give --depth for each plane of the scene"
+            why += ", and --depth helps where planes at known depths hold all of the scene"
         return msgspec.structs.replace(_unchanged(out, why), gain=gain)
     record, uncertainty = _record(elemental_set, aligned, options)
+    depths = (float(f"{depth:.3g}") for depth in (aligned.depths_mm[0], aligned.depths_mm[-1]))
+    inform(f"depths between {elemental_set.depths_text(*depths, join=' and ')}")
     page = alignment_page(record, aligned.alignment.pictures, elemental_set.units.tone_curve)
     write_geometry(out, record, {COVARIANCE_FILE: _covariance_file(record, uncertainty), ALIGNMENT_PAGE: page})
     _inform_of(record)
@@ -129,6 +148,20 @@ def _check_not_of_boards(out: Path) -> None:
     with suppress(BadValue, MissingFile):
         if read_geometry(out, CameraPoses).source is UNSET:
             raise OutputExists(f"{out}: holds a {GEOMETRY_FILE} that was not found by the views; name another --out")
+
+
+def _excess(prior: PosePrior, plausible: PoseErrors) -> float:
+    """Return how many times larger than plausible the errors of the old poses seem."""
+    return max(prior.sigma_rad / plausible.sigma_rad, prior.sigma_mm / plausible.sigma_mm)
+
+
+def _check_not_by_these_views(geometry: Path, elemental_set: ElementalSet) -> None:
+    """Refuse poses that were found by the same views (BadValue): noise would count twice."""
+    found = read_geometry(geometry, PosesOfSession)
+    images = {view.image for view in elemental_set.settings.view}
+    hashes = {digest for name, digest in elemental_set.input_hashes().items() if name in images}
+    if found.source == "views" and hashes & set(found.inputs.values()):
+        raise BadValue(f"{geometry}: was found by these views already; leave out --geometry, or give that of boards")
 
 
 def _unchanged(out: Path, reason: str) -> AlignmentSummary:
@@ -210,7 +243,7 @@ def _inform_of(record: AlignmentRecord) -> None:
     turns = np.degrees([view.turn_rad for view in record.views])
     inform(
         f"views move by {np.sqrt(np.mean(np.sum(shifts**2, axis=1))):.2f} px rms, at most "
-        f"{np.abs(shifts).max():.2f} px, and turn by up to {np.abs(turns).max():.2f}°"
+        f"{np.linalg.norm(shifts, axis=1).max():.2f} px, and turn by up to {np.abs(turns).max():.2f}°"
     )
     if change := record.lens_change or None:
         inform(

@@ -202,7 +202,8 @@ def read_geometry[Kind: CameraPoses](path: Path, kind: type[Kind]) -> Kind:
     """Read geometry.json, or that of a folder, whole or only the camera's poses."""
     path = path / GEOMETRY_FILE if is_folder(path) else path
     if not is_file(path):
-        raise MissingFile(f"{path}: no such file; run `faintfield geometry` on the board set first")
+        remedy = "run `faintfield geometry` on the board set first, or `faintfield align` on a set"
+        raise MissingFile(f"{path}: no such file; {remedy}")
     geometry = read_json(path, kind, what="the result of `faintfield geometry` or `align`", remedy="run that again")
     try:
         geometry.camera_lens()

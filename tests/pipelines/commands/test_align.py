@@ -125,6 +125,19 @@ def test_true_poses_stay(tmp_path: Path, done: Command) -> None:
     assert not (tmp_path / "set" / "alignment" / "geometry.json").exists()
 
 
+def test_wrong_depths_and_poses_by_the_same_views_are_refused(tmp_path: Path, faintfield: Command) -> None:
+    folder = tmp_path / "set"
+    faintfield("simulate", folder, "--rows", 5, "--columns", 5, "--size-px", 320, 240, "--poses", "nominal", "--snr", 1)
+    ended = faintfield("align", folder, "--depth", 600, "--json")
+    printed = loads(ended.stdout)
+    assert (ended.returncode, printed["accepted"]) == (0, False)
+    assert "times what is plausible; the depths may be wrong" in printed["reason"]
+
+    assert loads(faintfield("align", folder, "--depth", 500, "--depth", 700, "--json").stdout)["accepted"]
+    ended = faintfield("align", folder, "--geometry", folder / "alignment", "--out", tmp_path / "out")
+    assert (ended.returncode, "was found by these views already" in ended.stderr) == (1, True)
+
+
 def test_few_views_and_depths_that_are_none_are_refused(
     simulated_scene: Path, scene: Path, tmp_path: Path, faintfield: Command
 ) -> None:
