@@ -146,7 +146,7 @@ def inspect_grid(
     arranged_views = dict(zip(orientation.apply(nodes), pictures.fine, strict=True))
     fits = compare_neighbours(arranged_views, (least_px, largest_px), ratio)
     off_px = float(np.sqrt(np.nanmean(np.square(fits.shift_px))))
-    if abs(ratio - 1) * max(-least_px, largest_px) * distance < SURE * off_px:
+    if ratio != 1 and abs(ratio - 1) / max(ratio, 1) * max(-least_px, largest_px) * distance < SURE * off_px:
         return inspect_grid(nodes, pictures, prescribed, square=True)
     fitting = {nodes[index]: pictures.coarse[index] for index in range(len(nodes)) if index not in fits.odd}
     return GridInspection(

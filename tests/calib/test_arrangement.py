@@ -82,6 +82,16 @@ def test_pitch_ratio_is_measured() -> None:
     assert result.range_px[0] == pytest.approx(-3.8 * result.ratio, abs=0.7)
 
 
+def test_views_off_the_grid_do_not_make_it_oblong() -> None:
+    """Shifts of views against a regular grid must not be taken for another pitch."""
+    generator = np.random.default_rng(2)
+    views = {
+        node: np.roll(picture, generator.integers(-3, 4, 2), axis=(0, 1))
+        for node, picture in light_field(grid=(5, 5)).items()
+    }
+    assert inspect(views).ratio == 1.0
+
+
 @pytest.mark.parametrize(("grid", "transpose"), [((1, 7), False), ((7, 1), True)])
 def test_reversed_single_line_is_put_in_order(grid: tuple[int, int], transpose: bool) -> None:
     wanted = Orientation(transpose, flip_rows=True, flip_columns=True)
