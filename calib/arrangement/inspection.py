@@ -145,9 +145,10 @@ def inspect_grid(
         orientation, side_z, least_px, largest_px = orientation.turned(), -side_z, -largest_px, -least_px
     arranged_views = dict(zip(orientation.apply(nodes), pictures.fine, strict=True))
     fits = compare_neighbours(arranged_views, (least_px, largest_px), ratio)
-    off_px = float(np.sqrt(np.nanmean(np.square(fits.shift_px))))
-    if ratio != 1 and abs(ratio - 1) / max(ratio, 1) * max(-least_px, largest_px) * distance < SURE * off_px:
-        return inspect_grid(nodes, pictures, prescribed, square=True)
+    if ratio != 1:
+        least_moved_px = abs(ratio - 1) / max(ratio, 1) * max(-least_px, largest_px) * distance
+        if least_moved_px < SURE * np.sqrt(np.nanmean(np.square(fits.shift_px))):
+            return inspect_grid(nodes, pictures, prescribed, square=True)
     fitting = {nodes[index]: pictures.coarse[index] for index in range(len(nodes)) if index not in fits.odd}
     return GridInspection(
         orientation,

@@ -55,7 +55,6 @@ from faintfield.pipelines.reconstruction.surface.request import range_in_mm
 from faintfield.pipelines.workflows.reconstruct import open_set
 from faintfield.recon.alignment.cameras import LENS, move_poses
 from faintfield.recon.alignment.estimate import Alignment
-from faintfield.recon.alignment.prior import PosePrior
 from faintfield.recon.errors import NothingInFocus
 
 # Errors that are found may be so many times the plausible ones; beyond, what was aligned is hardly the scene.
@@ -115,26 +114,9 @@ def align_views(
     except NothingInFocus as failure:
         return _unchanged(out, f"the views tell no poses: {failure}")
     gain = HeldOutGain(**vars(aligned.alignment.gain))
-    if (excess := _excess(aligned.alignment.prior, plausible_errors(elemental_set, errors))) > _MOST_EXCESS:
-        why = (
-            f"the poses stay as they are: they would be wrong by {1e3 * aligned.alignment.prior.sigma_rad:.3g} mrad, "
-            f"{excess:.0f} times what is plausible; the depths may be wrong, or the pictures show what does not move "
-            "with the scene, such as a vignette or stray light; if errors are that large, state --rotation-error-mrad "
-            "and --position-error"
-        )
-        return msgspec.structs.replace(_unchanged(out, why), gain=gain)
-    if not aligned.alignment.gain.sure:
-        why = (
-            "the poses stay as they are: the new ones do not predict held-out pixels better, beyond chance (gain of "
-            f"{gain.text}; more than 3 are needed)"
-        )
-        why += "; they may be right, or light or views too few"
-        if not depths_mm:
-            why += ", and --depth helps where planes at known depths hold all of the scene"
+    if why := _refusal(aligned.alignment, gain, plausible_errors(elemental_set, errors), options):
         return msgspec.structs.replace(_unchanged(out, why), gain=gain)
     record, uncertainty = _record(elemental_set, aligned, options)
-    depths = (float(f"{depth:.3g}") for depth in (aligned.depths_mm[0], aligned.depths_mm[-1]))
-    inform(f"depths between {elemental_set.depths_text(*depths, join=' and ')}")
     page = alignment_page(record, aligned.alignment.pictures, elemental_set.units.tone_curve)
     write_geometry(out, record, {COVARIANCE_FILE: _covariance_file(record, uncertainty), ALIGNMENT_PAGE: page})
     _inform_of(record)
@@ -150,9 +132,24 @@ def _check_not_of_boards(out: Path) -> None:
             raise OutputExists(f"{out}: holds a {GEOMETRY_FILE} that was not found by the views; name another --out")
 
 
-def _excess(prior: PosePrior, plausible: PoseErrors) -> float:
-    """Return how many times larger than plausible the errors of the old poses seem."""
-    return max(prior.sigma_rad / plausible.sigma_rad, prior.sigma_mm / plausible.sigma_mm)
+def _refusal(alignment: Alignment, gain: HeldOutGain, plausible: PoseErrors, options: AlignmentOptions) -> str | None:
+    """Return why the new poses are not accepted, None if they are."""
+    prior = alignment.prior
+    excess = max(prior.sigma_rad / plausible.sigma_rad, prior.sigma_mm / plausible.sigma_mm)
+    if excess > _MOST_EXCESS:
+        return (
+            f"the poses stay as they are: they would be wrong by {1e3 * prior.sigma_rad:.3g} mrad and "
+            f"{prior.sigma_mm:.3g} in the unit of the poses, {excess:.0f} times what is plausible; the depths may be "
+            "wrong, or the pictures show what does not move with the scene, such as a vignette or stray light; if "
+            "errors are that large, state --rotation-error-mrad and --position-error"
+        )
+    if alignment.gain.sure:
+        return None
+    advice = "" if options.depth_mm else ", and --depth helps where planes at known depths hold all of the scene"
+    return (
+        "the poses stay as they are: the new ones do not predict held-out pixels better, beyond chance (gain of "
+        f"{gain.text}; more than 3 are needed); they may be right, or light or views too few{advice}"
+    )
 
 
 def _check_not_by_these_views(geometry: Path, elemental_set: ElementalSet) -> None:
@@ -239,6 +236,8 @@ def _covariance_file(record: AlignmentRecord, uncertainty: PoseUncertainty) -> b
 
 
 def _inform_of(record: AlignmentRecord) -> None:
+    if not record.options.depth_mm:
+        inform(f"depths between {' and '.join(record.transfer_sigma_px)}")
     shifts = np.array([view.shift_px for view in record.views])
     turns = np.degrees([view.turn_rad for view in record.views])
     inform(

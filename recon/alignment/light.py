@@ -168,9 +168,8 @@ class SurfaceLight:
             for image, seen in zip(picture, self._covered[views], strict=True):
                 share = np.maximum(gaussian(seen.astype(np.float32), self._blur), np.float32(1e-3))
                 image[:] = gaussian(image, self._blur) / share
-        return [Layer(picture, self._inverse_depths[views], self._gradient_scale)], self._covered[views] & self._usable[
-            views
-        ]
+        layer = Layer(picture, self._inverse_depths[views], self._gradient_scale)
+        return [layer], self._covered[views] & self._usable[views]
 
     def picture(self) -> NDArray[np.float32]:
         """Return the light by all views (row, column)."""
