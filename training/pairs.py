@@ -14,7 +14,7 @@ from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.metrics import signal_scale_for_snr
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.single_plane import PlaneOperator
-from faintfield.recon.prior.collaborative import Patches, collaborative_wiener, wiener_and_thresholded
+from faintfield.recon.prior.collaborative import Groups, Patches, collaborative_wiener
 from faintfield.recon.prior.evidence import noise_of_back_projection
 from faintfield.recon.solver.initialization import back_projection, smooth_start
 from faintfield.recon.solver.penalty_weight import universal_penalty_weight
@@ -103,7 +103,7 @@ def channels(exposed: Exposure, weight: float | None) -> NDArray[np.float32]:
     pilot = operator.adjoint_of_forward(plane) / np.maximum(coverage, 1e-9)
     seen = back_projection(operator, images)
     fine, coarse = Patches(8, 4, 16, 64), Patches(12, 5, 18, 64)
-    wiener, hard = wiener_and_thresholded(seen, pilot, noise, fine)
+    wiener, hard = Groups(pilot, noise, fine).wiener_and_thresholded(seen, pilot)
     first = (wiener + collaborative_wiener(seen, pilot, noise, coarse)) / 2
     second = collaborative_wiener(seen, (hard + first) / 2, noise, fine)
     return np.stack([seen, pilot, (first + second) / 2, np.sqrt(noise.variance), exposed.truth]).astype(np.float32)

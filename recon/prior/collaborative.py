@@ -1,5 +1,6 @@
 """Collaborative filters: a picture without its noise, by groups of patches that are alike; candidates for a plane."""
 
+from collections.abc import Collection
 from itertools import product
 from typing import NamedTuple
 
@@ -8,7 +9,7 @@ from numpy.typing import NDArray
 
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.scene_operator import SceneOperator
-from faintfield.recon.prior.collaborative_kernels import Transform, filter_rows
+from faintfield.recon.prior.collaborative_kernels import Transform, filter_rows, find_groups
 from faintfield.recon.prior.evidence import Evidence, Noise, evidence_of_planes
 from faintfield.recon.threads import map_in_threads
 
@@ -40,6 +41,78 @@ class Patches(NamedTuple):
     members: int = 64
 
 
+class Groups:
+    """Groups of patches that are alike in a guide, a picture (row, column) of the same scene as those to filter.
+
+    `noise` is that of the pictures to filter. Patches with a sample of infinite variance join no group.
+    """
+
+    def __init__(self, guide: Image, noise: Noise, patches: Patches) -> None:
+        size = patches.size
+        _require_same_shapes(guide=guide, variance=noise.variance)
+        if size < 4 or size % 4 or size > min(guide.shape):
+            raise ValueError(
+                f"patches of {size} samples in a picture {guide.shape}; give a multiple of four that fits into it"
+            )
+        # A distance to NaN is below none
+        known = np.where(np.isfinite(noise.variance), guide, np.nan).astype(np.float32)
+        self._patches, self._variance = patches, np.asarray(noise.variance, np.float32)
+        self._rows, self._columns = (_corners(length, patches) for length in guide.shape)
+        self._places = np.empty((self._rows.size, self._columns.size, patches.members), np.int16)
+        self._transform = _transform(noise.kernel, size)
+        # Groups reach into the next strips, but no farther: every other strip can be filtered at the same time
+        strip_of_row = self._rows // (2 * patches.radius + size)
+        self._strips = [np.flatnonzero(strip_of_row == k) for k in range(strip_of_row[-1] + 1)]
+
+        def find(strip: NDArray[np.intp]) -> None:
+            part = slice(strip[0], strip[-1] + 1)
+            find_groups(known, self._rows[part], self._columns, size, patches.radius, self._places[part])
+
+        map_in_threads(find, self._strips)
+
+    def wiener(self, picture: Image, pilot: Image) -> NDArray[np.float32]:
+        """Return a picture as Wiener's filter leaves it: see `collaborative_wiener`."""
+        return self._filtered(picture, pilot, wiener=True)[0]
+
+    def thresholded(self, picture: Image, pilot: Image) -> NDArray[np.float32]:
+        """Return what stands out of the noise of a picture, and the pilot's samples that are in no group.
+
+        The first step of Dabov et al.: coefficients above 2.7 standard deviations of their noise are kept. So it also
+        shows what the pilot lost.
+        """
+        return self._filtered(picture, pilot, large=True)[0]
+
+    def wiener_and_thresholded(self, picture: Image, pilot: Image) -> list[NDArray[np.float32]]:
+        """Return both, in less time."""
+        return self._filtered(picture, pilot, wiener=True, large=True)
+
+    def _filtered(
+        self, picture: Image, pilot: Image, *, wiener: bool = False, large: bool = False
+    ) -> list[NDArray[np.float32]]:
+        _require_same_shapes(guide=self._variance, picture=picture, pilot=pilot)
+        picture, pilot = (np.ascontiguousarray(array, np.float32) for array in (picture, pilot))
+        sums = [np.zeros((2, *picture.shape) if wanted else (2, 0, 0), np.float32) for wanted in (wiener, large)]
+
+        def work(strip: NDArray[np.intp]) -> None:
+            part = slice(strip[0], strip[-1] + 1)
+            groups = (self._rows[part], self._columns, self._patches.radius, self._places[part])
+            filter_rows(picture, pilot, self._variance, *groups, np.float32(_THRESHOLD), self._transform, *sums)
+
+        for turn in (0, 1):
+            map_in_threads(work, self._strips[turn::2])
+        for total, weight in sums:
+            if total.size:
+                np.copyto(total, pilot, where=weight == 0)
+            np.divide(total, weight, out=total, where=weight > 0)
+        return [total for total, _ in sums if total.size]
+
+
+def _require_same_shapes(**pictures: Image) -> None:
+    shapes = {name: picture.shape for name, picture in pictures.items()}
+    if len(set(shapes.values())) > 1:
+        raise ValueError(f"shapes are {shapes}; give all the same")
+
+
 def collaborative_wiener(
     picture: Image, pilot: Image, noise: Noise, patches: Patches | None = None, *, guide: Image | None = None
 ) -> NDArray[np.float32]:
@@ -53,8 +126,8 @@ def collaborative_wiener(
     Parameters
     ----------
     picture, pilot, noise : float array (row, column), float array (row, column), Noise
-        y, a picture of the same scene without noise, as blurred as y, and the covariance of y. Patches with a sample of
-        infinite variance join no group: samples that are in no other patch keep the pilot's value.
+        y, a picture of the same scene without noise, as blurred as y, and the covariance of y. Samples that are in no
+        group keep the pilot's value.
     patches : Patches, optional
         Settings of the groups.
     guide : float array (row, column), optional
@@ -65,52 +138,7 @@ def collaborative_wiener(
     ValueError
         Shapes differ, the picture is smaller than a patch, or the size of a patch is not a multiple of four.
     """
-    (wiener,) = wiener_and_thresholded(picture, pilot, noise, patches or Patches(), guide=guide, filters=1)
-    return wiener
-
-
-def wiener_and_thresholded(
-    picture: Image, pilot: Image, noise: Noise, patches: Patches, *, guide: Image | None = None, filters: int = 2
-) -> list[NDArray[np.float32]]:
-    """Return what `collaborative_wiener` returns, and the picture whose groups keep what stands out of the noise.
-
-    The second, the filter's first step, keeps the picture's own coefficients above 2.7 standard deviations of their
-    noise. So it also shows what the pilot lost. It is left out if `filters` is 1.
-    """
-    guide = pilot if guide is None else guide
-    picture, pilot, guide, variance = (
-        np.ascontiguousarray(array, np.float32) for array in (picture, pilot, guide, noise.variance)
-    )
-    _check(picture, pilot, guide, variance, patches)
-    # A distance to NaN is below none
-    guide = np.where(np.isfinite(variance), guide, np.float32(np.nan))
-    above, below = np.zeros((2, filters, *pilot.shape), np.float32)
-    transform = _transform(noise.kernel, patches.size)
-    rows, columns = (_corners(length, patches) for length in pilot.shape)
-    search = (patches.radius, patches.members, np.float32(_THRESHOLD))
-
-    def work(strip: NDArray[np.intp]) -> None:
-        filter_rows(picture, pilot, guide, variance, strip, columns, search, transform, above, below)
-
-    # Groups reach into the next strips, but no farther: the strips of one turn can be filtered at the same time
-    strip_of_row = rows // (2 * patches.radius + patches.size)
-    strips_of_all = [rows[strip_of_row == k] for k in range(strip_of_row[-1] + 1)]
-    for turn in (0, 1):
-        map_in_threads(work, strips_of_all[turn::2])
-    for total, weight in zip(above, below, strict=True):
-        np.copyto(total, pilot, where=weight == 0)
-        np.divide(total, weight, out=total, where=weight > 0)
-    return list(above)
-
-
-def _check(picture: Image, pilot: Image, guide: Image, variance: Image, patches: Patches) -> None:
-    shapes = [array.shape for array in (picture, pilot, guide, variance)]
-    if len(set(shapes)) > 1:
-        raise ValueError(f"picture, pilot, guide and variance have shapes {shapes}; give all the same")
-    if patches.size < 4 or patches.size % 4 or patches.size > min(picture.shape):
-        raise ValueError(
-            f"patches of {patches.size} samples in a picture {picture.shape}; give a multiple of four that fits into it"
-        )
+    return Groups(pilot if guide is None else guide, noise, patches or Patches()).wiener(picture, pilot)
 
 
 def _corners(length: int, patches: Patches) -> NDArray[np.intp]:
@@ -142,13 +170,14 @@ _LARGE = Patches(size=8, step=6, radius=16, members=64)
 _SMALL = Patches(size=4, step=3, radius=8, members=32)
 
 
-def patch_candidates(evidence: Evidence) -> dict[str, Image]:
-    """Return pictures (row, column) of a plane by name, all as blurred as the evidence, in electrons.
+def patch_candidates(evidence: Evidence, names: Collection[str] | None = None) -> dict[str, Image]:
+    """Return pictures (row, column) of a plane by name, all as blurred as the evidence, in electrons; some of `names`.
 
     "tv" is the pilot, the plane of the penalty; "wiener" the collaborative Wiener filter with this pilot; "twice" the
     filter again, its pilot the mean of the first result and of the thresholded picture, which shows what the penalty
-    lost; "fine" the same with small patches, from "twice" and their thresholded picture. A plane smaller than a patch
-    has its pilot only. Alike patches are found in the sum of the pilot and of the light in other colours.
+    lost; "fine" a filter of small patches, its pilot the mean of "twice" and of their thresholded picture. A plane
+    smaller than a patch has its pilot only. Alike patches are found in the sum of the pilot and of the light in other
+    colours.
     """
     picture, pilot, noise, _, other_colours = evidence
 
@@ -156,14 +185,14 @@ def patch_candidates(evidence: Evidence) -> dict[str, Image]:
         return pilot if other_colours is None else pilot + other_colours
 
     found = {"tv": pilot}
-    if min(pilot.shape) >= _LARGE.size:
-        wiener, thresholded = wiener_and_thresholded(picture, pilot, noise, _LARGE, guide=guide(pilot))
-        found["wiener"] = wiener
-        better = (wiener + thresholded) / 2
-        found["twice"] = collaborative_wiener(picture, better, noise, _LARGE, guide=guide(better))
-        _, thresholded = wiener_and_thresholded(picture, pilot, noise, _SMALL, guide=guide(pilot))
-        better = (found["twice"] + thresholded) / 2
-        found["fine"] = collaborative_wiener(picture, better, noise, _SMALL, guide=guide(better))
+    if min(pilot.shape) < _LARGE.size or (names is not None and set(names) <= {"tv"}):
+        return found
+    found["wiener"], thresholded = Groups(guide(pilot), noise, _LARGE).wiener_and_thresholded(picture, pilot)
+    better = (found["wiener"] + thresholded) / 2
+    found["twice"] = collaborative_wiener(picture, better, noise, _LARGE, guide=guide(better))
+    if names is None or "fine" in names:
+        groups = Groups(guide(pilot), noise, _SMALL)
+        found["fine"] = groups.wiener(picture, (found["twice"] + groups.thresholded(picture, pilot)) / 2)
     return found
 
 

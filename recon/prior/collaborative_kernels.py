@@ -15,6 +15,9 @@ from faintfield.recon.numba_tools import advanced, compiled, index, pointer
 # Variance in squared electrons below which a picture counts as free of noise.
 _LEAST_VARIANCE = 1e-20
 
+# Reference patches of a row whose members are found together: what they are compared with stays in the cache.
+_COLUMNS_AT_A_TIME = 32
+
 # Share of the noise that the weight of a group assumes to be left at least.
 _LEAST_LEFT = 1e-3
 
@@ -32,36 +35,76 @@ class Transform(NamedTuple):
 
 
 @compiled
-def filter_rows(picture, pilot, guide, variance, rows, columns, search, transform, above, below):
+def find_groups(guide, rows, columns, size, radius, groups):
+    """Find the patches that are most like each reference patch, the most alike first.
+
+    Parameters
+    ----------
+    guide : float32 array (row, column)
+        A picture l in which patches are compared. A patch with NaN has no group.
+    rows, columns : int array
+        First row and column of the reference patches.
+    size, radius : int
+        Samples of a patch along each side; largest distance of a member from its reference, along rows and columns.
+    groups : int16 array (row, column, member)
+        The places of the members, as `_place` numbers them; −1 where there are no more.
+    """
+    distances = np.empty((_COLUMNS_AT_A_TIME, groups.shape[2]), np.float32)
+    squares = np.empty(guide.shape[1], np.float32)
+    for n in range(rows.size):
+        for first in range(0, columns.size, _COLUMNS_AT_A_TIME):
+            part = slice(first, first + _COLUMNS_AT_A_TIME)
+            _find_alike(guide, rows[n], columns[part], size, radius, squares, distances, groups[n, part])
+
+
+@compiled
+def filter_rows(picture, pilot, variance, rows, columns, radius, groups, threshold, transform, wiener, large):
     """Filter the groups of all reference patches whose first samples lie in `rows` x `columns`.
 
     Parameters
     ----------
-    picture, pilot, guide, variance : float32 array (row, column)
-        y, u, a picture l in which patches are compared, and the variance of y. A patch with NaN in l has no group.
-    rows, columns : int array
-        First row and column of the reference patches.
-    search : (int, int, float)
-        Largest distance of a member from its reference, along rows and columns, largest number of members, and the
-        least magnitude of the coefficients that the second filter keeps, in standard deviations of their noise.
-    above, below : float32 array (filter, row, column)
-        Sums to which the filtered patches times their weights, and the weights, are added. The first filter is
-        Wiener's; the second, if there is one, keeps large coefficients.
+    picture, pilot, variance : float32 array (row, column)
+        y, u, and the variance of y.
+    rows, columns, radius, groups : int array, int array, int, int16 array (row, column, member)
+        The reference patches and their groups, as for `find_groups`.
+    threshold : float
+        Least magnitude of the coefficients that the second filter keeps, in standard deviations of their noise.
+    wiener, large : float32 array (2, row, column)
+        Sums of two filters, Wiener's and one that keeps large coefficients, to which the filtered patches times their
+        weights, and the weights, are added. An array without samples leaves a filter out.
     """
-    radius, members, threshold = search
-    size = transform.window.shape[0]
-    distances = np.empty((columns.size, members), np.float32)
-    places = np.empty((columns.size, members, 2), np.int32)
-    counts = np.empty(columns.size, np.intp)
+    size, members, width = transform.window.shape[0], groups.shape[2], picture.shape[1]
+    starts = np.empty(members, np.uintp)
     patches = np.empty((4, size * size * members), np.float32)
-    for row in rows:
-        _find_alike(guide, row, columns, size, radius, distances, places, counts)
+    for n in range(rows.size):
         for k in range(columns.size):
-            count = 1
-            while 2 * count <= counts[k]:
-                count *= 2
-            if counts[k] > 0:
-                _filter_group(picture, pilot, variance, places[k, :count], threshold, transform, patches, above, below)
+            count = _first_samples(groups[n, k], rows[n] * width + columns[k], radius, width, starts)
+            if count > 0:
+                _filter_group(picture, pilot, variance, starts[:count], threshold, transform, patches, wiener, large)
+
+
+@compiled
+def _place(down, right, radius):
+    """Return the number of a place at most `radius` samples from a reference, along rows and columns."""
+    return (down + radius) * (2 * radius + 1) + right + radius
+
+
+@compiled
+def _first_samples(group, reference, radius, width, starts):
+    """Set `starts` to the first samples of a group's patches in the flat picture; return their number, a power of two.
+
+    Each member goes to the slot with its bits in reverse order: then the halves of the group, `m` and `m + count/2`,
+    are neighbours in the order of their distances.
+    """
+    count = 1
+    while 2 * count <= group.size and group[2 * count - 1] >= 0:
+        count *= 2
+    if group[0] < 0:
+        return 0
+    for m in range(count):
+        down, right = group[m] // (2 * radius + 1) - radius, group[m] % (2 * radius + 1) - radius
+        starts[_reversed_bits(index(m), index(count))] = index(reference + down * width + right)
+    return count
 
 
 @compiled
@@ -71,28 +114,34 @@ def _outwards(step):
 
 
 @compiled
-def _find_alike(guide, row, columns, size, radius, distances, places, counts):
-    """Find the patches nearest to each reference patch of a row, by squared distance, nearest first."""
-    height, width = guide.shape
-    squares = np.empty(width, np.float32)
-    counts[:] = 0
+def _find_alike(guide, row, columns, size, radius, squares, distances, groups):
+    """Set the groups of some reference patches of a row to the patches nearest by squared distance, nearest first."""
+    (height, width), members = guide.shape, index(groups.shape[1])
+    groups[:] = -1
     distances[:] = np.inf
+    sums = pointer(squares)
     for vertical in range(2 * radius + 1):
-        other = row + _outwards(vertical)
-        if other < 0 or other > height - size:
+        down = _outwards(vertical)
+        if row + down < 0 or row + down > height - size:
             continue
         for horizontal in range(2 * radius + 1):
-            shift = _outwards(horizontal)
-            start, stop = max(0, -shift), min(width, width - shift)
-            _sum_squares(guide, row, other, shift, start, stop, size, squares)
+            right = _outwards(horizontal)
+            start, stop = max(columns[0], -right), min(columns[-1] + size, width - right)
+            if stop - start < size:
+                continue
+            _sum_squares(guide, row, row + down, right, start, stop, size, squares)
             for k in range(columns.size):
                 column = columns[k]
                 if column >= start and column + size <= stop:
                     distance = np.float32(0)
                     for j in range(index(size)):
-                        distance += squares[index(column) + j]
+                        distance += sums[index(column) + j]
                     if distance < distances[k, -1]:  # never for NaN
-                        _insert(distance, other, column + shift, distances, places, counts, k)
+                        first = index(k) * members
+                        nearest, group = advanced(pointer(distances), first), advanced(pointer(groups), first)
+                        _insert(distance, np.int16(_place(down, right, radius)), nearest, group, members)
+        if distances[: columns.size, -1].max() == 0:  # as in the dark: none can be nearer
+            break
 
 
 @compiled
@@ -113,41 +162,45 @@ def _sum_squares(guide, row, other, shift, start, stop, size, squares):
 
 
 @compiled
-def _insert(distance, row, column, distances, places, counts, k):
-    """Insert a patch into the list of those nearest to reference `k`, sorted by distance."""
-    at = distances.shape[1] - 1
-    counts[k] = min(counts[k] + 1, at + 1)
-    while at > 0 and distances[k, at - 1] > distance:
-        distances[k, at] = distances[k, at - 1]
-        places[k, at, 0], places[k, at, 1] = places[k, at - 1, 0], places[k, at - 1, 1]
-        at -= 1
-    distances[k, at] = distance
-    places[k, at, 0], places[k, at, 1] = row, column
+def _insert(distance, place, distances, places, length):
+    """Insert a patch into a list of the nearest ones, sorted by distance, whose last one leaves it."""
+    at = length - index(1)
+    while at > index(0) and distances[at - index(1)] > distance:
+        distances[at], places[at] = distances[at - index(1)], places[at - index(1)]
+        at -= index(1)
+    distances[at], places[at] = distance, place
 
 
 @compiled
-def _filter_group(picture, pilot, variance, places, threshold, transform, patches, above, below):
+def _filter_group(picture, pilot, variance, starts, threshold, transform, patches, wiener, large):
     """Filter the patches of a group by each filter, and add them to its sums."""
-    size, count = transform.window.shape[0], places.shape[0]
-    y, u, scratch = patches[0], patches[1], patches[2]
-    half = size // 2
+    size, count, width = transform.window.shape[0], starts.size, picture.shape[1]
+    y, u, kept, scratch = patches[0], patches[1], patches[2], patches[3]
+    middle = index(size // 2 * (width + 1))
     level = np.float32(0)
     for m in range(count):
-        level += variance[places[m, 0] + half, places[m, 1] + half]
+        level += pointer(variance)[starts[m] + middle]
     level = max(level / np.float32(count), np.float32(_LEAST_VARIANCE))
-    _read(picture, places, size, y)
-    _read(pilot, places, size, u)
-    for group in (y, u):
-        _cosine_transform(group, scratch, transform.cosines, count)
-        _haar(group, size * size, count, False)
-    if above.shape[0] > 1:
-        kept, length = patches[3], size * size * count
+    _read(picture, starts, size, y)
+    _forward(y, scratch, transform, count)
+    if large.size > 0:
+        length = size * size * count
         for k in range(length):  # not `kept[:length] = y[:length]`, which takes seconds to compile
             kept[k] = y[k]
         left = _keep_large(kept, level, threshold, transform, count)
-        _add_inverse(kept, scratch, places, transform, level, left, above[1], below[1])
-    left = _shrink(y, u, level, transform, count)
-    _add_inverse(y, scratch, places, transform, level, left, above[0], below[0])
+        _add_inverse(kept, scratch, starts, transform, level, left, large)
+    if wiener.size > 0:
+        _read(pilot, starts, size, u)
+        _forward(u, scratch, transform, count)
+        left = _shrink(y, u, level, transform, count)
+        _add_inverse(y, scratch, starts, transform, level, left, wiener)
+
+
+@compiled
+def _forward(group, scratch, transform, count):
+    """Transform a group."""
+    _cosine_transform(group, scratch, transform.cosines, count)
+    _haar(group, transform.window.size, count, False)
 
 
 @compiled
@@ -186,42 +239,39 @@ def _keep_large(y, level, threshold, transform, count):
 
 
 @compiled
-def _add_inverse(group, scratch, places, transform, level, left, above, below):
+def _add_inverse(group, scratch, starts, transform, level, left, sums):
     """Transform a group back, and add its patches with the weight that their variance gives them."""
-    size, count = transform.window.shape[0], places.shape[0]
+    size, count = transform.window.shape[0], starts.size
     _haar(group, size * size, count, True)
     _cosine_transform(group, scratch, transform.transposed, count)
     weight = np.float32(1) / (left / np.float32(count * size * size) + np.float32(_LEAST_LEFT) * level)
-    _add(group, places, size, transform.window, weight, above, below)
+    _add(group, starts, size, transform.window, weight, sums[0], sums[1])
 
 
 @compiled
-def _read(plane, places, size, group):
-    """Copy the patches at `places` to a group, each member to the slot with its bits in reverse order.
-
-    Then the halves of the group, `m` and `m + count/2`, are neighbours in the order of their distances.
-    """
-    count = index(places.shape[0])
+def _read(plane, starts, size, group):
+    """Copy the patches with given first samples to a group."""
+    count, width, length = index(starts.size), index(plane.shape[1]), index(size)
     for m in range(count):
-        row, column = places[m, 0], places[m, 1]
-        slot = _reversed_bits(m, count)
-        for i in range(size):
-            for j in range(size):
-                group[index(i * size + j) * count + slot] = plane[row + i, column + j]
+        for i in range(length):
+            source = advanced(pointer(plane), starts[m] + i * width)
+            target = advanced(pointer(group), i * length * count + m)
+            for j in range(length):
+                target[j * count] = source[j]
 
 
 @compiled
-def _add(group, places, size, window, weight, above, below):
+def _add(group, starts, size, window, weight, above, below):
     """Add the patches of a group times their weights, and the weights, to the sums."""
-    count = index(places.shape[0])
+    count, width, length = index(starts.size), index(above.shape[1]), index(size)
+    total, weights = pointer(above), pointer(below)
     for m in range(count):
-        row, column = places[m, 0], places[m, 1]
-        slot = _reversed_bits(m, count)
-        for i in range(size):
-            for j in range(size):
+        for i in range(length):
+            at = starts[m] + i * width
+            for j in range(length):
                 share = weight * window[i, j]
-                above[row + i, column + j] += share * group[index(i * size + j) * count + slot]
-                below[row + i, column + j] += share
+                total[at + j] += share * group[(i * length + j) * count + m]
+                weights[at + j] += share
 
 
 @compiled
@@ -237,30 +287,25 @@ def _reversed_bits(number, count):
 @compiled
 def _cosine_transform(group, scratch, cosines, count):
     """Set a group to `Σᵢⱼ C[k, i] C[l, j] x[i, j]` of each patch."""
-    size = cosines.shape[0]
-    _multiply(cosines, group, scratch, index(size * count), index(0), index(0))
+    size, length = index(cosines.shape[0]), index(count)
+    x, y = pointer(group), pointer(scratch)
+    for j in range(size):
+        _multiply(cosines, advanced(x, j * length), advanced(y, j * length), length, size * length)
     for k in range(size):
-        _multiply(cosines, scratch, group, index(count), index(k * size * count), index(k * size * count))
+        _multiply(cosines, advanced(y, k * size * length), advanced(x, k * size * length), length, length)
 
 
 @compiled
-def _multiply(matrix, source, target, length, read_from, write_to):
+def _multiply(matrix, source, target, length, stride):
     """Set rows of `length` numbers of the target to `Σᵢ C[k, i] x[i]`, with x the rows of the source."""
-    size = matrix.shape[0]
-    for k in range(size):
-        out = write_to + index(k) * length
-        for t in range(length):
-            target[out + t] = np.float32(0)
-        for i in range(0, size, 4):
+    for k in range(matrix.shape[0]):
+        out = advanced(target, index(k) * stride)
+        for i in range(0, matrix.shape[0], 4):
             a, b, c, d = matrix[k, i], matrix[k, i + 1], matrix[k, i + 2], matrix[k, i + 3]
-            at = read_from + index(i) * length
+            x = advanced(source, index(i) * stride)
             for t in range(length):
-                target[out + t] += (
-                    a * source[at + t]
-                    + b * source[at + length + t]
-                    + c * source[at + index(2) * length + t]
-                    + d * source[at + index(3) * length + t]
-                )
+                sum_of_four = a * x[t] + b * x[stride + t] + c * x[index(2) * stride + t] + d * x[index(3) * stride + t]
+                out[t] = sum_of_four if i == 0 else out[t] + sum_of_four
 
 
 @compiled

@@ -71,29 +71,46 @@ def evidence_of_planes(
     views: ViewSelection = None,
     *,
     other_colours: Image | None = None,
+    of_all_views: Sequence[Evidence] | None = None,
 ) -> list[Evidence]:
     """Return the evidence of each plane of a scene, `y_z = u_z + H_zᵀ(g − b − H f) / H_zᵀ H_z 1`.
 
     `samples` is f ≥ 0 in electrons, and `other_colours` (samples) the planes in other colours. All `views` by default.
+    The noise is that `of_all_views`, if it is given, in proportion to the number of views; else it is measured anew.
     """
     seen = operator.adjoint_of_forward(samples, views)
     residual = operator.adjoint(images.electrons, views) - seen
     if np.any(images.background_e):
         residual -= operator.adjoint_of_map(images.background_e, views)
-    variance = seen + operator.adjoint_of_map(images.background_e + images.read_variance_e2, views)
-    drawn = _drawn_noise(operator, images, samples, views, (0, 0))
-    parts = (operator.planes_of(array) for array in (residual, variance, drawn))
     own = _alone(operator, samples, seen, views)
     coverages = _alone(operator, np.ones_like(samples), operator.coverage(views), views)
+    if of_all_views is None:
+        variance = seen + operator.adjoint_of_map(images.background_e + images.read_variance_e2, views)
+        drawn = _drawn_noise(operator, images, samples, views, (0, 0))
+        sums = zip(coverages, operator.planes_of(variance), operator.planes_of(drawn), strict=True)
+        noises = [_noise(coverage, of_variance, [of_draw]) for coverage, of_variance, of_draw in sums]
+    else:
+        noises = list(map(_in_proportion, of_all_views, coverages))
     shown: list[Image | None] = [None] * len(coverages)
     if other_colours is not None:
         projected = operator.adjoint_of_forward(other_colours, views)
         shown = list(map(_divided, _alone(operator, other_colours, projected, views), coverages))
     found = []
-    for of_pilot, coverage, light, of_residual, of_variance, of_draw in zip(own, coverages, shown, *parts, strict=True):
+    for of_pilot, coverage, light, noise, of_residual in zip(
+        own, coverages, shown, noises, operator.planes_of(residual), strict=True
+    ):
         pilot, change = (_divided(array, coverage) for array in (of_pilot, of_residual))
-        found.append(Evidence(pilot + change, pilot, _noise(coverage, of_variance, [of_draw]), coverage, light))
+        found.append(Evidence(pilot + change, pilot, noise, coverage, light))
     return found
+
+
+def _in_proportion(of_all_views: Evidence, coverage: Image) -> Noise:
+    """Return the noise of some views: the variance of their mean falls with the number of views."""
+    noise, variance = of_all_views.noise, np.full_like(of_all_views.noise.variance, np.inf)
+    seen = well_seen_samples(coverage) & np.isfinite(noise.variance)
+    np.divide(of_all_views.coverage, coverage, out=variance, where=seen)
+    np.multiply(variance, noise.variance, out=variance, where=seen)
+    return noise._replace(variance=variance)
 
 
 def _alone(operator: SceneOperator, samples: Image, projected: Image, views: ViewSelection) -> list[Image]:

@@ -5,6 +5,7 @@ Windows stand for a large plane.
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,17 +118,17 @@ def cross_validated_weight(
     The noise of the data's part of the objective grows as the root of the number of views, and so does the weight from
     the training views to all views.
     """
-    windows = windows_of(problem, MIN_VIEWS)
+    samples = int(np.prod(problem.operator.samples_shape))
+    windows = windows_of(problem, MIN_VIEWS, max(_MIN_SAMPLES, round(_SHARE * samples)), workers=1)
     if windows:
         # A dark window is solved with the light of the whole plane, as that will be
-        folds = map_in_threads(lambda window: Fold(window, penalty, 0, level_e), windows)
+        folds = map_in_threads(lambda window: Fold(window.problem, penalty, 0, level_e), windows)
     else:
         folds = [Fold(problem, penalty, number) for number in range(folds_to_predict(problem))]
     losses = _losses(folds, guess, apply=map_in_threads if windows else map)
     best = min(losses, key=losses.__getitem__)
     offset = _lowest_offset([losses.get(best + n) for n in (-1, 0, 1)])
     candidates = {guess * _CANDIDATE_RATIO**step: loss for step, loss in sorted(losses.items())}
-    samples = np.prod(problem.operator.samples_shape)
     passes = sum(fold.passes * fold.samples for fold in folds) / float(samples)
     weight = guess * _CANDIDATE_RATIO ** (best + offset)
     return CrossValidatedWeight(weight, candidates, passes, None if windows else folds[0].solutions[best])
@@ -209,28 +210,41 @@ def _lowest_offset(losses: Sequence[float | None]) -> float:
     return float(np.clip(0.5 * (before - after) / (before - 2 * here + after), -0.5, 0.5))
 
 
-def windows_of(problem: SceneProblem, min_views: int) -> list[SceneProblem]:
-    """Return the problems of windows in rows and columns over a large plane; none for smaller planes, and for several.
+class Window(NamedTuple):
+    """A part of a plane: its problem, and its place in the plane."""
 
-    The windows share the images. Each is solved by one thread. Windows that fewer than `min_views` see are left out.
+    problem: SceneProblem
+    rows: slice
+    columns: slice
+
+    def of(self, plane: Image) -> Image:
+        """Return the part of a plane (row, column)."""
+        return plane[self.rows, self.columns]
+
+
+def windows_of(problem: SceneProblem, min_views: int, samples: int, workers: int | None = None) -> list[Window]:
+    """Return windows in rows and columns over a large plane, with so many samples together.
+
+    There are none of planes less than twice that large, and of several planes. The windows share the images. Those that
+    fewer than `min_views` see are left out. `workers` is the number of threads that solve one.
     """
     operator = problem.operator
     if not isinstance(operator, PlaneOperator):
         return []
     rows, columns = operator.grid.shape
-    wanted = max(_MIN_SAMPLES, _SHARE * rows * columns)
-    if rows * columns < 2 * wanted or min(rows, columns) < 2 * SIDE:
+    if rows * columns < 2 * samples or min(rows, columns) < 2 * SIDE:
         return []
-    across = max(round((wanted * columns / rows) ** 0.5 / SIDE), 1)
-    down = max(round(wanted / SIDE**2 / across), 1)
+    across = max(round((samples * columns / rows) ** 0.5 / SIDE), 1)
+    down = max(round(samples / SIDE**2 / across), 1)
     windows, maps = [], dict[float, Image]()
     for row, column in np.ndindex(down, across):
+        place = _middle(row, rows, down), _middle(column, columns, across)
         try:
-            window = operator.window(_middle(row, rows, down), _middle(column, columns, across), 1, maps)
+            window = operator.window(*place, workers, maps)
         except GeometryMismatch:  # no view sees it
             continue
         if len(window.seeing_views) >= min_views:
-            windows.append(SceneProblem(window, problem.images))
+            windows.append(Window(SceneProblem(window, problem.images), *place))
     return windows
 
 

@@ -6,7 +6,7 @@ work is thus done on the plane, where it is cheap, and few passes over the data 
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -90,7 +90,8 @@ def pmlem(
     """Yield planes of decreasing objective, each with its certificate; the caller decides when to stop.
 
     Proximal gradient in the metric of the data. A step that raised the objective is undone and repeated with twice the
-    metric; the next step needs the pass that gives the objective anyway.
+    metric; the next step needs the pass that gives the objective anyway. The same plane is then yielded again: its
+    certificate may be better, since the dual field has come nearer to that of the optimum.
 
     Parameters
     ----------
@@ -138,17 +139,17 @@ class _Pmlem:
     def iterates(self, plane: Image, dual: DualField) -> Iterator[PmlemIterate]:
         """Iterate without end; arrays as large as the plane are dropped before the next of their kind is made."""
         metric = self._fit.metric(plane)
-        accepted, point = None, plane
+        accepted, gradient = None, plane
         passes, lowest = 0, np.inf
         while True:
-            value, gradient = self._fit.value_and_gradient(plane)
+            value, of_plane = self._fit.value_and_gradient(plane)
             passes += 1
             objective = value + self._weight * dual.penalty_and_slack(plane, self._penalty)[0]
             if np.isnan(objective):
                 raise NotConverged(f"pass {passes} left the finite numbers; give a smaller penalty weight")
             if accepted is None or np.isinf(lowest) or objective <= lowest + _ROUNDING * abs(lowest):
                 lowest = min(lowest, objective)
-                del point
+                gradient = of_plane
                 certificate = self._certificate(plane, gradient, metric, dual)
                 accepted = PmlemIterate(plane, objective, certificate, passes, self._inner_steps, dual)
                 yield accepted
@@ -156,14 +157,17 @@ class _Pmlem:
                 if passes <= _PASSES_WITH_NEW_METRIC:
                     del metric
                     metric = self._fit.metric(plane)
-                point = plane - gradient / (metric * metric.dtype.type(self._scale))
             else:
-                self._scale *= 2
-                point = (accepted.plane + point) / 2  # half the way
+                self._scale *= 2  # half the way
+                certificate = self._certificate(accepted.plane, gradient, metric, dual)
+                accepted = replace(accepted, certificate=certificate, passes=passes, inner_steps=self._inner_steps)
+                yield accepted
             while self._scale > _MAX_SCALE:
                 yield accepted  # no step lowers the objective within rounding
-            del plane, gradient
+            del plane, of_plane
+            point = accepted.plane - gradient / (metric * metric.dtype.type(self._scale))
             plane = self._minimum(accepted.plane, point, metric, dual)
+            del point
 
     def _minimum(self, start: Image, point: Image, metric: Image, dual: DualField) -> Image:
         """Return the minimum of quadratic and penalty; start from a dual field and replace it by that of the minimum.

@@ -1,6 +1,6 @@
 """Planes by a prior: proposals beyond total variation, and what the data make of them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -73,17 +73,13 @@ def _about_proposals(
     if contradiction := _contradiction(objective, samples, evidences):
         return contradiction
     candidates: Candidates = patch_candidates
-    drafts: Candidates | None = None
     no_network = None
     if options.prior != "patches":
         reasons = (outside_range(evidence.pilot, evidence.noise) for evidence in evidences)
         no_network = next((reason for reason in reasons if reason is not None), None)
         if no_network is None:
             candidates = partial(_with_network, alone=options.prior == "learned")
-            drafts = partial(candidates, sides=2)
-    proposals = propose(
-        objective.posed, samples, evidences, weight, candidates, drafts=drafts, other_colours=other_colours
-    )
+    proposals = propose(objective.posed, samples, evidences, weight, candidates, other_colours=other_colours)
     if all(weights.get("tv") == 1 for proposal in proposals for weights in proposal.mixture.values()):
         return "total variation predicts held-out views best"
     proposed = operator.samples_of([proposal.picture for proposal in proposals])
@@ -107,12 +103,17 @@ def _about_proposals(
     ]
 
 
-def _with_network(evidence: Evidence, *, alone: bool, sides: int = 4) -> dict[str, Image]:
+def _with_network(evidence: Evidence, names: Collection[str] | None = None, *, alone: bool) -> dict[str, Image]:
     """Return the candidates from patches and what the network makes of them; alone: only that and total variation's."""
-    found = patch_candidates(evidence)
+    if alone:
+        names = {"tv", "learned"}
+    of_network = names is None or "learned" in names
+    found = patch_candidates(evidence, {*names, "twice"} if names is not None and of_network else names)
+    if not of_network:
+        return found
     patches = (found["wiener"] + found["twice"]) / 2
     variance = evidence.noise.variance
-    found["learned"] = learned_estimate(evidence.picture, evidence.pilot, patches, variance, sides=sides)
+    found["learned"] = learned_estimate(evidence.picture, evidence.pilot, patches, variance)
     return {name: found[name] for name in ("tv", "learned")} if alone else found
 
 

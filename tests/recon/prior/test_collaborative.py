@@ -7,11 +7,11 @@ from scipy.fft import dctn, idctn
 
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.prior.collaborative import (
+    Groups,
     Patches,
     collaborative_wiener,
     patch_candidates,
     refined,
-    wiener_and_thresholded,
 )
 from faintfield.recon.prior.evidence import Evidence, Noise, noise_of_back_projection
 from faintfield.recon.solver.initialization import back_projection
@@ -109,12 +109,14 @@ def test_filters_agree_with_slow_ones(
     noise.variance[-1, 0] = np.inf
     y[noise.variance == np.inf] = np.nan
     monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 2)
-    both = wiener_and_thresholded(y, pilot, noise, patches)
+    groups = Groups(pilot, noise, patches)
+    both = groups.wiener_and_thresholded(y, pilot)
     for result, expected in zip(both, slow_filters(y, pilot, noise, patches), strict=True):
         assert result.dtype == np.float32
         np.testing.assert_allclose(result, expected, atol=1e-5 * np.abs(y[np.isfinite(y)]).max())
     monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 5)
     np.testing.assert_array_equal(both[0], collaborative_wiener(y, pilot, noise, patches))
+    np.testing.assert_array_equal(both[1], groups.thresholded(y, pilot))
 
 
 def test_guide_decides_which_patches_are_alike() -> None:
@@ -123,7 +125,7 @@ def test_guide_decides_which_patches_are_alike() -> None:
     noise.variance[:16, -3:] = np.inf
     guide[:16, -3:] = np.nan
     patches = Patches(8, 5, 4, 16)
-    both = wiener_and_thresholded(y, pilot, noise, patches, guide=guide)
+    both = Groups(guide, noise, patches).wiener_and_thresholded(y, pilot)
     unguided = slow_filters(y, pilot, noise, patches)
     for result, expected, without in zip(both, slow_filters(y, pilot, noise, patches, guide), unguided, strict=True):
         np.testing.assert_allclose(result, expected, atol=1e-5 * np.abs(y).max())
@@ -149,13 +151,13 @@ def test_candidates_are_those_of_slow_filters() -> None:
     candidates = patch_candidates(Evidence(y, pilot, noise, np.ones_like(y), others))
     large, small = Patches(8, 6, 16, 64), Patches(4, 3, 8, 32)
 
-    def filtered(pilot: Image, patches: Patches) -> tuple[Image, Image]:
-        return slow_filters(y, pilot, noise, patches, pilot + others)
+    def filtered(pilot: Image, patches: Patches, guide: Image | None = None) -> tuple[Image, Image]:
+        return slow_filters(y, pilot, noise, patches, (pilot if guide is None else guide) + others)
 
     wiener, kept = filtered(pilot, large)
     twice, _ = filtered((wiener + kept) / 2, large)
     _, kept_small = filtered(pilot, small)
-    fine, _ = filtered((twice + kept_small) / 2, small)
+    fine, _ = filtered((twice + kept_small) / 2, small, pilot)
     for name, expected in {"tv": pilot, "wiener": wiener, "twice": twice, "fine": fine}.items():
         np.testing.assert_allclose(candidates[name], expected, atol=1e-3, err_msg=name)
 
@@ -184,5 +186,5 @@ def test_indefinite_kernel_keeps_result_within_the_picture() -> None:
     picture = (pilot + generator.normal(0, 0.5, pilot.shape)).astype(np.float32)
     kernel = np.outer([0.6, 1.0, 0.6], [0.2, 1.0, 0.2])  # samples alternating by row would have a variance below zero
     noise = Noise(np.full(pilot.shape, 0.25, np.float32), kernel)
-    for result in wiener_and_thresholded(picture, pilot, noise, Patches(8, 6, 16, 64)):
+    for result in Groups(pilot, noise, Patches(8, 6, 16, 64)).wiener_and_thresholded(picture, pilot):
         assert np.abs(result - 3).max() < np.abs(picture - 3).max()

@@ -1,5 +1,6 @@
 """Edges of a proposal, views that contradict a plane, and the mixture of candidates against a general solver."""
 
+from collections.abc import Collection
 from dataclasses import replace
 from itertools import product
 
@@ -13,13 +14,13 @@ from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.reconstruction.planes.penalised import Objective
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.prior.evidence import Evidence, Misfit, evidence_of_planes, misfits
-from faintfield.recon.prior.proposal import Scores, best_mixture, propose, scores
+from faintfield.recon.prior.proposal import Scores, best_mixture, mixtures_of, propose, scores
 from faintfield.recon.solver.data_fit import SceneProblem
 from tests.recon.displaced import dark_views, pieces
 from tests.recon.operator_contract import dense_matrix
 
 
-def pilot_alone(evidence: Evidence) -> dict[str, Image]:
+def pilot_alone(evidence: Evidence, names: Collection[str] | None = None) -> dict[str, Image]:
     return {"tv": evidence.pilot}
 
 
@@ -52,6 +53,15 @@ def test_edges_beyond_noise_are_those_of_the_plane(light: float) -> None:
     blurred = np.abs(edges) > 0.05 * light
     kept = np.abs((result.picture - evidence.pilot)[blurred & ~unseen]) / np.abs(edges[blurred & ~unseen])
     assert np.median(kept) > 0.9 if light == 40 else np.median(kept) < 0.9
+
+
+@pytest.mark.parametrize(("error", "is_made"), [(5.0, True), (20.0, False)])
+def test_candidates_that_hardly_help_get_no_weight(error: float, is_made: bool) -> None:
+    """Errors are independent, so that weights are as their inverse squares; the last candidate adds 0.8 or 0.05 %."""
+    independent = Scores(np.diag([4.0, 1.0, error**2]), np.zeros(3))
+    mixture = mixtures_of(["tv", "good", "poor"], {"light": independent})["light"]
+    inverse = np.array([0.25, 1.0, error**-2 if is_made else 0.0])
+    np.testing.assert_allclose([mixture[name] for name in ("tv", "good", "poor")], inverse / inverse.sum(), atol=1e-9)
 
 
 @pytest.mark.parametrize(

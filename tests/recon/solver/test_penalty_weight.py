@@ -133,10 +133,12 @@ def small_windows(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_windows_are_spread_and_do_not_meet() -> None:
     problem = problem_of((64, 96))
     used = np.zeros((64, 96), int)
-    for window in penalty_weight.windows_of(problem, 4):
-        column, row = np.array(window.operator.grids[0].origin_mm).astype(int)
-        assert window.operator.grids[0].shape == (8, 8)
-        assert window.images is problem.images
+    places = np.arange(64.0 * 96).reshape(64, 96)
+    for window in penalty_weight.windows_of(problem, 4, 8 * 8 * 6):
+        column, row = np.array(window.problem.operator.grids[0].origin_mm).astype(int)
+        assert window.problem.operator.grids[0].shape == (8, 8)
+        np.testing.assert_array_equal(window.of(places), places[row : row + 8, column : column + 8])
+        assert window.problem.images is problem.images
         used[row : row + 8, column : column + 8] += 1
     assert used.max() == 1
     assert 1 / 16 <= used.mean() <= 1.3 / 16
@@ -150,7 +152,7 @@ def test_windows_are_spread_and_do_not_meet() -> None:
 @pytest.mark.usefixtures("small_windows")
 @pytest.mark.parametrize(("shape", "least"), [((64, 11), 0), ((19, 20), 0), ((2000, 16), 11), ((16, 2000), 11)])
 def test_only_large_planes_have_windows(shape: tuple[int, int], least: int) -> None:
-    count = len(penalty_weight.windows_of(problem_of(shape), 4))
+    count = len(penalty_weight.windows_of(problem_of(shape), 4, max(8 * 8 * 6, shape[0] * shape[1] // 16)))
     assert count >= least
     assert (count == 0) == (least == 0)
 
@@ -158,8 +160,7 @@ def test_only_large_planes_have_windows(shape: tuple[int, int], least: int) -> N
 @pytest.mark.usefixtures("small_windows")
 def test_windows_with_few_views_are_left_out() -> None:
     shifts = np.where(np.arange(9) < 6, 60.0, FEW_SAMPLES)  # six of nine views see only the right
-    columns = [
-        window.operator.grids[0].origin_mm[0] for window in penalty_weight.windows_of(problem_of((64, 96), shifts), 4)
-    ]
+    windows = penalty_weight.windows_of(problem_of((64, 96), shifts), 4, 8 * 8 * 6)
+    columns = [window.problem.operator.grids[0].origin_mm[0] for window in windows]
     assert columns
     assert min(columns) >= 60

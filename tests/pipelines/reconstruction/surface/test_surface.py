@@ -234,7 +234,7 @@ def test_proposal_and_change_are_written_beside_picture(
 def test_each_colour_has_prior_of_its_own(
     seen: Searches, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, done: Command
 ) -> None:
-    monkeypatch.setattr(prior_module, "patch_candidates", lambda evidence: {"pilot": evidence.pilot})
+    monkeypatch.setattr(prior_module, "patch_candidates", lambda evidence, names=None: {"pilot": evidence.pilot})
     for path in [*scene.glob("view_*.tiff"), scene / "noise_reference.tiff"]:
         grey = read_frame(path).pixels_dn
         write_frame(path, np.stack([grey, grey // 2 + 50, grey], axis=-1))
