@@ -46,7 +46,7 @@ _WINDOW_SAMPLES, _EDGE = 3 * 2**18, 16
 
 # A candidate is left out if the mixture predicts nearly as well without it: this share of its gain over the first
 # candidate is lost at most for each. Chosen likewise.
-_NEGLIGIBLE = 0.002
+_NEGLIGIBLE = 0.001
 
 # Shares (row, column) of each sample that belong to a region, by the region's name; they sum to one.
 type Regions = dict[str, Image]
