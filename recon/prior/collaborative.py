@@ -19,6 +19,9 @@ _KAISER_BETA = 2.0
 # Least variance of a coefficient, relative to that of a sample.
 _LEAST_VARIANCE = 0.01
 
+# Places of members are 16-bit numbers.
+_MAX_RADIUS = 90
+
 # A coefficient below so many standard deviations of its noise is taken for noise.
 _THRESHOLD = 2.7
 
@@ -54,6 +57,8 @@ class Groups:
             raise ValueError(
                 f"patches of {size} samples in a picture {guide.shape}; give a multiple of four that fits into it"
             )
+        if patches.radius > _MAX_RADIUS:
+            raise ValueError(f"radius {patches.radius} is more than {_MAX_RADIUS} samples; give a smaller one")
         # A distance to NaN is below none
         known = np.where(np.isfinite(noise.variance), guide, np.nan).astype(np.float32)
         self._patches, self._variance = patches, np.asarray(noise.variance, np.float32)
@@ -171,12 +176,13 @@ _SMALL = Patches(size=4, step=3, radius=8, members=32)
 
 
 def patch_candidates(evidence: Evidence, names: Collection[str] | None = None) -> dict[str, Image]:
-    """Return pictures (row, column) of a plane by name, all as blurred as the evidence, in electrons; some of `names`.
+    """Return pictures (row, column) of a plane by name, all as blurred as the evidence, in electrons.
 
     "tv" is the pilot, the plane of the penalty; "wiener" the collaborative Wiener filter with this pilot; "twice" the
     filter again, its pilot the mean of the first result and of the thresholded picture, which shows what the penalty
     lost; "fine" a filter of small patches, its pilot the mean of "twice" and of their thresholded picture. A plane
-    smaller than a patch has its pilot only. Alike patches are found in the sum of the pilot and of the light in other
+    smaller than a patch has its pilot only. "twice" and "wiener" are left out if `names` is "tv" alone, "fine" if it is
+    not named. Alike patches are found in the sum of the pilot and of the light in other
     colours.
     """
     picture, pilot, noise, _, other_colours = evidence

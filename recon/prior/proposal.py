@@ -41,7 +41,7 @@ WEIGHT_ABOUT_PROPOSAL = 1.2
 
 # Samples of the windows that stand for a large plane, together, and samples along the edges of a window that do not
 # count: filters do not know what lies beyond. Chosen on `CHOSEN_ON` in benchmarks/imaging/uncertainty.py, at 1280 x 960
-# samples: twelve windows are within 0.5 % of the error with weights from all of the plane, half as many within 4 %.
+# samples: twelve windows are within 0.7 % of the error with weights from all of the plane, half as many within 3.2 %.
 _WINDOW_SAMPLES, _EDGE = 3 * 2**18, 16
 
 # A candidate is left out if the mixture predicts nearly as well without it: this share of its gain over the first
@@ -91,9 +91,10 @@ def scores(candidates: Sequence[Image], picture: Image, weight: Image) -> Scores
 
 
 def best_mixture(scores: Scores, allowed: Sequence[int] | None = None) -> NDArray[np.float64]:
-    """Return the weights a ≥ 0, Σ a = 1 of least error: (candidate,), zero for those not `allowed`; the first is.
+    """Return the weights a ≥ 0, Σ a = 1 of least error: (candidate,).
 
-    Every set of candidates with positive weight is tried. Where the error falls no further, fewer are preferred.
+    Only candidates whose numbers are `allowed`, among them the first, have any. Every set of candidates with positive
+    weight is tried. Where the error falls no further, fewer are preferred.
     """
     count = scores.towards.size
     best: NDArray[np.float64] = np.eye(count)[0]

@@ -6,7 +6,7 @@ work is thus done on the plane, where it is cheap, and few passes over the data 
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -90,8 +90,8 @@ def pmlem(
     """Yield planes of decreasing objective, each with its certificate; the caller decides when to stop.
 
     Proximal gradient in the metric of the data. A step that raised the objective is undone and repeated with twice the
-    metric; the next step needs the pass that gives the objective anyway. The same plane is then yielded again: its
-    certificate may be better, since the dual field has come nearer to that of the optimum.
+    metric; the next step needs the pass that gives the objective anyway. Only a plane that is certified within the
+    tolerance may have a larger objective, as after a start that is the optimum.
 
     Parameters
     ----------
@@ -139,35 +139,33 @@ class _Pmlem:
     def iterates(self, plane: Image, dual: DualField) -> Iterator[PmlemIterate]:
         """Iterate without end; arrays as large as the plane are dropped before the next of their kind is made."""
         metric = self._fit.metric(plane)
-        accepted, gradient = None, plane
+        accepted, point = None, plane
         passes, lowest = 0, np.inf
         while True:
-            value, of_plane = self._fit.value_and_gradient(plane)
+            value, gradient = self._fit.value_and_gradient(plane)
             passes += 1
             objective = value + self._weight * dual.penalty_and_slack(plane, self._penalty)[0]
             if np.isnan(objective):
                 raise NotConverged(f"pass {passes} left the finite numbers; give a smaller penalty weight")
-            if accepted is None or np.isinf(lowest) or objective <= lowest + _ROUNDING * abs(lowest):
+            certificate = self._certificate(plane, gradient, metric, dual)
+            is_lower = np.isinf(lowest) or objective <= lowest + _ROUNDING * abs(lowest)
+            if accepted is None or is_lower or certificate.distance <= self._tolerance:
                 lowest = min(lowest, objective)
-                gradient = of_plane
-                certificate = self._certificate(plane, gradient, metric, dual)
+                del point
                 accepted = PmlemIterate(plane, objective, certificate, passes, self._inner_steps, dual)
                 yield accepted
                 self._scale = max(self._scale * _RELAXATION, 1.0)
                 if passes <= _PASSES_WITH_NEW_METRIC:
                     del metric
                     metric = self._fit.metric(plane)
+                point = plane - gradient / (metric * metric.dtype.type(self._scale))
             else:
-                self._scale *= 2  # half the way
-                certificate = self._certificate(accepted.plane, gradient, metric, dual)
-                accepted = replace(accepted, certificate=certificate, passes=passes, inner_steps=self._inner_steps)
-                yield accepted
+                self._scale *= 2
+                point = (accepted.plane + point) / 2  # half the way
             while self._scale > _MAX_SCALE:
                 yield accepted  # no step lowers the objective within rounding
-            del plane, of_plane
-            point = accepted.plane - gradient / (metric * metric.dtype.type(self._scale))
+            del plane, gradient
             plane = self._minimum(accepted.plane, point, metric, dual)
-            del point
 
     def _minimum(self, start: Image, point: Image, metric: Image, dual: DualField) -> Image:
         """Return the minimum of quadratic and penalty; start from a dual field and replace it by that of the minimum.

@@ -105,11 +105,9 @@ def _about_proposals(
 
 def _with_network(evidence: Evidence, names: Collection[str] | None = None, *, alone: bool) -> dict[str, Image]:
     """Return the candidates from patches and what the network makes of them; alone: only that and total variation's."""
-    if alone:
-        names = {"tv", "learned"}
-    of_network = names is None or "learned" in names
-    found = patch_candidates(evidence, {*names, "twice"} if names is not None and of_network else names)
-    if not of_network:
+    names = {"tv", "learned"} if alone else names
+    found = patch_candidates(evidence, names)
+    if names is not None and "learned" not in names:
         return found
     patches = (found["wiener"] + found["twice"]) / 2
     variance = evidence.noise.variance

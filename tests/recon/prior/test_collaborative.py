@@ -142,6 +142,8 @@ def test_shapes_and_sizes_without_fit_are_refused() -> None:
     for size in (0, 6, 24):
         with pytest.raises(ValueError, match=f"patches of {size} samples"):
             collaborative_wiener(y, pilot, noise, Patches(size))
+    with pytest.raises(ValueError, match="radius 91 is more than 90"):
+        collaborative_wiener(y, pilot, noise, Patches(radius=91))
 
 
 def test_candidates_are_those_of_slow_filters() -> None:

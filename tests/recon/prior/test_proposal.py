@@ -13,8 +13,10 @@ from scipy.optimize import LinearConstraint, minimize
 from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.reconstruction.planes.penalised import Objective
 from faintfield.recon.likelihood.images import Image
+from faintfield.recon.prior import proposal
 from faintfield.recon.prior.evidence import Evidence, Misfit, evidence_of_planes, misfits
 from faintfield.recon.prior.proposal import Scores, best_mixture, mixtures_of, propose, scores
+from faintfield.recon.solver import penalty_weight
 from faintfield.recon.solver.data_fit import SceneProblem
 from tests.recon.displaced import dark_views, pieces
 from tests.recon.operator_contract import dense_matrix
@@ -53,6 +55,35 @@ def test_edges_beyond_noise_are_those_of_the_plane(light: float) -> None:
     blurred = np.abs(edges) > 0.05 * light
     kept = np.abs((result.picture - evidence.pilot)[blurred & ~unseen]) / np.abs(edges[blurred & ~unseen])
     assert np.median(kept) > 0.9 if light == 40 else np.median(kept) < 0.9
+
+
+def test_windows_stand_for_a_large_plane(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Candidates are judged in windows, and made once of the whole plane; weights are about those of all of it."""
+    plane = pieces(96)
+    operator, images = dark_views(plane, 3)
+    problem = Objective.of(SceneProblem(operator, images), SolverOptions()).posed
+    (evidence,) = evidence_of_planes(operator, images, plane)
+    shapes: list[tuple[int, ...]] = []
+
+    def multiples_of_pilot(evidence: Evidence, names: Collection[str] | None = None) -> dict[str, Image]:
+        shapes.append(evidence.pilot.shape)
+        return {"half": evidence.pilot / 2, "zero": 0 * evidence.pilot, "twice": 2 * evidence.pilot}
+
+    (whole,) = propose(problem, plane, [evidence], 1.0, multiples_of_pilot)
+    assert set(shapes) == {(96, 96)}
+    shapes.clear()
+    monkeypatch.setattr(penalty_weight, "SIDE", 24)
+    monkeypatch.setattr(proposal, "_WINDOW_SAMPLES", 6 * 24**2)
+    monkeypatch.setattr(proposal, "_EDGE", 2)
+    (windowed,) = propose(problem, plane, [evidence], 1.0, multiples_of_pilot)
+    assert shapes.count((24, 24)) == len(shapes) - 1 >= 8
+    assert shapes[-1] == (96, 96)
+    for region in ("light, detail", "light, smooth"):
+        mixture = windowed.mixture[region]
+        light = mixture["half"] / 2 + 2 * mixture["twice"]  # the pilot itself predicts best
+        expected = whole.mixture[region]["half"] / 2 + 2 * whole.mixture[region]["twice"]
+        assert light == pytest.approx(expected, abs=0.05)
+        assert light == pytest.approx(1, abs=0.1)
 
 
 @pytest.mark.parametrize(("error", "is_made"), [(5.0, True), (20.0, False)])

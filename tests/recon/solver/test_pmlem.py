@@ -221,7 +221,7 @@ def test_too_small_metric_is_enlarged_until_objective_falls() -> None:
 
     bold = TooBold(posed.operator, posed.images, float(start.mean()))
     iterates = list(islice(pmlem(bold, start, penalty_weight=WEIGHT, tolerance=1e-4), 60))
-    assert iterates[1].plane is iterates[0].plane  # the first step was undone
+    assert iterates[1].passes > 2  # steps were undone
     assert all(after.objective <= before.objective * (1 + 1e-6) for before, after in pairwise(iterates))
     assert distance(iterates[-1].plane, solved(posed).plane) < 2e-3
 

@@ -56,9 +56,9 @@ def test_plane_has_proposal_change_mixtures_and_certificate(proposed: Path, with
     assert plane["moved_file"] == "plane_00500.0_moved.tiff"
     light, x, moved = (tifffile.imread(proposed / plane[key]) for key in ("file", "proposal_file", "moved_file"))
     check_proposal(light, x, moved, plane["prior"]["moved_sigma"])
-    other = moved != 0  # dark samples are exactly black in both, and a proposal near enough to the optimum stays
+    other = moved != 0  # dark samples are exactly black in both
     sigma = (light - x)[other] / moved[other]
-    assert other.mean() > 0.1
+    assert other.mean() > 0.5
     assert 0.1 < np.percentile(sigma, 1) < np.percentile(sigma, 99) < 10
     assert 0 < plane["prior"]["moved_sigma"] < 1
     (first,) = read_record(without)["planes"]
