@@ -7,6 +7,7 @@ from cyclopts import Parameter
 
 from faintfield.pipelines.arguments import (
     IN_INPUT,
+    IN_MACHINE,
     IN_OUTPUT,
     Count,
     FigureNumber,
@@ -67,6 +68,7 @@ def reconstruct(
     options: Options = DEFAULTS,
     geometry: Annotated[Path | None, IN_INPUT] = None,
     scene: Annotated[SceneKind, IN_INPUT] = "dark_scene",
+    part: Annotated[str | None, IN_MACHINE] = None,
 ) -> Reconstruction:
     """Reconstruct planes of the scene at chosen depths, or one picture that is sharp everywhere, with its depth.
 
@@ -85,10 +87,13 @@ def reconstruct(
         geometry.json, or its folder; its lens and measured poses replace those of the set, node by node.
     scene
         Set of the session to reconstruct: the dark scene or the bright scene.
+    part
+        I/N: make only every N-th plane from the I-th on, and no report, as one of N jobs of a cluster that write to the
+        same OUT at the same time. When all have ended, the same command without --part puts the sweep together.
     """
     from faintfield.pipelines.workflows.reconstruct import reconstruct_folder
 
-    return reconstruct_folder(set_path, out, options, geometry, scene)
+    return reconstruct_folder(set_path, out, options, geometry, scene, part)
 
 
 def report(directory: Path, /) -> dict[str, str]:

@@ -7,7 +7,7 @@ import secrets
 import shutil
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -189,12 +189,24 @@ def exclusive(folder: Path) -> Iterator[None]:
     command is writing there.
     On a file system without locks, such as some network disks, nothing keeps a second command out.
     """
+    with _locked(folder, fcntl.LOCK_EX):
+        remove_leftovers(folder)
+        yield
+
+
+def shared(folder: Path) -> AbstractContextManager[None]:
+    """Lock a folder of results as `exclusive` does, but against that only: several blocks can run at a time."""
+    return _locked(folder, fcntl.LOCK_SH)
+
+
+@contextmanager
+def _locked(folder: Path, how: int) -> Iterator[None]:
     with translated_write_errors(folder):
         _refuse_file(folder)
         folder.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(folder, os.O_RDONLY)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, how | fcntl.LOCK_NB)
     except OSError as failure:
         if failure.errno not in _NO_LOCKS:
             os.close(descriptor)
@@ -204,7 +216,6 @@ def exclusive(folder: Path) -> Iterator[None]:
             locked = f"{folder}: cannot be locked ({failure.strerror}); name a place that can be written"
             raise CannotWrite(locked) from failure
     try:
-        remove_leftovers(folder)
         yield
     finally:
         with suppress(OSError):

@@ -39,7 +39,7 @@ from faintfield.pipelines.reconstruction.depth.search import check_overlap, chec
 from faintfield.pipelines.reconstruction.operators import default_pitch_px, plane_grid
 from faintfield.pipelines.reconstruction.overview import inspect_set, write_overview
 from faintfield.pipelines.reconstruction.planes.saturation import saturation_text
-from faintfield.pipelines.reconstruction.planes.sweep import PlaneTask, Runner, Sweep, run_serially
+from faintfield.pipelines.reconstruction.planes.sweep import Part, PlaneTask, Runner, Sweep, run_serially
 from faintfield.pipelines.reconstruction.request import Request, folder_of_method
 
 # Planes whose mean is at most this, in electrons per pixel, count as black.
@@ -121,6 +121,27 @@ def reconstruct_set(elemental_set: ElementalSet, out: Path, request: Request, ru
         out=str(out), planes=records, focus=focus, best_focus=found, depth_map=depth_map, metrics=metrics,
         units=elemental_set.units, recommendation=advice or UNSET,
     )  # fmt: skip
+
+
+def reconstruct_part(
+    elemental_set: ElementalSet, out: Path, request: Request, part: Part, runner: Runner = run_serially
+) -> Outcome:
+    """Make a part of the planes of a request, of which other processes make the other parts at the same time.
+
+    The planes are those of `reconstruct_set`, which later keeps them and writes all that is known of them together.
+    The caller shares `out` with the other parts, see `formats.files.shared`.
+    """
+    folders = {name: folder_of_method(out, name, request.methods) for name in request.methods}
+    whole = _sweep(elemental_set, folders, request)
+    sweep = whole.part(part)
+    inform(f"part {part}: {len(sweep.plan.grids)} of {len(whole.plan.grids)} planes")
+    sweep.keep_finished()
+    require_room(out, sweep.needed_bytes())
+    for folder in folders.values():
+        remove(folder / RECONSTRUCTION_FILE)
+    sweep.run(runner, out)
+    _warn(elemental_set, sweep.records)
+    return Outcome(out=str(out), planes=sweep.records, units=elemental_set.units)
 
 
 def _check(elemental_set: ElementalSet, folders: Iterable[Path], request: Request) -> None:

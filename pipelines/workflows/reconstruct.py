@@ -1,5 +1,6 @@
 """Planes or a surface of a set or session, with the report: `faintfield reconstruct`."""
 
+import re
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -10,31 +11,37 @@ from msgspec import UNSET
 from faintfield.pipelines.arguments import SceneKind
 from faintfield.pipelines.console import inform, working
 from faintfield.pipelines.errors import OutputExists, WrongUsage
-from faintfield.pipelines.formats.files import check_results_folder, exclusive, files_below
-from faintfield.pipelines.formats.results.records import RECONSTRUCTION_FILE, REPORT_FILE
+from faintfield.pipelines.formats.files import UNFINISHED, check_results_folder, exclusive, files_below, shared
+from faintfield.pipelines.formats.results.records import JOINT_METHODS, RECONSTRUCTION_FILE, REPORT_FILE
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, check_exists, load_set
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, load_session, with_measured_geometry
 from faintfield.pipelines.reconstruction.channels import keeping_frames
 from faintfield.pipelines.reconstruction.depth.scene_structure import Mode, recommendation
 from faintfield.pipelines.reconstruction.options import OF_PLANES, Options
-from faintfield.pipelines.reconstruction.planes.sweep import Runner, run_serially
+from faintfield.pipelines.reconstruction.planes.sweep import Part, Runner, run_serially
 from faintfield.pipelines.reconstruction.planes.workers import make_runner
 from faintfield.pipelines.reconstruction.request import Request, folder_of_method, resolve, select_planes
-from faintfield.pipelines.reconstruction.run import Outcome, reconstruct_set, refuse_surfaces
+from faintfield.pipelines.reconstruction.run import Outcome, reconstruct_part, reconstruct_set, refuse_surfaces
 from faintfield.pipelines.reconstruction.surface.reconstruct import reconstruct_surface
 from faintfield.pipelines.reconstruction.surface.request import SURFACE_FOLDER, SurfaceRequest, select_surface
 from faintfield.rig.session.session import has_session
 
 
 def reconstruct_folder(
-    folder: Path, out: Path | None, options: Options, geometry: Path | None = None, scene: SceneKind = "dark_scene"
+    folder: Path,
+    out: Path | None,
+    options: Options,
+    geometry: Path | None = None,
+    scene: SceneKind = "dark_scene",
+    part: str | None = None,
 ) -> Outcome:
-    """Reconstruct what the options ask of a set or session, and write the report.
+    """Reconstruct what the options ask of a set or session, and write the report; or a part of the planes only.
 
     Raises MissingFile if there is no such folder, and WrongUsage if options contradict one another, or no folder for
     the results is known.
     """
     check_exists(folder)
+    wanted = None if part is None else parse_part(part)
     if options.surface and (of_planes := options.given(OF_PLANES)):
         raise WrongUsage(
             f"--surface makes one picture at all depths, and {' and '.join(of_planes)} would have no effect; leave it "
@@ -42,17 +49,38 @@ def reconstruct_folder(
         )
     surface = select_surface(options)
     if surface is not None:
+        if wanted:
+            raise WrongUsage("--surface makes one picture, which has no --part; leave one out")
         elemental_set, page_in = open_set(folder, out, scene, geometry)
         out = out or page_in / SURFACE_FOLDER
         return surface_and_report(elemental_set, out, surface, page_in=page_in)
     runner = make_runner(options.workers, options.scheduler)
     planes = select_planes(options)
+    if wanted and (together := [method for method in planes.methods if method in JOINT_METHODS]):
+        raise WrongUsage(f"{together[0]} solves all planes together, which have no --part; leave one out")
     elemental_set, out = open_set(folder, out, scene, geometry)
     # Before depths are searched
-    check_results_folder(out)
+    if wanted is None:
+        check_results_folder(out)
+    elif planes.auto or planes.auto_sweep:
+        inform("each part searches the depths again; give those that one search finds to save that time")
     if options.depth_map:
         refuse_surfaces(folder_of_method(out, method, planes.methods) for method in planes.methods)
-    return reconstruct_and_report(elemental_set, out, resolve(planes, elemental_set, out), runner)
+    request = resolve(planes, elemental_set, out)
+    if wanted is None:
+        return reconstruct_and_report(elemental_set, out, request, runner)
+    # One process for each part, whose name a killed one leaves behind for the next whole command to remove
+    with shared(out), exclusive(out / f".part_{wanted.number}_of_{wanted.count}{UNFINISHED}"):
+        return reconstruct_part(elemental_set, out, request, wanted, runner)
+
+
+def parse_part(text: str) -> Part:
+    """Return the part I/N of a sweep: WrongUsage unless 1 ≤ I ≤ N."""
+    numbers = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text)
+    part = Part(int(numbers[1]), int(numbers[2])) if numbers else None
+    if part is None or not 1 <= part.number <= part.count:
+        raise WrongUsage(f"--part {text}: is no part I/N of a sweep, with I from 1 to N; give such as 3/16")
+    return part
 
 
 def reconstruct_and_report(

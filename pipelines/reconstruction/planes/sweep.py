@@ -60,6 +60,17 @@ class PlaneTask:
         return len(self.files) * sum(len(layout.lattices) for layout in self.layouts)
 
 
+@dataclass(frozen=True)
+class Part:
+    """A part of the planes of a sweep, made by a process of its own: every `count`-th plane from the `number`-th on."""
+
+    number: int
+    count: int
+
+    def __str__(self) -> str:
+        return f"{self.number}/{self.count}"
+
+
 class Channel:
     """One colour of a set in memory: what all of its tasks share."""
 
@@ -222,6 +233,13 @@ class Sweep:
             per_sample = arrays * (is_missing * float_bytes + shown_bytes) + plan.with_focus * float_bytes
             total += rows * columns * len(plan.layouts) * per_sample
         return total
+
+    def part(self, part: Part) -> "Sweep":
+        """Return the sweep of a part of the planes, with all their colours and methods."""
+        plan = self.plan
+        places = list(plan.grids)[part.number - 1 :: part.count]
+        grids = {place: plan.grids[place] for place in places}
+        return replace(self, plan=replace(plan, grids=grids, files=tuple(f for f in plan.files if f.place in grids)))
 
     def keep_finished(self) -> None:
         """Find the planes that are there, made from the same inputs."""

@@ -11,12 +11,12 @@ import pytest
 import tifffile
 from msgspec import UNSET, convert, structs
 
-from faintfield.pipelines.formats.files import UNFINISHED
+from faintfield.pipelines.formats.files import UNFINISHED, shared
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.results.plane_files import PARTS, PlaneFiles
 from faintfield.pipelines.formats.results.records import FocusPoint, PlaneRecord
 from faintfield.pipelines.reconstruction.request import Request
-from tests.pipelines.conftest import Command
+from tests.pipelines.conftest import Command, assert_refused
 from tests.pipelines.forms import files_in
 
 SWEEP = ("--sweep-mm", "500:700:3", "--method", "backprojection")
@@ -61,6 +61,36 @@ def test_killed_sweep_is_completed_alike(seed: int, colour_set: Path, tmp_path: 
     assert list(killed.rglob(f"*{UNFINISHED}"))
     done("reconstruct", colour_set, "--out", killed, *SWEEP)
     assert _contents(killed) == _contents(whole)
+
+
+def test_parts_are_put_together(colour_set: Path, tmp_path: Path, done: Command, faintfield: Command) -> None:
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    done("reconstruct", colour_set, "--out", whole, *SWEEP)
+    with shared(parts):  # as another part at the same time
+        for part, names in (("2/2", [600]), ("1/2", [500, 600, 700])):
+            done("reconstruct", colour_set, "--out", parts, *SWEEP, "--part", part)
+            assert sorted(path.name for path in parts.glob("*.tiff")) == [f"plane_{mm:07.1f}.tiff" for mm in names]
+        assert_refused(faintfield("reconstruct", colour_set, "--out", parts, *SWEEP), "OutputBusy")
+    assert not (parts / "reconstruction.json").exists()
+    assert "3 of 3 planes are there" in done("reconstruct", colour_set, "--out", parts, *SWEEP).stderr
+    assert _contents(parts) == _contents(whole)
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ((*SWEEP, "--part", "0/4"), "is no part I/N"),
+        ((*SWEEP, "--part", "5/4"), "is no part I/N"),
+        ((*SWEEP[:2], "--joint", "--part", "1/4"), "solves all planes together"),
+        (("--surface", "--part", "1/4"), "makes one picture"),
+    ],
+)
+def test_wrong_parts_are_refused(
+    options: tuple[str, ...], reason: str, scene: Path, tmp_path: Path, faintfield: Command
+) -> None:
+    ended = faintfield("reconstruct", scene, "--out", tmp_path / "out", *options)
+    assert ended.returncode == 2
+    assert reason in ended.stderr
 
 
 def test_only_altered_planes_are_made_again(scene: Path, tmp_path: Path, done: Command) -> None:
