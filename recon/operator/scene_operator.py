@@ -113,9 +113,8 @@ class SceneOperator:
         """Return H f: the planes as each view sees them together, (view, row, column)."""
         chosen = self._views(views)
         expected = np.zeros((len(chosen), *self.images_shape[1:]), self.dtype)
-        image_of_view = np.zeros(self.images_shape[0], np.intp)
-        image_of_view[chosen] = np.arange(len(chosen))
         samples = self._checked("samples", samples, self.samples_shape)
+        image_of_view = self._image_of(chosen)
         self._sweeps.run(Sweep(kernels.FORWARD, chosen, image_of_view, samples=samples, expected_images=expected))
         return expected
 
@@ -124,10 +123,11 @@ class SceneOperator:
         images = self._checked("images", images, self.images_shape)
         return self._adjoint(images, self._views(views), self.all_views)
 
-    def adjoint_of_view(self, image: Image, view: int) -> Image:
-        """Return Hᵀ g (samples) of the image (row, column) of one view, as if all others were zero."""
-        image = self._checked("an image", image, self.images_shape[1:])
-        return self._adjoint(image, self._views([view]), np.zeros_like(self.all_views))
+    def adjoint_of_views(self, images: Image, views: Sequence[int] | NDArray[np.integer]) -> Image:
+        """Return Hᵀ g (samples) of the images (chosen view, row, column) of some views, as if all others were zero."""
+        chosen = self._views(views)
+        images = self._checked("images", images, (len(chosen), *self.images_shape[1:]))
+        return self._adjoint(images, chosen, self._image_of(chosen))
 
     def adjoint_of_forward(self, samples: Image, views: ViewSelection = None) -> Image:
         """Return Hᵀ H f (samples), with no array as large as the images."""
@@ -237,6 +237,12 @@ class SceneOperator:
     def map_of_views(self, value: float | Image, views: NDArray[np.intp]) -> float | Image:
         """Return a map (lattice, row, column) as each view has it, (view, row, column); a number as it is."""
         return float(value) if np.ndim(value) == 0 else self._map(value)[self.lattice_of_view[views]]
+
+    def _image_of(self, chosen: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Return the number of each view among the chosen ones (view,), zero for the others."""
+        image_of_view = np.zeros(self.images_shape[0], np.intp)
+        image_of_view[chosen] = np.arange(len(chosen))
+        return image_of_view
 
     def _adjoint(self, images: Image, views: NDArray[np.intp], image_of_view: NDArray[np.intp]) -> Image:
         sums = self._sweeps.run(Sweep(kernels.ADJOINT, views, image_of_view, images=images))[1]

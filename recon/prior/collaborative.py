@@ -77,26 +77,21 @@ class Groups:
 
     def wiener(self, picture: Image, pilot: Image) -> NDArray[np.float32]:
         """Return a picture as Wiener's filter leaves it: see `collaborative_wiener`."""
-        return self._filtered(picture, pilot, wiener=True)[0]
-
-    def thresholded(self, picture: Image, pilot: Image) -> NDArray[np.float32]:
-        """Return what stands out of the noise of a picture, and the pilot's samples that are in no group.
-
-        The first step of Dabov et al.: coefficients above 2.7 standard deviations of their noise are kept. So it also
-        shows what the pilot lost.
-        """
-        return self._filtered(picture, pilot, large=True)[0]
+        return self._filtered(picture, pilot, thresholded=False)[0]
 
     def wiener_and_thresholded(self, picture: Image, pilot: Image) -> list[NDArray[np.float32]]:
-        """Return both, in less time."""
-        return self._filtered(picture, pilot, wiener=True, large=True)
+        """Return that, and what stands out of the noise of a picture, with the pilot's samples that are in no group.
 
-    def _filtered(
-        self, picture: Image, pilot: Image, *, wiener: bool = False, large: bool = False
-    ) -> list[NDArray[np.float32]]:
+        The latter is the first step of Dabov et al.: coefficients above 2.7 standard deviations of their noise are
+        kept. So it also shows what the pilot lost.
+        """
+        return self._filtered(picture, pilot, thresholded=True)
+
+    def _filtered(self, picture: Image, pilot: Image, *, thresholded: bool) -> list[NDArray[np.float32]]:
         _require_same_shapes(guide=self._variance, picture=picture, pilot=pilot)
         picture, pilot = (np.ascontiguousarray(array, np.float32) for array in (picture, pilot))
-        sums = [np.zeros((2, *picture.shape) if wanted else (2, 0, 0), np.float32) for wanted in (wiener, large)]
+        large = picture.shape if thresholded else (0, 0)
+        sums = [np.zeros((2, *shape), np.float32) for shape in (picture.shape, large)]
 
         def work(strip: NDArray[np.intp]) -> None:
             part = slice(strip[0], strip[-1] + 1)
@@ -170,9 +165,8 @@ def _transform(kernel: NDArray[np.float64], size: int) -> Transform:
     return Transform(*(np.ascontiguousarray(array, np.float32) for array in arrays))
 
 
-# Large patches average most of the noise away, small ones keep what is seen once. Chosen on photographs.
-_LARGE = Patches(size=8, step=6, radius=16, members=64)
-_SMALL = Patches(size=4, step=3, radius=8, members=32)
+# Chosen on photographs.
+_PATCHES = Patches(size=8, step=6, radius=16, members=64)
 
 
 def patch_candidates(evidence: Evidence, names: Collection[str] | None = None) -> dict[str, Image]:
@@ -180,26 +174,20 @@ def patch_candidates(evidence: Evidence, names: Collection[str] | None = None) -
 
     "tv" is the pilot, the plane of the penalty; "wiener" the collaborative Wiener filter with this pilot; "twice" the
     filter again, its pilot the mean of the first result and of the thresholded picture, which shows what the penalty
-    lost; "fine" a filter of small patches, its pilot the mean of "twice" and of their thresholded picture. A plane
-    smaller than a patch has its pilot only. "twice" and "wiener" are left out if `names` is "tv" alone, "fine" if it is
-    not named. Alike patches are found in the sum of the pilot and of the light in other
-    colours.
+    lost. A plane smaller than a patch has its pilot only; so it is if `names` is "tv" alone. Alike patches are found in
+    the sum of the pilot and of the light in other colours.
     """
     picture, pilot, noise, _, other_colours = evidence
 
     def guide(pilot: Image) -> Image:
         return pilot if other_colours is None else pilot + other_colours
 
-    found = {"tv": pilot}
-    if min(pilot.shape) < _LARGE.size or (names is not None and set(names) <= {"tv"}):
-        return found
-    found["wiener"], thresholded = Groups(guide(pilot), noise, _LARGE).wiener_and_thresholded(picture, pilot)
-    better = (found["wiener"] + thresholded) / 2
-    found["twice"] = collaborative_wiener(picture, better, noise, _LARGE, guide=guide(better))
-    if names is None or "fine" in names:
-        groups = Groups(guide(pilot), noise, _SMALL)
-        found["fine"] = groups.wiener(picture, (found["twice"] + groups.thresholded(picture, pilot)) / 2)
-    return found
+    if min(pilot.shape) < _PATCHES.size or (names is not None and set(names) <= {"tv"}):
+        return {"tv": pilot}
+    wiener, thresholded = Groups(guide(pilot), noise, _PATCHES).wiener_and_thresholded(picture, pilot)
+    better = (wiener + thresholded) / 2
+    twice = collaborative_wiener(picture, better, noise, _PATCHES, guide=guide(better))
+    return {"tv": pilot, "wiener": wiener, "twice": twice}
 
 
 def refined(operator: SceneOperator, images: ElementalImages, plane: Image) -> Image:

@@ -163,13 +163,22 @@ def _drawn_noise(
 ) -> Image:
     """Return Hᵀ n (samples) of one draw of the noise n of the data: its deviation with random signs, fast to draw."""
     light, total = np.maximum(samples, 0), np.zeros_like(samples)
-    for view in (operator.all_views if views is None else np.asarray(views)).tolist():
-        known = operator.map_of_views(images.background_e + images.read_variance_e2, np.array([view]))
-        deviation = np.sqrt(operator.forward(light, [view]) + known)[0]
-        random_bytes = np.random.default_rng([*seed, view]).bytes(-(-deviation.size // 8))
-        negative = np.unpackbits(np.frombuffer(random_bytes, np.uint8), count=deviation.size).reshape(deviation.shape)
-        total += operator.adjoint_of_view(np.where(negative, -deviation, deviation), view)
+    for some in _few_views(operator, operator.all_views if views is None else np.asarray(views)):
+        drawn = operator.forward(light, some)
+        drawn += operator.map_of_views(images.background_e + images.read_variance_e2, some)
+        np.sqrt(drawn, out=drawn)
+        for view, deviation in zip(some.tolist(), drawn, strict=True):
+            random_bytes = np.random.default_rng([*seed, view]).bytes(-(-deviation.size // 8))
+            bits = np.unpackbits(np.frombuffer(random_bytes, np.uint8), count=deviation.size)
+            np.negative(deviation, out=deviation, where=bits.reshape(deviation.shape).astype(bool))
+        total += operator.adjoint_of_views(drawn, some)
     return total
+
+
+def _few_views(operator: SceneOperator, views: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+    """Return views in groups whose images together are about as large as the samples: each group takes some sweeps."""
+    at_a_time = max(int(np.prod(operator.samples_shape)) // int(np.prod(operator.images_shape[1:])), 1)
+    return np.array_split(views, -(-len(views) // at_a_time)) if len(views) else []
 
 
 def _products_of_neighbours(picture: Image) -> NDArray[np.float64]:
@@ -206,17 +215,19 @@ def misfits(
 
     `regions` are shares (row, column) of the samples of each plane in "light, detail" and "light, smooth".
     """
-    squares, variances, spreads = (np.zeros_like(samples) for _ in range(3))
-    for view in operator.seeing_views.tolist():
-        background_e, read_variance_e2 = (
-            operator.map_of_views(value, np.array([view])) for value in (images.background_e, images.read_variance_e2)
-        )
-        expected = (operator.forward(samples, [view]) + background_e)[0]
-        variance = np.asarray(expected + read_variance_e2).reshape(expected.shape)
-        squares += operator.adjoint_of_view(np.square(images.electrons[view] - expected), view)
-        variances += operator.adjoint_of_view(variance, view)
+    squares, spreads = (np.zeros_like(samples) for _ in range(2))
+    variances = operator.adjoint_of_forward(samples)
+    variances += operator.adjoint_of_map(images.background_e + images.read_variance_e2)
+    for some in _few_views(operator, operator.seeing_views):
+        expected = operator.forward(samples, some)
+        expected += operator.map_of_views(images.background_e, some)
+        residual = images.electrons[some] - expected
+        squares += operator.adjoint_of_views(np.square(residual, out=residual), some)
         # Of a Poisson number and a normal one
-        spreads += operator.adjoint_of_view(2 * np.square(variance) + expected, view)
+        variance = np.add(expected, operator.map_of_views(images.read_variance_e2, some), out=residual)
+        np.square(variance, out=variance)
+        expected += 2 * variance
+        spreads += operator.adjoint_of_views(expected, some)
     parts = (operator.planes_of(array) for array in (squares, variances, spreads))
     return [_misfit(*of_plane) for of_plane in zip(*parts, regions, strict=True)]
 

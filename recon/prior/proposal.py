@@ -3,17 +3,19 @@
 Its response to noise in the data gives the standard deviation of planes made with it.
 """
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from faintfield.recon.likelihood.images import Image, blurred
 from faintfield.recon.operator.occlusion import opacity
+from faintfield.recon.operator.scene_operator import SceneOperator
 from faintfield.recon.prior.evidence import Evidence, evidence_of_planes
+from faintfield.recon.prior.scales import Candidates, is_of_samples
 from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.solver.initialization import mean_light_e
 from faintfield.recon.solver.penalties import Penalty, differences
@@ -45,18 +47,12 @@ WEIGHT_ABOUT_PROPOSAL = 1.2
 _WINDOW_SAMPLES, _EDGE = 3 * 2**18, 16
 
 # A candidate is left out if the mixture predicts nearly as well without it: this share of its gain over the first
-# candidate is lost at most for each. Chosen likewise.
-_NEGLIGIBLE = 0.001
+# candidate is lost at most for each; and for all those of the samples of a large plane, which take three times as long
+# as all those of means of samples.
+_NEGLIGIBLE, _SMALL = 0.001, 0.1
 
 # Shares (row, column) of each sample that belong to a region, by the region's name; they sum to one.
 type Regions = dict[str, Image]
-
-
-class Candidates(Protocol):
-    """Candidates for a plane."""
-
-    def __call__(self, evidence: Evidence, names: Collection[str] | None = None) -> dict[str, Image]:
-        """Return candidates (row, column) by name, all as blurred as the evidence: those named, by default all."""
 
 
 @dataclass(frozen=True)
@@ -93,39 +89,31 @@ def scores(candidates: Sequence[Image], picture: Image, weight: Image) -> Scores
 def best_mixture(scores: Scores, allowed: Sequence[int] | None = None) -> NDArray[np.float64]:
     """Return the weights a ≥ 0, Σ a = 1 of least error: (candidate,).
 
-    Only candidates whose numbers are `allowed`, among them the first, have any. Every set of candidates with positive
-    weight is tried. Where the error falls no further, fewer are preferred.
+    Only candidates whose numbers are `allowed`, among them the first, have any. Where all predict alike, it is the
+    first.
     """
-    count = scores.towards.size
-    best: NDArray[np.float64] = np.eye(count)[0]
-    least = scores.loss(best)
-    scale = max(float(np.trace(scores.gram)), 1e-300)
-    allowed = range(count) if allowed is None else allowed
-    for size in range(1, len(allowed) + 1):
-        for chosen in combinations(allowed, size):
-            weights = _mixture_of(scores, list(chosen))
-            if weights is not None and scores.loss(weights) < least - 1e-12 * scale:
-                best, least = weights, scores.loss(weights)
-    return best
-
-
-def _mixture_of(scores: Scores, chosen: list[int]) -> NDArray[np.float64] | None:
-    """Return the weights of least error with sum one of some candidates; None if one of them is negative."""
-    # The first of them takes the rest: so the sum is one whatever the scale of the errors
-    first, *others = chosen
-    differences = np.eye(scores.towards.size)[others] - np.eye(scores.towards.size)[first]
-    curvature = differences @ scores.gram @ differences.T
-    slope = differences @ (scores.towards - scores.gram[first])
-    shares = np.linalg.lstsq(curvature, slope, rcond=None)[0]
-    if (shares < 0).any() or shares.sum() > 1:
-        return None
+    chosen = np.arange(scores.towards.size) if allowed is None else np.asarray(allowed)
+    # The errors of the candidates as columns, up to a part that all have in common: the error of a mixture of sum one
+    # is the mixture of the errors. And min |E a|² + (1 − Σ a)² over a ≥ 0 has the direction of the best of those.
+    values, vectors = np.linalg.eigh(scores.gram[np.ix_(chosen, chosen)])
+    some = values > 1e-12 * max(values[-1], 0)
+    roots, axes = np.sqrt(values[some])[:, np.newaxis], vectors[:, some].T
+    errors = roots * axes - axes @ scores.towards[chosen, np.newaxis] / roots
+    scale = np.abs(errors).max(initial=1e-300)
+    sum_is_one = np.append(np.zeros(len(errors)), 1.0)
+    shares, _ = nnls(np.vstack([errors / scale, np.ones(chosen.size)]), sum_is_one, maxiter=1000)
     weights: NDArray[np.float64] = np.zeros(scores.towards.size)
-    weights[others], weights[first] = shares, 1 - shares.sum()
+    weights[chosen] = shares / shares.sum()
     return weights
 
 
-def mixtures_of(names: Sequence[str], totals: dict[str, Scores]) -> dict[str, dict[str, float]]:
-    """Return the weights of candidates by region and name; those that hardly help anywhere need not be made."""
+def mixtures_of(
+    names: Sequence[str], totals: dict[str, Scores], *, spared: Callable[[str], bool] | None = None
+) -> dict[str, dict[str, float]]:
+    """Return the weights of candidates by region and name; those that hardly help anywhere need not be made.
+
+    `spared` names those that should help more than a little to be made.
+    """
 
     def of(allowed: Sequence[int]) -> tuple[float, dict[str, NDArray[np.float64]]]:
         weights = {region: best_mixture(scores, allowed) for region, scores in totals.items()}
@@ -133,11 +121,13 @@ def mixtures_of(names: Sequence[str], totals: dict[str, Scores]) -> dict[str, di
 
     (of_first, _), (least, weights) = of([0]), of(range(len(names)))
     allowed = list(range(len(names)))
-    for number in reversed(allowed[1:]):
-        fewer = [other for other in allowed if other != number]
+    gain = of_first - least
+    costly = {number for number in allowed[1:] if spared is not None and spared(names[number])}
+    for left_out, most in [(costly, _SMALL), *(({number}, _NEGLIGIBLE) for number in reversed(allowed[1:]))]:
+        fewer = [number for number in allowed if number not in left_out]
         loss, without = of(fewer)
-        if loss - least <= _NEGLIGIBLE * (of_first - least):
-            allowed, weights = fewer, without
+        if loss - least <= most * gain:
+            allowed, weights, least = fewer, without, loss
     return {region: dict(zip(names, of_region.tolist(), strict=True)) for region, of_region in weights.items()}
 
 
@@ -177,6 +167,7 @@ def propose(
     candidates: Candidates,
     *,
     other_colours: Image | None = None,
+    regions: Sequence[Regions] | None = None,
 ) -> list[PlaneProposal]:
     """Return a proposal for each plane of a scene: a mixture of candidates, with weights from held-out views.
 
@@ -194,17 +185,21 @@ def propose(
         where all predict alike.
     other_colours : float array (samples), optional
         The planes in other colours, for the evidence of the folds.
+    regions : sequence of dict, optional
+        Their `regions_of_planes`, where they are known.
     """
     operator = problem.operator
-    regions = [regions_of(*of_plane) for of_plane in zip(operator.planes_of(samples), evidences, strict=True)]
+    regions = regions or regions_of_planes(operator, samples, evidences)
     level_e = mean_light_e(operator, samples)
     totals: list[dict[str, Scores]] = [{} for _ in evidences]
-    for part in _parts(problem, samples, evidences, regions, other_colours):
+    parts = _parts(problem, samples, evidences, regions, other_colours)
+    for part in parts:
         for number in range(max(_MIN_FOLDS, folds_to_predict(problem))):
             names, found = _fold_scores(part, penalty_weight, level_e, number, candidates)
             for total, more in zip(totals, found, strict=True):
                 total.update({name: total[name] + new if name in total else new for name, new in more.items()})
-    mixtures = [mixtures_of(names, of_regions) for of_regions in totals]
+    spared = is_of_samples if len(parts) > 1 else None
+    mixtures = [mixtures_of(names, of_regions, spared=spared) for of_regions in totals]
     planes = zip(operator.planes_of(samples), evidences, regions, mixtures, strict=True)
     return [
         PlaneProposal(
@@ -235,11 +230,12 @@ def _parts(
     evidences: Sequence[Evidence],
     regions: Sequence[Regions],
     other_colours: Image | None,
-) -> Iterator[_Part]:
-    """Yield the parts by which candidates are judged: windows of a large plane, else all."""
+) -> list[_Part]:
+    """Return the parts by which candidates are judged: windows of a large plane, else all."""
     windows = windows_of(problem, MIN_VIEWS, _WINDOW_SAMPLES)
     if not windows:
-        yield _Part(problem, samples, evidences, regions, other_colours)
+        return [_Part(problem, samples, evidences, regions, other_colours)]
+    parts = []
     for window in windows:
         (evidence,), (shares,) = evidences, regions
         inside = np.zeros(window.problem.operator.samples_shape, np.float32)
@@ -252,13 +248,15 @@ def _parts(
             window.of(evidence.coverage),
             None if others is None else window.of(others),
         )
-        yield _Part(
-            window.problem,
-            window.of(samples),
-            [known],
-            [{name: inside * window.of(share) for name, share in shares.items()}],
-            None if other_colours is None else window.of(other_colours),
-        )
+        shares = {name: inside * window.of(share) for name, share in shares.items()}
+        light = None if other_colours is None else window.of(other_colours)
+        parts.append(_Part(window.problem, window.of(samples), [known], [shares], light))
+    return parts
+
+
+def regions_of_planes(operator: SceneOperator, samples: Image, evidences: Sequence[Evidence]) -> list[Regions]:
+    """Return the regions of each plane of a scene."""
+    return [regions_of(*of_plane) for of_plane in zip(operator.planes_of(samples), evidences, strict=True)]
 
 
 def regions_of(plane: Image, evidence: Evidence) -> Regions:

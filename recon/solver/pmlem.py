@@ -17,7 +17,8 @@ from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.solver.proximal import DualField
 from faintfield.recon.solver.proximal_kernels import squared_distance
 
-# An inner problem is solved until its error is this fraction of the last step, or of the tolerance; limit on its steps.
+# An inner problem is solved until its error is this fraction of the last step, or of the tolerance, of which it is half
+# as much after each pass that met this, but had no certificate; limit on its steps.
 _INNER_OF_STEP, _INNER_OF_TOLERANCE, _MAX_INNER_STEPS = 0.3, 0.8, 600
 
 # Relative rise of the objective that rounding may cause; a step with a larger rise is undone.
@@ -133,7 +134,7 @@ def iterate_until(iterates: Iterator[PmlemIterate], tolerance: float, max_passes
 class _Pmlem:
     def __init__(self, fit: DataFit, weight: float, penalty: Penalty, tolerance: float) -> None:
         self._fit, self._weight, self._penalty, self._tolerance = fit, weight, penalty, tolerance
-        self._scale = 1.0
+        self._scale, self._inner_of_tolerance = 1.0, _INNER_OF_TOLERANCE
         self._inner_steps = 0
 
     def iterates(self, plane: Image, dual: DualField) -> Iterator[PmlemIterate]:
@@ -154,6 +155,8 @@ class _Pmlem:
                 del point
                 accepted = PmlemIterate(plane, objective, certificate, passes, self._inner_steps, dual)
                 yield accepted
+                if certificate.slack <= self._tolerance:
+                    self._inner_of_tolerance /= 2  # else further passes would bring no more
                 self._scale = max(self._scale * _RELAXATION, 1.0)
                 if passes <= _PASSES_WITH_NEW_METRIC:
                     del metric
@@ -180,7 +183,7 @@ class _Pmlem:
 
             def gap_tolerance(plane: Image) -> float:
                 step = distance(plane, start, metric)
-                return 0.5 * max(_INNER_OF_STEP * step, _INNER_OF_TOLERANCE * self._tolerance * size) ** 2
+                return 0.5 * max(_INNER_OF_STEP * step, self._inner_of_tolerance * self._tolerance * size) ** 2
 
             found = dual.prox(point, metric, self._weight / self._scale, self._penalty, gap_tolerance, _MAX_INNER_STEPS)
             plane = found.plane

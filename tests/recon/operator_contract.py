@@ -68,7 +68,7 @@ def _check_views(operator: PlaneOperator, dense: Image, x: Image, y: Image) -> N
     np.testing.assert_allclose(both, operator.adjoint(y), atol=_ROUNDING)
     of_last = dense[-y[-1].size :].T @ y[-1].ravel()
     last = int(operator.all_views[-1])
-    np.testing.assert_allclose(operator.adjoint_of_view(y[-1], last), of_last.reshape(x.shape), atol=_ROUNDING)
+    np.testing.assert_allclose(operator.adjoint_of_views(y[-1:], [last]), of_last.reshape(x.shape), atol=_ROUNDING)
     both = operator.adjoint_of_forward(x, first) + operator.adjoint_of_forward(x, second)
     np.testing.assert_allclose(both, operator.adjoint_of_forward(x), atol=_ROUNDING)
     both = operator.sensitivity(first) + operator.sensitivity(second)

@@ -16,12 +16,13 @@ from faintfield.recon.prior.collaborative import patch_candidates
 from faintfield.recon.prior.evidence import Evidence, evidence_of_planes, misfits
 from faintfield.recon.prior.proposal import (
     WEIGHT_ABOUT_PROPOSAL,
-    Candidates,
     PlaneProposal,
     ProposalAnswers,
+    Regions,
     propose,
-    regions_of,
+    regions_of_planes,
 )
+from faintfield.recon.prior.scales import Candidates, CandidatesOfScales, scales
 from faintfield.recon.solver.penalty_weight import MIN_VIEWS
 from faintfield.recon.solver.uncertainty import Answers, LocalProblem
 
@@ -45,10 +46,9 @@ def with_prior(objective: Objective, solutions: Sequence[Solution]) -> list[Solu
     return with_sigma(objective, found, answers) if objective.options.uncertainty else found
 
 
-def _contradiction(objective: Objective, samples: Image, evidences: Sequence[Evidence]) -> str | None:
+def _contradiction(objective: Objective, samples: Image, regions: Sequence[Regions]) -> str | None:
     """Return how the views contradict planes by more than noise, None if they do not."""
     operator, images = objective.posed.operator, objective.posed.images
-    regions = [regions_of(*of_plane) for of_plane in zip(operator.planes_of(samples), evidences, strict=True)]
     found = next((misfit for misfit in misfits(operator, images, samples, regions) if misfit.contradicts), None)
     if found is None:
         return None
@@ -70,16 +70,14 @@ def _about_proposals(
     weight = first.penalty_weight or 0.0
     samples = operator.samples_of([solution.plane for solution in solutions])
     evidences = evidence_of_planes(operator, objective.posed.images, samples, other_colours=other_colours)
-    if contradiction := _contradiction(objective, samples, evidences):
+    regions = regions_of_planes(operator, samples, evidences)
+    if contradiction := _contradiction(objective, samples, regions):
         return contradiction
-    candidates: Candidates = patch_candidates
-    no_network = None
-    if options.prior != "patches":
-        reasons = (outside_range(evidence.pilot, evidence.noise) for evidence in evidences)
-        no_network = next((reason for reason in reasons if reason is not None), None)
-        if no_network is None:
-            candidates = partial(_with_network, alone=options.prior == "learned")
-    proposals = propose(objective.posed, samples, evidences, weight, candidates, other_colours=other_colours)
+    makers, no_network = _makers(options, evidences)
+    candidates = CandidatesOfScales(makers)
+    proposals = propose(
+        objective.posed, samples, evidences, weight, candidates, other_colours=other_colours, regions=regions
+    )
     if all(weights.get("tv") == 1 for proposal in proposals for weights in proposal.mixture.values()):
         return "total variation predicts held-out views best"
     proposed = operator.samples_of([proposal.picture for proposal in proposals])
@@ -101,6 +99,21 @@ def _about_proposals(
         partial(ProposalAnswers, proposal=proposal, pilot=solution.plane)
         for solution, proposal in zip(solutions, proposals, strict=True)
     ]
+
+
+def _makers(options: SolverOptions, evidences: Sequence[Evidence]) -> tuple[list[Candidates], str | None]:
+    """Return what makes the candidates of each scale, and why the network makes none; None if it makes any."""
+    makers: list[Candidates] = []
+    reasons: list[str | None] = []
+    for of_scale in zip(*map(scales, evidences), strict=False):
+        if options.prior == "patches":
+            makers.append(patch_candidates)
+            continue
+        why = (outside_range(evidence.pilot, evidence.noise) for evidence in of_scale)
+        reasons.append(next((reason for reason in why if reason is not None), None))
+        with_network = partial(_with_network, alone=options.prior == "learned")
+        makers.append(patch_candidates if reasons[-1] else with_network)
+    return makers, reasons[0] if all(reasons) and reasons else None
 
 
 def _with_network(evidence: Evidence, names: Collection[str] | None = None, *, alone: bool) -> dict[str, Image]:

@@ -68,7 +68,7 @@ def test_plane_has_proposal_change_mixtures_and_certificate(proposed: Path, with
     mixture = plane["prior"]["mixture"]
     assert set(mixture) == {"light, detail", "light, smooth", "dark, detail", "dark, smooth"}
     for weights in mixture.values():
-        assert list(weights) == ["tv", "wiener", "twice", "fine"]
+        assert list(weights) == ["tv", "wiener", "twice", "half wiener", "half twice"]
         assert min(weights.values()) >= 0
         assert sum(weights.values()) == pytest.approx(1, abs=1e-9)
     assert plane["certificate"]["reached"]
