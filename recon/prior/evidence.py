@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from faintfield.recon.likelihood.images import ElementalImages, Image, blurred
 from faintfield.recon.operator.scene_operator import SceneOperator, ViewSelection
 from faintfield.recon.solver.initialization import well_seen_samples
+from faintfield.recon.threads import map_in_threads
 
 # Spacings of the blurs of the noise of a draw, which stands in for many draws, and of the number of views.
 _WIDE_BLUR, _NARROW_BLUR = (1, 2, 4, 8, 12), (1, 1)
@@ -166,18 +167,21 @@ def _drawn_noise(
     for some in _few_views(operator, operator.all_views if views is None else np.asarray(views)):
         drawn = operator.forward(light, some)
         drawn += operator.map_of_views(images.background_e + images.read_variance_e2, some)
-        np.sqrt(drawn, out=drawn)
-        for view, deviation in zip(some.tolist(), drawn, strict=True):
-            random_bytes = np.random.default_rng([*seed, view]).bytes(-(-deviation.size // 8))
-            bits = np.unpackbits(np.frombuffer(random_bytes, np.uint8), count=deviation.size)
-            np.negative(deviation, out=deviation, where=bits.reshape(deviation.shape).astype(bool))
+
+        def draw(view: int, variance: Image) -> None:
+            random_bytes = np.random.default_rng([*seed, view]).bytes(-(-variance.size // 8))
+            bits = np.unpackbits(np.frombuffer(random_bytes, np.uint8), count=variance.size)
+            deviation = np.sqrt(variance, out=variance)
+            np.negative(deviation, out=deviation, where=bits.reshape(variance.shape).astype(bool))
+
+        map_in_threads(lambda of_view: draw(*of_view), list(zip(some.tolist(), drawn, strict=True)))
         total += operator.adjoint_of_views(drawn, some)
     return total
 
 
 def _few_views(operator: SceneOperator, views: NDArray[np.intp]) -> list[NDArray[np.intp]]:
     """Return views in groups whose images together are about as large as the samples: each group takes some sweeps."""
-    at_a_time = max(int(np.prod(operator.samples_shape)) // int(np.prod(operator.images_shape[1:])), 1)
+    at_a_time = max(int(np.prod(operator.samples_shape)) // int(np.prod(operator.images_shape[1:])), operator.workers)
     return np.array_split(views, -(-len(views) // at_a_time)) if len(views) else []
 
 
@@ -221,13 +225,18 @@ def misfits(
     for some in _few_views(operator, operator.seeing_views):
         expected = operator.forward(samples, some)
         expected += operator.map_of_views(images.background_e, some)
-        residual = images.electrons[some] - expected
-        squares += operator.adjoint_of_views(np.square(residual, out=residual), some)
-        # Of a Poisson number and a normal one
-        variance = np.add(expected, operator.map_of_views(images.read_variance_e2, some), out=residual)
-        np.square(variance, out=variance)
-        expected += 2 * variance
-        spreads += operator.adjoint_of_views(expected, some)
+        spread = expected + operator.map_of_views(images.read_variance_e2, some)
+
+        def compare(view: int, of_view: Image, spread: Image) -> None:
+            """Set the light to squares of residuals, and the variance to that of these."""
+            spread *= 2 * spread  # of a Poisson number and a normal one
+            spread += of_view
+            np.subtract(images.electrons[view], of_view, out=of_view)
+            np.square(of_view, out=of_view)
+
+        map_in_threads(lambda arrays: compare(*arrays), list(zip(some.tolist(), expected, spread, strict=True)))
+        squares += operator.adjoint_of_views(expected, some)
+        spreads += operator.adjoint_of_views(spread, some)
     parts = (operator.planes_of(array) for array in (squares, variances, spreads))
     return [_misfit(*of_plane) for of_plane in zip(*parts, regions, strict=True)]
 

@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from faintfield.recon.likelihood.images import Image, blurred
 from faintfield.recon.operator.occlusion import opacity
@@ -92,6 +91,8 @@ def best_mixture(scores: Scores, allowed: Sequence[int] | None = None) -> NDArra
     Only candidates whose numbers are `allowed`, among them the first, have any. Where all predict alike, it is the
     first.
     """
+    from scipy.optimize import nnls  # it takes 40 MB and half a second, and without a prior it is not needed
+
     chosen = np.arange(scores.towards.size) if allowed is None else np.asarray(allowed)
     # The errors of the candidates as columns, up to a part that all have in common: the error of a mixture of sum one
     # is the mixture of the errors. And min |E a|² + (1 − Σ a)² over a ≥ 0 has the direction of the best of those.

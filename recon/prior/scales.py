@@ -6,16 +6,19 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import convolve2d
 
-from faintfield.recon.likelihood.images import Image
+from faintfield.recon.likelihood.images import Image, sums_of_four
 from faintfield.recon.prior.evidence import Evidence, Noise
+from faintfield.recon.threads import map_in_threads
 
 # What candidates of each scale are named with: samples, means of 2 x 2 and of 4 x 4. Of 8 x 8 they are no use any more.
 PREFIXES = ("", "half ", "quarter ")
 
 # Samples along a side that the coarsest scale has at least.
 _LEAST_SIDE = 32
+
+# Rows of a strip that a thread interpolates.
+_STRIP = 128
 
 # Covariance of the sums of two neighbouring samples, of lags −1, 0 and 1 within and between them.
 _PAIRS = np.outer([1, 2, 1], [1, 2, 1])
@@ -78,18 +81,18 @@ def scales(evidence: Evidence) -> Iterator[Evidence]:
 
 def halved(evidence: Evidence) -> Evidence:
     """Return the evidence of means of 2 x 2 samples, weighted by how well each is seen."""
-    coverage = _sums(evidence.coverage)
+    coverage = sums_of_four(evidence.coverage)
 
     def mean(picture: Image) -> Image:
-        sums = _sums(evidence.coverage * picture)
+        sums = sums_of_four(evidence.coverage * picture)
         return np.divide(sums, coverage, out=sums, where=coverage > 0)
 
     variance = evidence.noise.variance
     seen = np.isfinite(variance)
-    count = _sums(seen.astype(np.float32))
+    count = sums_of_four(seen.astype(np.float32))
     share, kernel = _noise_of_means(evidence.noise.kernel)
     of_mean = np.full(count.shape, np.inf, np.float32)
-    np.divide(np.float32(share) * _sums(np.where(seen, variance, 0)), count, out=of_mean, where=count > 0)
+    np.divide(np.float32(share) * sums_of_four(np.where(seen, variance, 0)), count, out=of_mean, where=count > 0)
     others = evidence.other_colours
     return Evidence(
         mean(evidence.picture),
@@ -102,18 +105,9 @@ def halved(evidence: Evidence) -> Evidence:
 
 def _noise_of_means(kernel: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
     """Return the variance of a mean of 2 x 2 samples of variance one, and the correlation (3, 3) of such means."""
-    covariance = convolve2d(kernel, _PAIRS)[::2, ::2] / 16
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(kernel, 2), (3, 3))[::2, ::2]
+    covariance = np.einsum("ijkl,kl->ij", around, _PAIRS) / 16
     return float(covariance[1, 1]), covariance / covariance[1, 1]
-
-
-def _sums(picture: Image) -> Image:
-    """Return the sums of 2 x 2 samples; at an odd edge, of those that there are."""
-    rows, columns = picture.shape
-    padded = np.pad(picture, ((0, rows % 2), (0, columns % 2))) if rows % 2 or columns % 2 else picture
-    sums = padded[::2, ::2] + padded[1::2, ::2]
-    sums += padded[::2, 1::2]
-    sums += padded[1::2, 1::2]
-    return sums
 
 
 def _raised(picture: Image, pilots: Sequence[Image]) -> Image:
@@ -125,11 +119,16 @@ def _raised(picture: Image, pilots: Sequence[Image]) -> Image:
 
 def _interpolated(picture: Image, shape: tuple[int, ...]) -> Image:
     """Return twice as many samples along both axes, interpolated linearly, cut to a shape."""
-    for axis in (0, 1):
-        lines = np.moveaxis(picture, axis, 0)
-        finer = np.empty((2 * len(lines), lines.shape[1]), picture.dtype)
-        before, after = (lines[np.clip(np.arange(len(lines)) + step, 0, len(lines) - 1)] for step in (-1, 1))
-        finer[::2] = (3 * lines + before) / 4
-        finer[1::2] = (3 * lines + after) / 4
-        picture = np.moveaxis(finer, 0, axis)
-    return picture[: shape[0], : shape[1]]
+    rows, columns = picture.shape
+    finer, padded = np.empty((2 * rows, 2 * columns), picture.dtype), np.pad(picture, 1, mode="edge")
+
+    def fill(strip: range) -> None:
+        lines = padded[strip.start : strip.stop + 2]
+        for first, neighbours in ((0, lines[:-2]), (1, lines[2:])):
+            between = (3 * lines[1:-1] + neighbours) / 4
+            target = finer[2 * strip.start + first : 2 * strip.stop : 2]
+            target[:, ::2] = (3 * between[:, 1:-1] + between[:, :-2]) / 4
+            target[:, 1::2] = (3 * between[:, 1:-1] + between[:, 2:]) / 4
+
+    map_in_threads(fill, [range(first, min(first + _STRIP, rows)) for first in range(0, rows, _STRIP)])
+    return finer[: shape[0], : shape[1]]

@@ -18,8 +18,9 @@ from faintfield.recon.solver.proximal import DualField
 from faintfield.recon.solver.proximal_kernels import squared_distance
 
 # An inner problem is solved until its error is this fraction of the last step, or of the tolerance, of which it is half
-# as much after each pass that met this, but had no certificate; limit on its steps.
+# as much after each pass that hardly lowered the certificate's distance; limit on its steps.
 _INNER_OF_STEP, _INNER_OF_TOLERANCE, _MAX_INNER_STEPS = 0.3, 0.8, 600
+_SLOW = 0.8
 
 # Relative rise of the objective that rounding may cause; a step with a larger rise is undone.
 _ROUNDING = 1e-7
@@ -152,11 +153,11 @@ class _Pmlem:
             is_lower = np.isinf(lowest) or objective <= lowest + _ROUNDING * abs(lowest)
             if accepted is None or is_lower or certificate.distance <= self._tolerance:
                 lowest = min(lowest, objective)
+                if accepted is not None and certificate.distance > _SLOW * accepted.certificate.distance:
+                    self._inner_of_tolerance /= 2
                 del point
                 accepted = PmlemIterate(plane, objective, certificate, passes, self._inner_steps, dual)
                 yield accepted
-                if certificate.slack <= self._tolerance:
-                    self._inner_of_tolerance /= 2  # else further passes would bring no more
                 self._scale = max(self._scale * _RELAXATION, 1.0)
                 if passes <= _PASSES_WITH_NEW_METRIC:
                     del metric
@@ -185,7 +186,11 @@ class _Pmlem:
                 step = distance(plane, start, metric)
                 return 0.5 * max(_INNER_OF_STEP * step, self._inner_of_tolerance * self._tolerance * size) ** 2
 
-            found = dual.prox(point, metric, self._weight / self._scale, self._penalty, gap_tolerance, _MAX_INNER_STEPS)
+            weight = self._weight / self._scale
+            if self._penalty.bounded and not any(vectors.any() for vectors in dual.vectors):
+                gap = 0.5 * (self._inner_of_tolerance * self._tolerance * size) ** 2
+                dual.begin_coarse(point, metric, weight, self._penalty, gap)
+            found = dual.prox(point, metric, weight, self._penalty, gap_tolerance, _MAX_INNER_STEPS)
             plane = found.plane
             self._inner_steps += found.steps
         if not self._fit.may_reach_zero:

@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.recon.likelihood.images import Image
+from faintfield.recon.likelihood.images import Image, sums_of_four
 from faintfield.recon.solver import proximal_kernels
 from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.threads import run_in_threads
@@ -23,6 +23,9 @@ _STEPS_PER_EXCHANGE, _MIN_STRIP_ROWS = 20, 64
 
 # The gap is measured after this share of the steps so far, at least after one exchange.
 _CHECK_SHARE = 0.1
+
+# Samples along a side of the coarsest problem from which others begin, and most steps that each of these makes.
+_COARSEST, _MAX_COARSE_STEPS = 64, 600
 
 # Length of the first step on the plane in the metric, and the strong convexity that the acceleration relies on; the
 # metric's own is 1, and less converges faster.
@@ -66,6 +69,29 @@ class DualField:
     def copy(self) -> "DualField":
         """Return a copy that can be changed without changing this field."""
         return replace(self, vectors=[vectors.copy() for vectors in self.vectors])
+
+    def begin_coarse(self, point: Image, metric: Image, weight: float, penalty: Penalty, gap: float) -> None:
+        """Set this field to that of planes of half as many rows and columns: a start from which fewer steps are left.
+
+        Light is averaged over wide even parts in few steps on coarse samples and in many on fine ones. A sum over 2 x 2
+        samples of the quadratic is that of a coarse sample; its steps to the next count along two fine edges, so
+        that β is twice as large. Coarse problems, too, begin with coarser ones, and are solved until their gap is
+        `gap`. The other parameters are as for `prox`; φ must be of bounded slope. Vectors may be longer than one, which
+        the first step mends.
+        """
+        for vectors, (v, w, *x) in zip(
+            self.vectors,
+            self._planes(point, metric, *([] if self.proposal is None else [self.proposal])),
+            strict=True,
+        ):
+            if min(v.shape) >= 2 * _COARSEST:
+                coarse_w = sums_of_four(w)
+                coarse = DualField.zero([coarse_w.shape], v.dtype)
+                coarse.proposal, coarse.workers = (sums_of_four(x[0]) / v.dtype.type(4) if x else None), self.workers
+                problem = sums_of_four(w * v) / coarse_w, coarse_w, 2 * weight, penalty
+                coarse.begin_coarse(*problem, gap)
+                coarse.prox(*problem, lambda _: gap, _MAX_COARSE_STEPS)
+                _interpolate_edges(coarse.vectors[0], vectors)
 
     def primal(self, point: Image, reach: Image) -> Image:
         """Return `v − β/w ∇ᵀp` (samples), not clipped at zero, for a point v and a reach β/w."""
@@ -180,6 +206,18 @@ class _PrimalDual:
         vectors, *planes = self._changed
         rows = slice(max(first, 0), stop)
         return np.concatenate([vectors[:, rows], *(plane[None, rows] for plane in planes)])
+
+
+def _interpolate_edges(coarse: Image, fine: Image) -> None:
+    """Set the vectors (2, row, column) at the edges of fine samples to those of coarse ones, linearly between them."""
+    for axis in (0, 1):
+        lines = np.moveaxis(coarse[axis], axis, 0)
+        between = lines / 2
+        between[1:] += lines[:-1] / 2
+        for first, along in ((0, between), (1, lines)):
+            target = np.moveaxis(fine[axis], axis, 0)[first::2]
+            target[:] = np.repeat(along, 2, axis=1)[: len(target), : target.shape[1]]
+        np.moveaxis(fine[axis], axis, 0)[-1] = 0  # beyond the last sample
 
 
 def step_sizes(reach: Image) -> Image:
