@@ -53,8 +53,9 @@ def run(
     limit_px
         Largest accepted standard deviation of the transfer between views, as for `geometry`.
     """
-    # Of `reconstruct`, three options have no place here: --out, as results lie in the session; --geometry, which is
-    # measured; and --scene, as the page is that of the dark scene. The bright one is reconstructed by `reconstruct`
+    # Of `reconstruct`, four options have no place here: --out, as results lie in the session; --geometry, which is
+    # measured; --scene, as the page is that of the dark scene; and --part, as the page needs all planes. The bright
+    # scene, and parts, are reconstructed by `reconstruct`
     from faintfield.pipelines.workflows.session import run_session
 
     return run_session(session, options, lens, limit_px)

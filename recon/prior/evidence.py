@@ -1,8 +1,8 @@
 """Evidence of the data for each plane: a picture with its noise, that of the plane without noise, and their misfit."""
 
-from collections.abc import Sequence
-from itertools import product
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Sequence
+from itertools import islice, product
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from faintfield.recon.likelihood.images import ElementalImages, Image, blurred
 from faintfield.recon.operator.scene_operator import SceneOperator, ViewSelection
 from faintfield.recon.solver.initialization import well_seen_samples
-from faintfield.recon.threads import map_in_threads
+from faintfield.recon.threads import run_in_threads
 
 # Spacings of the blurs of the noise of a draw, which stands in for many draws, and of the number of views.
 _WIDE_BLUR, _NARROW_BLUR = (1, 2, 4, 8, 12), (1, 1)
@@ -174,14 +174,24 @@ def _drawn_noise(
             deviation = np.sqrt(variance, out=variance)
             np.negative(deviation, out=deviation, where=bits.reshape(variance.shape).astype(bool))
 
-        map_in_threads(lambda of_view: draw(*of_view), list(zip(some.tolist(), drawn, strict=True)))
+        _for_each_view(operator.workers, draw, some.tolist(), drawn)
         total += operator.adjoint_of_views(drawn, some)
     return total
 
 
+def _for_each_view(workers: int, work: Callable[..., None], *of_views: Iterable[Any]) -> None:
+    """Call `work` with what belongs to each view, in threads."""
+
+    def take(worker: int) -> None:
+        for of_view in islice(zip(*of_views, strict=True), worker, None, workers):
+            work(*of_view)
+
+    run_in_threads(take, range(workers))
+
+
 def _few_views(operator: SceneOperator, views: NDArray[np.intp]) -> list[NDArray[np.intp]]:
     """Return views in groups whose images together are about as large as the samples: each group takes some sweeps."""
-    at_a_time = max(int(np.prod(operator.samples_shape)) // int(np.prod(operator.images_shape[1:])), operator.workers)
+    at_a_time = max(int(np.prod(operator.samples_shape)) // int(np.prod(operator.images_shape[1:])), 1)
     return np.array_split(views, -(-len(views) // at_a_time)) if len(views) else []
 
 
@@ -234,7 +244,7 @@ def misfits(
             np.subtract(images.electrons[view], of_view, out=of_view)
             np.square(of_view, out=of_view)
 
-        map_in_threads(lambda arrays: compare(*arrays), list(zip(some.tolist(), expected, spread, strict=True)))
+        _for_each_view(operator.workers, compare, some.tolist(), expected, spread)
         squares += operator.adjoint_of_views(expected, some)
         spreads += operator.adjoint_of_views(spread, some)
     parts = (operator.planes_of(array) for array in (squares, variances, spreads))

@@ -21,6 +21,11 @@ from faintfield.recon.threads import run_in_threads
 # many rows of its neighbours as it makes steps.
 _STEPS_PER_EXCHANGE, _MIN_STRIP_ROWS = 20, 64
 
+# Columns of a tile of a strip, about: the rows in work of wider ones do not stay in the cache.
+_TILE_COLUMNS = 1024
+
+_ALL = slice(None)
+
 # The gap is measured after this share of the steps so far, at least after one exchange.
 _CHECK_SHARE = 0.1
 
@@ -172,16 +177,24 @@ class _PrimalDual:
         self._fixed = point, reach, step_sizes(reach), proposal, penalty.smoothing_e, penalty.bounded
         self._point, self._reach, self._proposal, self._penalty = point, reach, proposal, penalty
         self._edges, self._workers = _edges(len(plane), workers), workers
+        tiles = max(round(plane.shape[1] / _TILE_COLUMNS), 1)
+        self._column_edges = [tile * plane.shape[1] // tiles for tile in range(tiles + 1)]
 
     def advance(self) -> None:
         for _ in range(max(round(_CHECK_SHARE * self.steps / _STEPS_PER_EXCHANGE), 1)):
             arguments = *self._changed, *self._fixed, *self._next_steps()
-            # Neighbours change their rows while a strip is in work
-            before = {first: self._copied_rows(first - _STEPS_PER_EXCHANGE, first) for first in self._edges}
-            after = {stop: self._copied_rows(stop, stop + _STEPS_PER_EXCHANGE) for stop in self._edges}
+            # Neighbours change their rows and columns while a tile is in work
+            reach = _STEPS_PER_EXCHANGE
+            above = {first: self._copied(slice(max(first - reach, 0), first)) for first in self._edges}
+            below = {stop: self._copied(slice(stop, stop + reach)) for stop in self._edges}
+            before = {left: self._copied(_ALL, slice(max(left - reach, 0), left)) for left in self._column_edges}
+            behind = {right: self._copied(_ALL, slice(right, right + reach)) for right in self._column_edges}
 
             def step(strip: tuple[int, int]) -> None:
-                proximal_kernels.step_strip(*strip, before[strip[0]], after[strip[1]], *arguments)  # noqa: B023
+                rows = above[strip[0]], below[strip[1]]  # noqa: B023
+                for left, right in pairwise(self._column_edges):
+                    columns = before[left], behind[right]  # noqa: B023
+                    proximal_kernels.step_tile(*strip, left, right, *rows, *columns, *arguments)  # noqa: B023
 
             run_in_threads(step, list(pairwise(self._edges)))
             self.steps += _STEPS_PER_EXCHANGE
@@ -201,11 +214,10 @@ class _PrimalDual:
             self._length *= float(momenta[n])
         return lengths, momenta
 
-    def _copied_rows(self, first: int, stop: int) -> Image:
-        """Return a copy (4, row, column) of rows of p, x and x ahead, as far as the plane has them."""
+    def _copied(self, rows: slice, columns: slice = _ALL) -> Image:
+        """Return a copy (4, row, column) of a part of p, x and x ahead, as far as the plane has it."""
         vectors, *planes = self._changed
-        rows = slice(max(first, 0), stop)
-        return np.concatenate([vectors[:, rows], *(plane[None, rows] for plane in planes)])
+        return np.concatenate([vectors[:, rows, columns], *(plane[None, rows, columns] for plane in planes)])
 
 
 def _interpolate_edges(coarse: Image, fine: Image) -> None:

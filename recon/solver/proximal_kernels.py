@@ -1,14 +1,15 @@
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
-"""Steps of a primal-dual iteration on a penalised plane, compiled: several at a time on a strip of rows.
+"""Steps of a primal-dual iteration on a penalised plane, compiled: several at a time on a tile.
 
 The penalty of a plane x is `β Σ φ(|∇(x − x̂)|)`, with `(∇x)[i,j] = (x[i+1,j] − x[i,j], x[i,j+1] − x[i,j])` and no
 difference taken across an edge. x̂ is a proposal, by default zero. The dual field p has a vector of length at most one
 for each sample (of any length where φ is quadratic everywhere).
 
-A step changes a row using the rows next to it. The steps follow one another down the strip, each a row behind the one
+A step changes a row using the rows next to it. The steps follow one another down a tile, each a row behind the one
 before, so that the rows in work stay in the cache and the planes pass through memory once for all steps. n steps on a
-strip need n rows of its neighbours on each side, whose values become stale one after the other. They are copied before
-any strip is changed, so that strips can be processed in any order, and the result does not depend on their number.
+tile need n rows and columns of its neighbours on each side, whose values become stale one after the other. They are
+copied before any tile is changed, so that tiles can be processed in any order, and the result does not depend on their
+number.
 """
 
 import numpy as np
@@ -17,15 +18,20 @@ from faintfield.recon.numba_tools import compiled
 
 
 @compiled
-def step_strip(
-    first, stop, above, below, dual, plane, ahead, centre, reach, sizes, origin, smoothing, bounded, lengths, momenta
-):
-    """Make `momenta.size` steps on rows `first` to `stop` of the dual field, the plane, and the plane ahead.
+def step_tile(
+    first, stop, left, right, above, below, before, behind,
+    dual, plane, ahead, centre, reach, sizes, origin, smoothing, bounded, lengths, momenta,
+):  # fmt: skip
+    """Make `momenta.size` steps on a tile of the dual field, the plane, and the plane ahead.
 
     Parameters
     ----------
+    first, stop, left, right : int
+        Rows and columns of the tile.
     above, below : array (4, step, column)
-        The rows before and after the strip of p, of x and of x ahead; without rows at an edge of the plane.
+        The rows before and after the tile of p, of x and of x ahead; without rows at an edge of the plane.
+    before, behind : array (4, row, step)
+        The columns before and after it, likewise.
     dual, plane, ahead : array (2, row, column), (row, column), (row, column)
         p; x; x extrapolated beyond its last step, less x̂. They are changed.
     centre, reach, sizes, origin : array (row, column)
@@ -35,8 +41,10 @@ def step_strip(
     lengths, momenta : array (step,)
         τ, the length of each step on x in the metric; its extrapolation.
     """
-    count, columns = momenta.size, centre.shape[1]
+    count = momenta.size
     top, bottom = first - above.shape[1], stop + below.shape[1]
+    west, east = left - before.shape[2], right + behind.shape[2]
+    columns, inner, after = east - west, left - west, right - west
     number = centre.dtype.type
     one, smoothing = number(1), number(smoothing)
     # A ring of rows in work, those of p after a column of zeros, those ahead with their last value twice
@@ -47,19 +55,21 @@ def step_strip(
         if front < bottom:
             k = front % kept
             if front < first:
-                _load(above, front - top, p[k], x[k], x_ahead[k])
+                _load(above, front - top, west, east, 0, p[k], x[k], x_ahead[k])
             elif front >= stop:
-                _load(below, front - stop, p[k], x[k], x_ahead[k])
+                _load(below, front - stop, west, east, 0, p[k], x[k], x_ahead[k])
             else:
+                _load(before, front, 0, inner, 0, p[k], x[k], x_ahead[k])
+                _load(behind, front, 0, columns - after, after, p[k], x[k], x_ahead[k])
                 _copy_row(
-                    dual[0, front],
-                    dual[1, front],
-                    plane[front],
-                    ahead[front],
-                    p[k, 0, 1:],
-                    p[k, 1, 1:],
-                    x[k],
-                    x_ahead[k],
+                    dual[0, front, left:right],
+                    dual[1, front, left:right],
+                    plane[front, left:right],
+                    ahead[front, left:right],
+                    p[k, 0, 1 + inner :],
+                    p[k, 1, 1 + inner :],
+                    x[k, inner:],
+                    x_ahead[k, inner:],
                 )
             x_ahead[k, columns] = x_ahead[k, columns - 1]
         for step in range(count):
@@ -70,28 +80,49 @@ def step_strip(
                 k = row % kept
                 next_row = (row + 1) % kept if row + 1 < bottom else k
                 length, momentum = number(lengths[step]), number(momenta[step])
-                _step_dual(x_ahead[k], x_ahead[next_row], sizes[row], one / length, smoothing, bounded, p[k])
+                size = sizes[row, west:east]
+                _step_dual(x_ahead[k], x_ahead[next_row], size, one / length, smoothing, bounded, p[k])
                 over = p[(row - 1) % kept] if row > top else over_top
-                _step_primal(over, p[k], centre[row], reach[row], length, momentum, x[k], x_ahead[k])
+                v, r = centre[row, west:east], reach[row, west:east]
+                _step_primal(over, p[k], v, r, length, momentum, x[k], x_ahead[k])
                 if origin.size > 0:
                     for j in range(columns):
-                        x_ahead[k, j] -= origin[row, j]
+                        x_ahead[k, j] -= origin[row, west + j]
                     x_ahead[k, columns] = x_ahead[k, columns - 1]
         row = front - count
         if first <= row < stop:
             k = row % kept
-            _copy_row(p[k, 0, 1:], p[k, 1, 1:], x[k], x_ahead[k], dual[0, row], dual[1, row], plane[row], ahead[row])
+            _copy_row(
+                p[k, 0, 1 + inner : 1 + after],
+                p[k, 1, 1 + inner : 1 + after],
+                x[k, inner:after],
+                x_ahead[k, inner:after],
+                dual[0, row, left:],
+                dual[1, row, left:],
+                plane[row, left:],
+                ahead[row, left:],
+            )
 
 
 @compiled
-def _load(rows, row, p, x, x_ahead):
-    _copy_row(rows[0, row], rows[1, row], rows[2, row], rows[3, row], p[0, 1:], p[1, 1:], x, x_ahead)
+def _load(rows, row, begin, end, to, p, x, x_ahead):
+    """Copy columns of a row (4, row, column) to a row in work, from its column `to` on."""
+    _copy_row(
+        rows[0, row, begin:end],
+        rows[1, row, begin:end],
+        rows[2, row, begin:end],
+        rows[3, row, begin:end],
+        p[0, 1 + to :],
+        p[1, 1 + to :],
+        x[to:],
+        x_ahead[to:],
+    )
 
 
 @compiled
 def _copy_row(down, right, plane, ahead, to_down, to_right, to_plane, to_ahead):
     """Copy a row in work; `a[:] = b` would take seconds to compile, for the message that sizes differ."""
-    for j in range(to_plane.size):
+    for j in range(plane.size):
         to_down[j], to_right[j], to_plane[j], to_ahead[j] = down[j], right[j], plane[j], ahead[j]
 
 

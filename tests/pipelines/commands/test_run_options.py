@@ -27,7 +27,7 @@ def test_only_options_of_sets_are_missing_from_run() -> None:
         command: {name for argument in app[command].assemble_argument_collection() for name in argument.names}
         for command in ("run", "reconstruct")
     }
-    assert options["reconstruct"] - options["run"] == {"SESSION|SET", "--out", "--geometry", "--scene"}
+    assert options["reconstruct"] - options["run"] == {"SESSION|SET", "--out", "--geometry", "--scene", "--part"}
     assert options["run"] - options["reconstruct"] == {"SESSION", "--lens", "--limit-px"}
 
 
