@@ -72,11 +72,12 @@ def _scale(name: str) -> str:
 
 def scales(evidence: Evidence) -> Iterator[Evidence]:
     """Yield the evidence of a plane, then that of its means of 2 x 2 samples, and of 4 x 4, if it is large enough."""
-    for _ in PREFIXES:
-        yield evidence
+    yield evidence
+    for _ in PREFIXES[1:]:
         if min(evidence.pilot.shape) < 2 * _LEAST_SIDE:
             break
         evidence = halved(evidence)
+        yield evidence
 
 
 def halved(evidence: Evidence) -> Evidence:
