@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.recon.likelihood.images import Image, sums_of_four
+from faintfield.recon.likelihood.images import Image
 from faintfield.recon.prior.evidence import Evidence, Noise
 from faintfield.recon.threads import map_in_threads
 
@@ -20,8 +20,9 @@ _LEAST_SIDE = 32
 # Rows of a strip that a thread interpolates.
 _STRIP = 128
 
-# Covariance of the sums of two neighbouring samples, of lags −1, 0 and 1 within and between them.
-_PAIRS = np.outer([1, 2, 1], [1, 2, 1])
+# Weights of the four samples along each axis of which a mean is made: the noise of neighbouring means then correlates
+# by a quarter, as that of samples does where views fall on all phases, and as the network has learned.
+_WEIGHTS = np.array([1, 6, 6, 1]) / 14
 
 
 class Candidates(Protocol):
@@ -81,19 +82,19 @@ def scales(evidence: Evidence) -> Iterator[Evidence]:
 
 
 def halved(evidence: Evidence) -> Evidence:
-    """Return the evidence of means of 2 x 2 samples, weighted by how well each is seen."""
-    coverage = sums_of_four(evidence.coverage)
+    """Return the evidence of means of about 2 x 2 samples, weighted by how well each is seen."""
+    coverage = _weighted(evidence.coverage)
 
     def mean(picture: Image) -> Image:
-        sums = sums_of_four(evidence.coverage * picture)
+        sums = _weighted(evidence.coverage * picture)
         return np.divide(sums, coverage, out=sums, where=coverage > 0)
 
     variance = evidence.noise.variance
     seen = np.isfinite(variance)
-    count = sums_of_four(seen.astype(np.float32))
+    count = _weighted(seen.astype(np.float32))
     share, kernel = _noise_of_means(evidence.noise.kernel)
     of_mean = np.full(count.shape, np.inf, np.float32)
-    np.divide(np.float32(share) * sums_of_four(np.where(seen, variance, 0)), count, out=of_mean, where=count > 0)
+    np.divide(np.float32(share) * _weighted(np.where(seen, variance, 0)), count, out=of_mean, where=count > 0)
     others = evidence.other_colours
     return Evidence(
         mean(evidence.picture),
@@ -105,10 +106,22 @@ def halved(evidence: Evidence) -> Evidence:
 
 
 def _noise_of_means(kernel: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-    """Return the variance of a mean of 2 x 2 samples of variance one, and the correlation (3, 3) of such means."""
-    around = np.lib.stride_tricks.sliding_window_view(np.pad(kernel, 2), (3, 3))[::2, ::2]
-    covariance = np.einsum("ijkl,kl->ij", around, _PAIRS) / 16
+    """Return the variance of a mean of samples of variance one, and the correlation (3, 3) of neighbouring means."""
+    lags = np.convolve(_WEIGHTS, _WEIGHTS)
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(kernel, 4), (7, 7))[::2, ::2]
+    covariance = np.einsum("ijkl,k,l->ij", around, lags, lags)
     return float(covariance[1, 1]), covariance / covariance[1, 1]
+
+
+def _weighted(picture: Image) -> Image:
+    """Return the weighted sums of samples around every second corner, of those that there are."""
+    for axis in (0, 1):
+        lines = np.moveaxis(picture, axis, 0)
+        around = np.pad(lines, ((1, 1 + len(lines) % 2), (0, 0)))
+        sums = np.float32(_WEIGHTS[1]) * (around[1:-1:2] + around[2::2])
+        sums += np.float32(_WEIGHTS[0]) * (around[:-3:2] + around[3::2])
+        picture = np.moveaxis(sums, 0, axis)
+    return np.ascontiguousarray(picture)
 
 
 def _raised(picture: Image, pilots: Sequence[Image]) -> Image:

@@ -3,7 +3,6 @@
 from collections.abc import Collection
 
 import numpy as np
-import pytest
 
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.prior.evidence import Evidence, Noise
@@ -20,48 +19,57 @@ def evidence_of(shape: tuple[int, int], seed: int = 1) -> Evidence:
 
 
 def averaging_matrix(shape: tuple[int, int]) -> Image:
-    """Means of 2 x 2 samples as a matrix."""
-    rows, columns = shape
-    matrix = np.zeros((rows // 2, columns // 2, rows, columns))
-    for row, column in np.ndindex(rows // 2, columns // 2):
-        matrix[row, column, 2 * row : 2 * row + 2, 2 * column : 2 * column + 2] = 1 / 4
-    return matrix.reshape(rows // 2 * (columns // 2), rows * columns)
+    """Weights of samples in means, before they are divided by their sums: 1, 6, 6 and 1 along both axes."""
+    along = []
+    for length in shape:
+        matrix = np.zeros((-(-length // 2), length + 3))
+        for mean in range(len(matrix)):
+            matrix[mean, 2 * mean : 2 * mean + 4] = np.array([1, 6, 6, 1]) / 14
+        along.append(matrix[:, 1 : length + 1])
+    return np.asarray(np.einsum("ik,jl->ijkl", *along))
 
 
 def test_noise_of_means_follows_from_covariance() -> None:
-    shape = (8, 8)
+    shape = (12, 12)
     covariance = np.zeros((*shape, *shape))
     for row, column in np.ndindex(shape):
         for down, right in np.ndindex(3, 3):
             other = row + down - 1, column + right - 1
-            if 0 <= other[0] < 8 and 0 <= other[1] < 8:
+            if 0 <= other[0] < 12 and 0 <= other[1] < 12:
                 covariance[row, column, *other] = 4 * KERNEL[down, right]
-    matrix = averaging_matrix(shape)
-    expected = (matrix @ covariance.reshape(64, 64) @ matrix.T).reshape(4, 4, 4, 4)
+    matrix = averaging_matrix(shape).reshape(36, 144)
+    expected = (matrix @ covariance.reshape(144, 144) @ matrix.T).reshape(6, 6, 6, 6)
     noise = halved(evidence_of(shape)).noise
-    np.testing.assert_allclose(noise.variance, np.einsum("ijij->ij", expected), rtol=1e-6)
-    around = expected[1, 1, :3, :3]
+    inner = (slice(1, -1), slice(1, -1))
+    np.testing.assert_allclose(noise.variance[inner], np.einsum("ijij->ij", expected)[inner], rtol=1e-6)
+    around = expected[2, 2, 1:4, 1:4]
     np.testing.assert_allclose(noise.kernel, around / around[1, 1], atol=1e-12)
 
 
+def test_noise_of_means_correlates_as_that_of_samples() -> None:
+    along = np.array([0.25, 1, 0.25])
+    evidence = evidence_of((16, 16))
+    evidence = evidence._replace(noise=evidence.noise._replace(kernel=np.outer(along, along)))
+    for coarse in (halved(evidence), halved(halved(evidence))):
+        np.testing.assert_allclose(coarse.noise.kernel, np.outer(along, along), atol=0.01)
+
+
 def test_means_count_each_sample_as_it_is_seen() -> None:
-    evidence = evidence_of((5, 6))
+    evidence = evidence_of((9, 8))
     evidence.coverage[:2, :2] = [[0, 2], [1, 1]]
-    evidence.coverage[2:4, 2:4] = 0
+    evidence.coverage[4:, 2:] = 0
     evidence.noise.variance[evidence.coverage == 0] = np.inf
     coarse = halved(evidence)
-    assert coarse.coverage.shape == (3, 3)
-    assert coarse.other_colours is not None
-    assert evidence.other_colours is not None
-    for fine, mean in (
-        (evidence.picture, coarse.picture),
-        (evidence.pilot, coarse.pilot),
-        (evidence.other_colours, coarse.other_colours),
-    ):
-        assert mean[0, 0] == pytest.approx((2 * fine[0, 1] + fine[1, 0] + fine[1, 1]) / 4)
-        assert mean[2, 2] == pytest.approx(np.average(fine[4, 4:], weights=evidence.coverage[4, 4:]), rel=1e-6)
-        assert mean[1, 1] == 0
-    assert np.isinf(coarse.noise.variance) == pytest.approx(coarse.coverage == 0)
+    weights = averaging_matrix((9, 8)) * evidence.coverage
+    sums = weights.sum(axis=(2, 3))
+    assert (sums == 0).any()
+    np.testing.assert_allclose(coarse.coverage, sums, rtol=1e-6)
+    for name in ("picture", "pilot", "other_colours"):
+        expected = np.einsum("ijkl,kl->ij", weights, getattr(evidence, name)) / np.where(sums > 0, sums, 1)
+        np.testing.assert_allclose(getattr(coarse, name), expected, rtol=1e-5, err_msg=name)
+    np.testing.assert_array_equal(np.isinf(coarse.noise.variance), sums == 0)
+    share = coarse.noise.variance[1, 1] / 4
+    np.testing.assert_allclose(coarse.noise.variance[sums > 0], 4 * share, rtol=1e-6)
 
 
 def test_candidates_of_means_change_pilot_between_samples_linearly() -> None:
