@@ -92,9 +92,9 @@ def reconstruct(
         I/N: make only every N-th plane from the I-th on, and no report, as one of N jobs of a cluster that write to the
         same OUT at the same time. When all have ended, the same command without --part puts the sweep together.
     """
-    from faintfield.pipelines.workflows.reconstruct import reconstruct_folder
+    from faintfield.pipelines.workflows.reconstruct import parse_part, reconstruct_folder
 
-    return reconstruct_folder(set_path, out, options, geometry, scene, part)
+    return reconstruct_folder(set_path, out, options, geometry, scene, None if part is None else parse_part(part))
 
 
 def report(directory: Path, /) -> dict[str, str]:

@@ -33,7 +33,7 @@ def reconstruct_folder(
     options: Options,
     geometry: Path | None = None,
     scene: SceneKind = "dark_scene",
-    part: str | None = None,
+    part: Part | None = None,
 ) -> Outcome:
     """Reconstruct what the options ask of a set or session, and write the report; or a part of the planes only.
 
@@ -41,7 +41,6 @@ def reconstruct_folder(
     the results is known.
     """
     check_exists(folder)
-    wanted = None if part is None else parse_part(part)
     if options.surface and (of_planes := options.given(OF_PLANES)):
         raise WrongUsage(
             f"--surface makes one picture at all depths, and {' and '.join(of_planes)} would have no effect; leave it "
@@ -49,29 +48,29 @@ def reconstruct_folder(
         )
     surface = select_surface(options)
     if surface is not None:
-        if wanted:
+        if part:
             raise WrongUsage("--surface makes one picture, which has no --part; leave one out")
         elemental_set, page_in = open_set(folder, out, scene, geometry)
         out = out or page_in / SURFACE_FOLDER
         return surface_and_report(elemental_set, out, surface, page_in=page_in)
     runner = make_runner(options.workers, options.scheduler)
     planes = select_planes(options)
-    if wanted and (together := [method for method in planes.methods if method in JOINT_METHODS]):
-        raise WrongUsage(f"{together[0]} solves all planes together, which have no --part; leave one out")
+    if part and (joint := [method for method in planes.methods if method in JOINT_METHODS]):
+        raise WrongUsage(f"{joint[0]} solves all planes together, which have no --part; leave one out")
     elemental_set, out = open_set(folder, out, scene, geometry)
     # Before depths are searched
-    if wanted is None:
+    if part is None:
         check_results_folder(out)
     elif planes.auto or planes.auto_sweep:
         inform("each part searches the depths again; give those that one search finds to save that time")
     if options.depth_map:
         refuse_surfaces(folder_of_method(out, method, planes.methods) for method in planes.methods)
     request = resolve(planes, elemental_set, out)
-    if wanted is None:
+    if part is None:
         return reconstruct_and_report(elemental_set, out, request, runner)
     # One process for each part, whose name a killed one leaves behind for the next whole command to remove
-    with shared(out), exclusive(out / f".part_{wanted.number}_of_{wanted.count}{UNFINISHED}"):
-        return reconstruct_part(elemental_set, out, request, wanted, runner)
+    with shared(out), exclusive(out / f".part_{part.number}_of_{part.count}{UNFINISHED}"):
+        return reconstruct_part(elemental_set, out, request, part, runner)
 
 
 def parse_part(text: str) -> Part:

@@ -109,11 +109,11 @@ def best_mixture(scores: Scores, allowed: Sequence[int] | None = None) -> NDArra
 
 
 def mixtures_of(
-    names: Sequence[str], totals: dict[str, Scores], *, spared: Callable[[str], bool] | None = None
+    names: Sequence[str], totals: dict[str, Scores], *, is_slow: Callable[[str], bool] | None = None
 ) -> dict[str, dict[str, float]]:
     """Return the weights of candidates by region and name; those that hardly help anywhere need not be made.
 
-    `spared` names those that should help more than a little to be made.
+    `is_slow` tells candidates that are to be made only if together they help more than a little.
     """
 
     def of(allowed: Sequence[int]) -> tuple[float, dict[str, NDArray[np.float64]]]:
@@ -123,8 +123,8 @@ def mixtures_of(
     (of_first, _), (least, weights) = of([0]), of(range(len(names)))
     allowed = list(range(len(names)))
     gain = of_first - least
-    costly = {number for number in allowed[1:] if spared is not None and spared(names[number])}
-    for left_out, most in [(costly, _SMALL), *(({number}, _NEGLIGIBLE) for number in reversed(allowed[1:]))]:
+    slow = {number for number in allowed[1:] if is_slow is not None and is_slow(names[number])}
+    for left_out, most in [(slow, _SMALL), *(({number}, _NEGLIGIBLE) for number in reversed(allowed[1:]))]:
         fewer = [number for number in allowed if number not in left_out]
         loss, without = of(fewer)
         if loss - least <= most * gain:
@@ -199,8 +199,8 @@ def propose(
             names, found = _fold_scores(part, penalty_weight, level_e, number, candidates)
             for total, more in zip(totals, found, strict=True):
                 total.update({name: total[name] + new if name in total else new for name, new in more.items()})
-    spared = is_of_samples if len(parts) > 1 else None
-    mixtures = [mixtures_of(names, of_regions, spared=spared) for of_regions in totals]
+    is_slow = is_of_samples if len(parts) > 1 else None
+    mixtures = [mixtures_of(names, of_regions, is_slow=is_slow) for of_regions in totals]
     planes = zip(operator.planes_of(samples), evidences, regions, mixtures, strict=True)
     return [
         PlaneProposal(

@@ -212,6 +212,6 @@ def test_fewest_win_where_mixtures_predict_alike() -> None:
 def test_slow_candidates_that_help_little_get_no_weight(error: float, is_made: bool) -> None:
     """Errors are independent; without the slow candidate 16 or 4 % of the gain over the first are lost."""
     independent = Scores(np.diag([4.0, error**2, 1.0]), np.zeros(3))
-    mixture = mixtures_of(["tv", "slow", "half"], {"light": independent}, spared=lambda name: name == "slow")["light"]
+    mixture = mixtures_of(["tv", "slow", "half"], {"light": independent}, is_slow=lambda name: name == "slow")["light"]
     inverse = np.array([0.25, error**-2 if is_made else 0.0, 1.0])
     np.testing.assert_allclose(list(mixture.values()), inverse / inverse.sum(), atol=1e-9)
