@@ -42,7 +42,7 @@ class CandidatesOfScales:
     Attributes
     ----------
     makers : sequence of callable
-        What makes the candidates of each scale. The first candidate of each is its pilot.
+        Functions that make the candidates of each scale. The first candidate of each is its pilot.
     """
 
     makers: Sequence[Candidates]
