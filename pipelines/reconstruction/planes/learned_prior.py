@@ -19,7 +19,7 @@ _FILE = "networks/plane_prior.onnx"
 
 # The network halves its pictures three times; tiles and margins are multiples of that, too. What is farther from a
 # sample than the margin hardly changes it. Margins are computed twice, but larger tiles take more memory.
-_MULTIPLE, _TILE, _MARGIN = 8, 640, 24
+_MULTIPLE, _TILE, _MARGIN = 8, 320, 24
 
 # One side has errors 1 to 4 % larger than four, two sides 0.2 to 0.7 %.
 _SIDES = 2
