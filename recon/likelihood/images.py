@@ -132,16 +132,6 @@ def binned(maps: NDArray[Any], bins: int) -> NDArray[Any]:
     return np.asarray(whole.reshape(*maps.shape[:-2], rows, bins, columns, bins).mean(axis=(-3, -1)))
 
 
-def sums_of_four(picture: Image) -> Image:
-    """Return the sums of 2 x 2 samples of a picture (row, column); at an odd edge, of those that there are."""
-    rows, columns = picture.shape
-    padded = np.pad(picture, ((0, rows % 2), (0, columns % 2))) if rows % 2 or columns % 2 else picture
-    sums: Image = padded[::2, ::2] + padded[1::2, ::2]
-    sums += padded[::2, 1::2]
-    sums += padded[1::2, 1::2]
-    return sums
-
-
 def select_likelihood(
     images: ElementalImages, name: LikelihoodName | Literal["auto"], level_e: float
 ) -> PixelLikelihood:

@@ -192,6 +192,7 @@ def propose(
     operator = problem.operator
     regions = regions or regions_of_planes(operator, samples, evidences)
     level_e = mean_light_e(operator, samples)
+    names: list[list[str]] = []
     totals: list[dict[str, Scores]] = [{} for _ in evidences]
     parts = _parts(problem, samples, evidences, regions, other_colours)
     for part in parts:
@@ -200,7 +201,7 @@ def propose(
             for total, more in zip(totals, found, strict=True):
                 total.update({name: total[name] + new if name in total else new for name, new in more.items()})
     is_slow = is_of_samples if len(parts) > 1 else None
-    mixtures = [mixtures_of(names, of_regions, is_slow=is_slow) for of_regions in totals]
+    mixtures = [mixtures_of(*of_plane, is_slow=is_slow) for of_plane in zip(names, totals, strict=True)]
     planes = zip(operator.planes_of(samples), evidences, regions, mixtures, strict=True)
     return [
         PlaneProposal(
@@ -278,8 +279,8 @@ def regions_of(plane: Image, evidence: Evidence) -> Regions:
 
 def _fold_scores(
     part: _Part, penalty_weight: float, level_e: float, number: int, candidates: Candidates
-) -> tuple[list[str], list[dict[str, Scores]]]:
-    """Return the names of the candidates, and their scores from the training views of a fold, by plane and region."""
+) -> tuple[list[list[str]], list[dict[str, Scores]]]:
+    """Return the names of each plane's candidates, and their scores from the training views of a fold, by region."""
     problem, fold = part.problem, Fold(part.problem, Penalty(), number, level_e)
     planes = fold.solve(penalty_weight, part.samples, problem.dual()).plane
     training, validation = fold.training, fold.validation
@@ -290,12 +291,13 @@ def _fold_scores(
         )
         for views, others in ((training, part.other_colours), (validation, None))
     )
-    found = []
+    names, found = [], []
     for evidence, truth, regions in zip(known, truths, part.regions, strict=True):
         made = candidates(evidence)
         pictures = list(made.values())
+        names.append(list(made))
         found.append({n: scores(pictures, truth.picture, truth.coverage * share) for n, share in regions.items()})
-    return list(made), found
+    return names, found
 
 
 def _sharpened(mixed: Image, plane: Image, evidence: Evidence) -> Image:

@@ -3,8 +3,9 @@
 That is `min ½ Σ w (x − v)² + β Σ φ(|∇(x − x̂)|)` over x ≥ 0, with a proposal x̂ that is zero unless given.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -12,7 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.recon.likelihood.images import Image, sums_of_four
+from faintfield.recon.likelihood.images import Image
 from faintfield.recon.solver import proximal_kernels
 from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.threads import run_in_threads
@@ -23,8 +24,6 @@ _STEPS_PER_EXCHANGE, _MIN_STRIP_ROWS = 20, 64
 
 # Columns of a tile of a strip, about: the rows in work of wider ones do not stay in the cache.
 _TILE_COLUMNS = 1024
-
-_ALL = slice(None)
 
 # The gap is measured after this share of the steps so far, at least after one exchange.
 _CHECK_SHARE = 0.1
@@ -90,10 +89,10 @@ class DualField:
             strict=True,
         ):
             if min(v.shape) >= 2 * _COARSEST:
-                coarse_w = sums_of_four(w)
+                coarse_w = _sums_of_four(w)
                 coarse = DualField.zero([coarse_w.shape], v.dtype)
-                coarse.proposal, coarse.workers = (sums_of_four(x[0]) / v.dtype.type(4) if x else None), self.workers
-                problem = sums_of_four(w * v) / coarse_w, coarse_w, 2 * weight, penalty
+                coarse.proposal, coarse.workers = (_sums_of_four(x[0]) / v.dtype.type(4) if x else None), self.workers
+                problem = _sums_of_four(w * v) / coarse_w, coarse_w, 2 * weight, penalty
                 coarse.begin_coarse(*problem, gap)
                 coarse.prox(*problem, lambda _: gap, _MAX_COARSE_STEPS)
                 _interpolate_edges(coarse.vectors[0], vectors)
@@ -182,22 +181,25 @@ class _PrimalDual:
 
     def advance(self) -> None:
         for _ in range(max(round(_CHECK_SHARE * self.steps / _STEPS_PER_EXCHANGE), 1)):
-            arguments = *self._changed, *self._fixed, *self._next_steps()
             # Neighbours change their rows and columns while a tile is in work
-            reach = _STEPS_PER_EXCHANGE
-            above = {first: self._copied(slice(max(first - reach, 0), first)) for first in self._edges}
-            below = {stop: self._copied(slice(stop, stop + reach)) for stop in self._edges}
-            before = {left: self._copied(_ALL, slice(max(left - reach, 0), left)) for left in self._column_edges}
-            behind = {right: self._copied(_ALL, slice(right, right + reach)) for right in self._column_edges}
-
-            def step(strip: tuple[int, int]) -> None:
-                rows = above[strip[0]], below[strip[1]]  # noqa: B023
-                for left, right in pairwise(self._column_edges):
-                    columns = before[left], behind[right]  # noqa: B023
-                    proximal_kernels.step_tile(*strip, left, right, *rows, *columns, *arguments)  # noqa: B023
-
+            rows = {row: self._beside(row, 0) for row in self._edges}
+            columns = {column: self._beside(column, 1) for column in self._column_edges}
+            step = partial(self._step_strip, self._next_steps(), rows, columns)
             run_in_threads(step, list(pairwise(self._edges)))
             self.steps += _STEPS_PER_EXCHANGE
+
+    def _step_strip(
+        self,
+        steps: tuple[NDArray[np.float64], NDArray[np.float64]],
+        rows: Mapping[int, tuple[Image, Image]],
+        columns: Mapping[int, tuple[Image, Image]],
+        strip: tuple[int, int],
+    ) -> None:
+        """Make steps on a strip tile by tile, given what lies before and after each of its edges."""
+        first, stop = strip
+        for left, right in pairwise(self._column_edges):
+            around = rows[first][0], rows[stop][1], columns[left][0], columns[right][1]
+            proximal_kernels.step_tile(first, stop, left, right, *around, *self._changed, *self._fixed, *steps)
 
     def gap(self) -> float:
         """Return the gap relative to the weight."""
@@ -214,10 +216,26 @@ class _PrimalDual:
             self._length *= float(momenta[n])
         return lengths, momenta
 
-    def _copied(self, rows: slice, columns: slice = _ALL) -> Image:
-        """Return a copy (4, row, column) of a part of p, x and x ahead, as far as the plane has it."""
+    def _beside(self, edge: int, axis: int) -> tuple[Image, Image]:
+        """Return copies (4, row, column) of p, x and x ahead before and after an edge, as far as the plane has them."""
         vectors, *planes = self._changed
-        return np.concatenate([vectors[:, rows, columns], *(plane[None, rows, columns] for plane in planes)])
+        before, after = slice(max(edge - _STEPS_PER_EXCHANGE, 0), edge), slice(edge, edge + _STEPS_PER_EXCHANGE)
+
+        def copied(part: slice) -> Image:
+            at = (part, slice(None)) if axis == 0 else (slice(None), part)
+            return np.stack([array[at] for array in (*vectors, *planes)])
+
+        return copied(before), copied(after)
+
+
+def _sums_of_four(picture: Image) -> Image:
+    """Return the sums of 2 x 2 samples of a picture (row, column); at an odd edge, of those that there are."""
+    rows, columns = picture.shape
+    padded = np.pad(picture, ((0, rows % 2), (0, columns % 2))) if rows % 2 or columns % 2 else picture
+    sums: Image = padded[::2, ::2] + padded[1::2, ::2]
+    sums += padded[::2, 1::2]
+    sums += padded[1::2, 1::2]
+    return sums
 
 
 def _interpolate_edges(coarse: Image, fine: Image) -> None:

@@ -60,17 +60,8 @@ def step_tile(
                 _load(below, front - stop, west, east, 0, p[k], x[k], x_ahead[k])
             else:
                 _load(before, front, 0, inner, 0, p[k], x[k], x_ahead[k])
+                _load_own(dual, plane, ahead, front, left, right, inner, p[k], x[k], x_ahead[k])
                 _load(behind, front, 0, columns - after, after, p[k], x[k], x_ahead[k])
-                _copy_row(
-                    dual[0, front, left:right],
-                    dual[1, front, left:right],
-                    plane[front, left:right],
-                    ahead[front, left:right],
-                    p[k, 0, 1 + inner :],
-                    p[k, 1, 1 + inner :],
-                    x[k, inner:],
-                    x_ahead[k, inner:],
-                )
             x_ahead[k, columns] = x_ahead[k, columns - 1]
         for step in range(count):
             row = front - 1 - step
@@ -92,16 +83,7 @@ def step_tile(
         row = front - count
         if first <= row < stop:
             k = row % kept
-            _copy_row(
-                p[k, 0, 1 + inner : 1 + after],
-                p[k, 1, 1 + inner : 1 + after],
-                x[k, inner:after],
-                x_ahead[k, inner:after],
-                dual[0, row, left:],
-                dual[1, row, left:],
-                plane[row, left:],
-                ahead[row, left:],
-            )
+            _store(p[k], x[k], x_ahead[k], inner, after, row, left, dual, plane, ahead)
 
 
 @compiled
@@ -116,6 +98,36 @@ def _load(rows, row, begin, end, to, p, x, x_ahead):
         p[1, 1 + to :],
         x[to:],
         x_ahead[to:],
+    )
+
+
+@compiled
+def _load_own(dual, plane, ahead, row, left, right, to, p, x, x_ahead):
+    """Copy the columns of a tile to a row in work, from its column `to` on."""
+    _copy_row(
+        dual[0, row, left:right],
+        dual[1, row, left:right],
+        plane[row, left:right],
+        ahead[row, left:right],
+        p[0, 1 + to :],
+        p[1, 1 + to :],
+        x[to:],
+        x_ahead[to:],
+    )
+
+
+@compiled
+def _store(p, x, x_ahead, begin, end, row, left, dual, plane, ahead):
+    """Copy columns of a row in work back to a tile, whose first column is `left`."""
+    _copy_row(
+        p[0, 1 + begin : 1 + end],
+        p[1, 1 + begin : 1 + end],
+        x[begin:end],
+        x_ahead[begin:end],
+        dual[0, row, left:],
+        dual[1, row, left:],
+        plane[row, left:],
+        ahead[row, left:],
     )
 
 

@@ -18,7 +18,7 @@ from faintfield.recon.prior.evidence import Evidence, Misfit, evidence_of_planes
 from faintfield.recon.prior.proposal import Scores, best_mixture, mixtures_of, propose, scores
 from faintfield.recon.solver import penalty_weight
 from faintfield.recon.solver.data_fit import SceneProblem
-from tests.recon.displaced import dark_views, pieces
+from tests.recon.displaced import dark_views, noisy_images, pieces, planes_displaced_by
 from tests.recon.operator_contract import dense_matrix
 
 
@@ -215,3 +215,21 @@ def test_slow_candidates_that_help_little_get_no_weight(error: float, is_made: b
     mixture = mixtures_of(["tv", "slow", "half"], {"light": independent}, is_slow=lambda name: name == "slow")["light"]
     inverse = np.array([0.25, error**-2 if is_made else 0.0, 1.0])
     np.testing.assert_allclose(list(mixture.values()), inverse / inverse.sum(), atol=1e-9)
+
+
+def test_planes_may_have_different_candidates() -> None:
+    """As where one of two planes is smaller than a patch."""
+    generator = np.random.default_rng(8)
+    operator = planes_displaced_by([*generator.uniform(-2, 2, (2, 12, 2))], (24, 24))
+    samples = np.concatenate([5 * pieces(24).ravel(), 0 * pieces(24).ravel()]).astype(np.float32)
+    images = noisy_images(operator, samples, 0.0, 4.0, generator)
+    problem = Objective.of(SceneProblem(operator, images), SolverOptions()).posed
+
+    def more_where_bright(evidence: Evidence, names: Collection[str] | None = None) -> dict[str, Image]:
+        made = {"tv": evidence.pilot, "same": evidence.pilot}
+        return made if evidence.pilot.mean() > 1 else {"tv": evidence.pilot}
+
+    evidences = evidence_of_planes(operator, images, samples)
+    bright, dark = propose(problem, samples, evidences, 1.0, more_where_bright)
+    assert {tuple(weights) for weights in bright.mixture.values()} == {("tv", "same")}
+    assert {tuple(weights) for weights in dark.mixture.values()} == {("tv",)}
