@@ -1,8 +1,9 @@
-"""Raw Bayer frames of any size, the whole way: `python -m benchmarks.speed.full_frame --mpx 1 6 24`.
+"""Raw Bayer frames of any size, the whole way: `python -m benchmarks.speed.full_frame --mpx 1 6 24 --prior tv auto`.
 
 Frames of a picture on one plane are made by OpenCV's warp, without the operator that is measured; then `faintfield`
-reconstructs them as a user would. Printed for each size: seconds, CPU seconds and peak memory of each command, and its
-seconds over those in which one core copies the frames' bytes.
+reconstructs them as a user would. Printed for each size and number of views, as a JSON object a line: seconds, CPU
+seconds and peak memory of each command, and those of its stages; the bytes of the images that its passes read, over
+those that reading alone would have moved meanwhile; then exponents of growth, with pixels and with views.
 """
 
 import argparse
@@ -13,10 +14,11 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
-from itertools import pairwise
+from itertools import pairwise, product
+from operator import attrgetter
 from pathlib import Path
 
 import cv2
@@ -24,6 +26,7 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
+from benchmarks.speed.passes import reading
 from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSetFile, Noise, View, write_set
 from faintfield.rig.plan import grid_nodes, nominal_poses_rt_cam_ref
 
@@ -38,26 +41,32 @@ _LIGHT_E = (0.6, 1.0, 0.5)
 
 
 @dataclass(frozen=True)
-class Stage:
+class Cost:
     """Cost of a command.
 
     Attributes
     ----------
-    name : str
-        The command.
+    mpx, views, name : float, int, str
+        Megapixels of a frame, number of views, and the command.
     seconds, cpu_seconds : float
         Elapsed, and of all threads.
     peak_mb : float
         Largest resident memory, memory maps included.
-    over_copying : float
-        Seconds over those of one core that copies the bytes of all frames.
+    passes_over_reading : float
+        Time of the passes over the data after the choice of the weight, over that in which all threads would read the
+        images as often.
+    stages : dict of str to list of float
+        Seconds and CPU seconds of each stage.
     """
 
+    mpx: float
+    views: int
     name: str
     seconds: float
     cpu_seconds: float
     peak_mb: float
-    over_copying: float
+    passes_over_reading: float
+    stages: dict[str, list[float]]
 
 
 def make_set(folder: Path, mpx: float, views: int = 49, seed: int = 1) -> float:
@@ -154,61 +163,78 @@ def _frame(
     return np.clip(np.rint(electrons * _GAIN_DN_PER_E + _OFFSET_DN), 0, 16383).astype(np.uint16)
 
 
-def measured(name: str, arguments: list[str], copying_s: float) -> Stage:
-    """Run a command of faintfield and return what it took."""
+def run_command(arguments: list[str], stages: Path) -> tuple[float, float, float]:
+    """Run a command of faintfield, write its stages, and return seconds, CPU seconds and peak memory in MB."""
     started = time.perf_counter()
-    process = subprocess.Popen([str(Path(sys.executable).with_name("faintfield")), *arguments])
+    process = subprocess.Popen([sys.executable, "-m", "benchmarks.speed.stages", str(stages), *arguments])
     _, status, usage = os.wait4(process.pid, 0)
     seconds = time.perf_counter() - started
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode != 0:
         raise subprocess.CalledProcessError(process.returncode, arguments)
-    return Stage(name, seconds, usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024 / 1e6, seconds / copying_s)
+    return seconds, usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024 / 1e6
 
 
-def copying_s(size: float) -> float:
-    """Return the time in which one core copies so many bytes: the least of five copies of a part of them."""
-    source = np.ones(2**25, np.float32)
-    target, times = np.empty_like(source), []
+def bandwidth() -> float:
+    """Return the bytes per second that all threads read together: the most in five readings of half a gigabyte."""
+    images = np.ones(2**27, np.float32)
+    read, times = reading(images), []
     for _ in range(6):
         started = time.perf_counter()
-        np.copyto(target, source)
+        read()
         times.append(time.perf_counter() - started)
-    return min(times[1:]) * size / source.nbytes
+    return images.nbytes / min(times[1:])
 
 
-def stages(mpx: float, views: int, depths: int, prior: str, where: Path | None) -> Iterator[Stage]:
+def costs(mpx: float, views: int, arguments: argparse.Namespace) -> Iterator[Cost]:
     """Make a set, reconstruct it, and yield what each command took."""
-    with tempfile.TemporaryDirectory(dir=where) as folder:
-        made = Path(folder) / "set"
-        copying = copying_s(make_set(made, mpx, views))
-        wanted = [str(_DEPTH_MM + 20.0 * n) for n in range(depths)]
-        options = [part for depth in wanted for part in ("--depth-mm", depth)]
-        out = str(Path(folder) / "planes")
-        first = ["reconstruct", str(made), "--depth-mm", wanted[0], "--method", "backprojection", "--out", f"{out}0"]
-        yield measured("read, back-project, report", first, copying)
-        last = ["reconstruct", str(made), *options, "--prior", prior, "--out", out]
-        yield measured(f"reconstruct {depths} depth(s), {prior}", last, copying)
+    speed = bandwidth()
+    with tempfile.TemporaryDirectory(dir=arguments.folder) as folder:
+        made, file = Path(folder) / "set", Path(folder) / "stages.json"
+        frame_bytes = make_set(made, mpx, views)
+        wanted = [str(_DEPTH_MM + 20.0 * n) for n in range(arguments.depths)]
+        depths = [part for depth in wanted for part in ("--depth-mm", depth)]
+        commands = {"back-projection": ["--depth-mm", wanted[0], "--method", "backprojection"]}
+        commands |= {prior: [*depths, "--prior", prior] for prior in arguments.prior}
+        for name, options in commands.items():
+            out = Path(folder) / name
+            measured = run_command(["reconstruct", str(made), *options, "--out", str(out)], file)
+            found = {stage["name"]: stage for stage in json.loads(file.read_text(encoding="utf-8"))}
+            stages = {stage: [round(s["seconds"], 2), round(s["cpu_seconds"], 2)] for stage, s in found.items()}
+            # A pass reads one colour, on average a third of the frames, as float32 instead of their 16 bits
+            read_s = found.get("passes", {}).get("calls", 0) * 2 * frame_bytes / 3 / speed
+            yield Cost(mpx, views, name, *measured, stages["passes"][0] / read_s if read_s else 0.0, stages)
+
+
+def exponents(costs: Sequence[Cost]) -> Iterator[dict[str, float | str]]:
+    """Yield how CPU seconds grow from one size to the next, and from one number of views to the next."""
+    for axis, fixed in (("mpx", "views"), ("views", "mpx")):
+        alike: dict[tuple[str, float], list[Cost]] = {}
+        for cost in sorted(costs, key=attrgetter(axis)):
+            alike.setdefault((cost.name, getattr(cost, fixed)), []).append(cost)
+        for (name, value), line in alike.items():
+            for small, large in pairwise(line):
+                least, most = getattr(small, axis), getattr(large, axis)
+                exponent = math.log(large.cpu_seconds / small.cpu_seconds) / math.log(most / least)
+                yield {"name": name, fixed: value, f"from_{axis}": least, f"to_{axis}": most, "exponent": exponent}
 
 
 def main() -> None:
-    """Print a line for each command and size, then exponents of growth; with --json, one object a line."""
+    """Print a line for each command, then exponents of growth."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--mpx", type=float, nargs="+", default=[1.0, 6.0, 24.0], help="megapixels of the detector")
-    parser.add_argument("--views", type=int, default=49, help="elemental images, at most 49")
+    parser.add_argument("--views", type=int, nargs="+", default=[49], help="elemental images, at most 49")
     parser.add_argument("--depths", type=int, default=1, help="number of planes, 20 mm apart")
-    parser.add_argument("--prior", default="tv", help="prior of PMLEM")
+    parser.add_argument("--prior", nargs="+", default=["tv", "auto"], help="priors of PMLEM")
     parser.add_argument("--folder", type=Path, help="where frames are made, for the time of the run")
     arguments = parser.parse_args()
-    seconds: dict[str, list[tuple[float, float]]] = {}
-    for mpx in arguments.mpx:
-        for stage in stages(mpx, arguments.views, arguments.depths, arguments.prior, arguments.folder):
-            print(json.dumps({"mpx": mpx, "views": arguments.views, **asdict(stage)}), flush=True)
-            seconds.setdefault(stage.name, []).append((mpx, stage.cpu_seconds))
-    for name, points in seconds.items():
-        for (small, before), (large, after) in pairwise(points):
-            exponent = math.log(after / before) / math.log(large / small)
-            print(json.dumps({"name": name, "from_mpx": small, "to_mpx": large, "cpu_exponent": exponent}))
+    done: list[Cost] = []
+    for mpx, views in product(arguments.mpx, arguments.views):
+        for cost in costs(mpx, views, arguments):
+            print(json.dumps(asdict(cost)), flush=True)
+            done.append(cost)
+    for exponent in exponents(done):
+        print(json.dumps(exponent))
 
 
 if __name__ == "__main__":

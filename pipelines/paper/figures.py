@@ -44,7 +44,7 @@ from faintfield.pipelines.reconstruction.request import DEFAULT_METHOD, Request
 from faintfield.pipelines.reconstruction.run import Outcome, reconstruct_set
 from faintfield.pipelines.simulation.options import SyntheticOptions
 from faintfield.pipelines.simulation.synthetic_set import NOISE_FREE, write_synthetic_set
-from faintfield.recon.likelihood.images import blurred
+from faintfield.recon.blur import blurred
 
 PAGE_FILE = "figures.html"
 _CURVES_FILE = "figure4_curves.json"

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.recon.likelihood.images import ElementalImages, Image, blurred
+from faintfield.recon.blur import blurred
+from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.scene_operator import SceneOperator
 from faintfield.recon.solver.initialization import back_projection
 

@@ -6,8 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from faintfield.recon.blur import blurred
 from faintfield.recon.depth.agreement import Agreement, DepthEstimate
-from faintfield.recon.likelihood.images import ElementalImages, Image, blurred
+from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.scene_operator import SceneOperator
 from faintfield.recon.operator.single_plane import PlaneOperator
 from faintfield.recon.solver.initialization import back_projection

@@ -1,6 +1,5 @@
 """The data of a reconstruction: the elemental images in electrons, the likelihood of their pixels, bins and a blur."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -172,23 +171,3 @@ def read_noise_share(mean_e: float, read_noise_e: float) -> float:
     score = 1 - np.divide(joint @ counts, density * mean_e, out=np.ones_like(density), where=density > 0)
     information = float(np.sum(density * score**2) / np.sum(density))
     return float(np.clip((1 / information - mean_e) / read_noise_e**2, 0.0, 1.0))
-
-
-# scipy.ndimage has blurs, but would add 20 MB to the memory of every reconstruction.
-def blurred(image: NDArray[np.floating], spacings: Sequence[int]) -> NDArray[np.floating]:
-    """Return an image (row, column) averaged with its neighbours; edges are repeated.
-
-    For each spacing d in turn, every sample becomes the mean of the samples d before it, itself and d after it, with
-    weights ¼, ½ and ¼, along rows and columns. The result is nearly that of a Gaussian of variance `Σ d²/2`.
-    """
-    for spacing in spacings:
-        for axis in (0, 1):
-            along = np.moveaxis(image, axis, 0)
-            half, quarter = along.dtype.type(0.5), along.dtype.type(0.25)
-            mean = half * along
-            mean[spacing:] += quarter * along[:-spacing]
-            mean[:spacing] += quarter * along[:1]
-            mean[:-spacing] += quarter * along[spacing:]
-            mean[-spacing:] += quarter * along[-1:]
-            image = np.moveaxis(mean, 0, axis)
-    return np.ascontiguousarray(image)

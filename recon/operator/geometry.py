@@ -1,7 +1,7 @@
 """The arguments of a scene operator, checked and converted to the arrays that the kernels read: pixels and planes."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -143,9 +143,10 @@ def window_geometry(geometry: SceneGeometry, grid: PlaneGrid, first: tuple[int, 
     ends = (-1, 1) if geometry.bent else ()
     bends = [end * LARGEST_CODE * float(geometry.relief_step) * homographies[views:] for end in ends]
     depths = [homographies[:views] + bend for bend in bends] or [homographies]
+    nodes = [_Nodes.of(rays[:, lattice]) for lattice in range(rays.shape[1])]
     reach = np.zeros((views, rows, 2), np.intp)
     for view, lattice in enumerate(geometry.lattice_of_view.tolist()):
-        found = np.array([_pixels_of(depth[view], grid.shape, rays[:, lattice]) for depth in depths])
+        found = np.array([_pixels_of(depth[view], grid.shape, nodes[lattice]) for depth in depths])
         (top, left), (bottom, right) = found[:, ::2].min(axis=0), found[:, 1::2].max(axis=0)
         reach[view, top:bottom] = left // BLOCK_PX * BLOCK_PX, min(-(-right // BLOCK_PX) * BLOCK_PX, padded)
     return geometry._replace(
@@ -165,17 +166,33 @@ def _advance(homography: NDArray[np.float64], rays: NDArray[Any]) -> int:
     return int(np.clip(np.round(advance), 1, LARGEST_ADVANCE)) if np.isfinite(advance) else 1
 
 
-def _pixels_of(
-    homography: NDArray[np.float64], shape: tuple[int, int], rays: NDArray[Any]
-) -> tuple[int, int, int, int]:
-    """Return ranges of rows and columns that hold all pixels whose rays (2, row, column) meet some samples.
+class _Nodes(NamedTuple):
+    """Nodes of a coarse lattice on a detector of `size_px` (row, column), its last row and column among them.
 
-    Each part of the detector between two nodes of a coarse lattice lies in the range if one of its neighbours does.
+    `rays` (3, row, column) are homogeneous.
     """
-    rows, columns = rays.shape[1:]
-    row_nodes, column_nodes = (np.unique([*range(0, count, _NODE_PX), count - 1]) for count in (rows, columns))
-    x, y = rays[:, row_nodes[:, np.newaxis], column_nodes].astype(np.float64)
-    x, y, scale = np.tensordot(homography, np.stack([x, y, np.ones_like(x)]), 1)
+
+    size_px: tuple[int, int]
+    rows: NDArray[np.intp]
+    columns: NDArray[np.intp]
+    rays: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, rays: NDArray[Any]) -> "_Nodes":
+        """Return the nodes among rays (2, row, column)."""
+        rows, columns = rays.shape[1:]
+        row_nodes, column_nodes = (np.unique([*range(0, count, _NODE_PX), count - 1]) for count in (rows, columns))
+        x, y = rays[:, row_nodes[:, np.newaxis], column_nodes].astype(np.float64)
+        return cls((rows, columns), row_nodes, column_nodes, np.stack([x, y, np.ones_like(x)]))
+
+
+def _pixels_of(homography: NDArray[np.float64], shape: tuple[int, int], nodes: _Nodes) -> tuple[int, int, int, int]:
+    """Return ranges of rows and columns that hold all pixels whose rays meet some samples.
+
+    Each part of the detector between two nodes lies in the range if one of its neighbours does.
+    """
+    rows, columns = nodes.size_px
+    x, y, scale = np.tensordot(homography, nodes.rays, 1)
     with np.errstate(divide="ignore", invalid="ignore"):
         column, row = x / scale, y / scale
     beyond = [np.abs(np.diff(part, axis=axis)).max(initial=0.0) for part in (column, row) for axis in (0, 1)]
@@ -185,7 +202,7 @@ def _pixels_of(
     meets = (column > -reach) & (column < shape[1] + reach) & (row > -reach) & (row < shape[0] + reach)
     if not meets.any():
         return 0, 0, 0, 0
-    met_rows, met_columns = row_nodes[meets.any(axis=1)], column_nodes[meets.any(axis=0)]
+    met_rows, met_columns = nodes.rows[meets.any(axis=1)], nodes.columns[meets.any(axis=0)]
     return int(met_rows[0]), int(met_rows[-1]) + 1, int(met_columns[0]), int(met_columns[-1]) + 1
 
 

@@ -6,8 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from faintfield.recon.blur import blurred
 from faintfield.recon.errors import GeometryMismatch
-from faintfield.recon.likelihood.images import Image, blurred
+from faintfield.recon.likelihood.images import Image
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.kernels import Hiding
 

@@ -7,9 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.recon.likelihood.images import ElementalImages, Image, blurred
+from faintfield.recon.blur import blurred
+from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.scene_operator import SceneOperator, ViewSelection
 from faintfield.recon.solver.initialization import well_seen_samples
+from faintfield.recon.solver.penalty_weight import fold_count, validation_views
 from faintfield.recon.threads import run_in_threads
 
 # Spacings of the blurs of the noise of a draw, which stands in for many draws, and of the number of views.
@@ -23,8 +25,9 @@ _TINY = 1e-30
 # benchmarks/imaging/uncertainty.py.
 _MAX_EXCESS, _MAX_BEYOND_SMOOTH = 0.006, 0.012
 
-# Standard errors that are added to both.
-_SIGMAS = 2.0
+# Standard errors that are added to both, and pixels that are compared at least: so many tell a mean square to a part in
+# a thousand where a tenth of them see detail.
+_SIGMAS, _COMPARED_PIXELS = 2.0, 2**26
 
 
 class Noise(NamedTuple):
@@ -225,14 +228,15 @@ class Misfit(NamedTuple):
 def misfits(
     operator: SceneOperator, images: ElementalImages, samples: Image, regions: Sequence[dict[str, Image]]
 ) -> list[Misfit]:
-    """Return the misfit of each plane of f ≥ 0 (samples, in electrons), in one pass over the data.
+    """Return the misfit of each plane of f ≥ 0 (samples, in electrons), in a pass over the data or a part of them.
 
     `regions` are shares (row, column) of the samples of each plane in "light, detail" and "light, smooth".
     """
     squares, spreads = (np.zeros_like(samples) for _ in range(2))
-    variances = operator.adjoint_of_forward(samples)
-    variances += operator.adjoint_of_map(images.background_e + images.read_variance_e2)
-    for some in _few_views(operator, operator.seeing_views):
+    views = _compared_views(operator)
+    variances = operator.adjoint_of_forward(samples, views)
+    variances += operator.adjoint_of_map(images.background_e + images.read_variance_e2, views)
+    for some in _few_views(operator, views):
         expected = operator.forward(samples, some)
         expected += operator.map_of_views(images.background_e, some)
         spread = expected + operator.map_of_views(images.read_variance_e2, some)
@@ -249,6 +253,17 @@ def misfits(
         spreads += operator.adjoint_of_views(spread, some)
     parts = (operator.planes_of(array) for array in (squares, variances, spreads))
     return [_misfit(*of_plane) for of_plane in zip(*parts, regions, strict=True)]
+
+
+def _compared_views(operator: SceneOperator) -> NDArray[np.intp]:
+    """Return views of enough pixels, in all rows and columns of a grid alike."""
+    views = operator.seeing_views
+    chosen: list[int] = []
+    for fold in range(fold_count(len(views))):
+        chosen.extend(validation_views(len(views), fold))
+        if len(chosen) * np.prod(operator.images_shape[1:]) >= _COMPARED_PIXELS:
+            break
+    return views[sorted(chosen)]
 
 
 def _misfit(squares: Image, variances: Image, spreads: Image, regions: dict[str, Image]) -> Misfit:

@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.recon.likelihood.images import Image, blurred
+from faintfield.recon.blur import blurred
+from faintfield.recon.likelihood.images import Image
 from faintfield.recon.operator.occlusion import opacity
 from faintfield.recon.operator.scene_operator import SceneOperator
 from faintfield.recon.prior.evidence import Evidence, evidence_of_planes
@@ -21,6 +22,7 @@ from faintfield.recon.solver.penalties import Penalty, differences
 from faintfield.recon.solver.penalty_weight import MIN_VIEWS, Fold, folds_to_predict, windows_of
 from faintfield.recon.solver.proximal import DualField
 from faintfield.recon.solver.uncertainty import Answers, Expected, LocalProblem, UsualErrors, Weights
+from faintfield.recon.threads import map_in_threads
 
 # Fewest folds: the choice by one is noisy.
 _MIN_FOLDS = 2
@@ -49,6 +51,9 @@ _WINDOW_SAMPLES, _EDGE = 3 * 2**18, 16
 # candidate is lost at most for each; and for all those of the samples of a large plane, which take three times as long
 # as all those of means of samples.
 _NEGLIGIBLE, _SMALL = 0.001, 0.1
+
+# Rows that a thread mixes at a time: they stay in the cache.
+_STRIP = 32
 
 # Shares (row, column) of each sample that belong to a region, by the region's name; they sum to one.
 type Regions = dict[str, Image]
@@ -326,11 +331,16 @@ def _mixed(
     """Return x̂ ≥ 0: the mixture of candidates, with the edges that total variation's plane has beyond it."""
     used = {name for weights in mixture.values() for name, weight in weights.items() if weight > 0}
     made = candidates(evidence, used)
-    picture = np.zeros_like(evidence.pilot)
-    for region, weights in mixture.items():
-        for name, weight in weights.items():
-            if weight > 0:
-                picture += np.float32(weight) * regions[region] * made[name]
+    picture = np.empty_like(evidence.pilot)
+
+    def mix(strip: slice) -> None:
+        picture[strip] = sum(
+            regions[region][strip]
+            * sum(np.float32(weight) * made[name][strip] for name, weight in weights.items() if weight > 0)
+            for region, weights in mixture.items()
+        )
+
+    map_in_threads(mix, [slice(first, first + _STRIP) for first in range(0, len(picture), _STRIP)])
     return _sharpened(picture, plane, evidence)
 
 

@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.recon.likelihood.images import ElementalImages, Image, blurred
+from faintfield.recon.blur import blurred
+from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.scene_operator import SceneOperator, ViewSelection
 from faintfield.recon.solver.initialization import smooth_start, well_seen_samples
 from faintfield.recon.solver.proximal import DualField

@@ -3,7 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.recon.likelihood.images import ElementalImages, Image, blurred
+from faintfield.recon.blur import blurred
+from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.scene_operator import SceneOperator, ViewSelection
 
 # Spacings of the blur, which has a standard deviation of 2 samples.

@@ -39,9 +39,9 @@ _TOLERANCE, _MAX_PASSES = 0.02, 4
 # Side of a window in samples: what lies beyond its edges is unknown to it, so that it should not be small.
 SIDE = 256
 
-# The windows have this share of the plane's samples together, and at least so many: the darkest scenes, of SNR 0.05,
-# need that many to tell weights that are a quarter apart. A plane less than twice that large stands for itself.
-_SHARE, _MIN_SAMPLES = 1 / 16, 2**20
+# The windows have so many samples together: the darkest scenes, of SNR 0.05, need that many to tell weights that are a
+# quarter apart. A plane less than twice that large stands for itself.
+_WINDOW_SAMPLES = 2**20
 
 
 @dataclass(frozen=True)
@@ -86,13 +86,14 @@ def validation_views(views: int, fold: int = 0) -> NDArray[np.intp]:
 
     Each is three places further on in the next seven: on a grid of seven columns, one in each row and in each column.
     """
-    folds = _folds(views)
+    folds = fold_count(views)
     index = np.arange(views)
     stride = 1 if folds % 3 == 0 else 3
     return np.flatnonzero(index % folds == (stride * (index // folds) + fold) % folds)
 
 
-def _folds(views: int) -> int:
+def fold_count(views: int) -> int:
+    """Return the number of folds that so many views have."""
     return max(2, min(MAX_FOLDS, views // 2))
 
 
@@ -119,7 +120,7 @@ def cross_validated_weight(
     the training views to all views.
     """
     samples = int(np.prod(problem.operator.samples_shape))
-    windows = windows_of(problem, MIN_VIEWS, max(_MIN_SAMPLES, round(_SHARE * samples)), workers=1)
+    windows = windows_of(problem, MIN_VIEWS, _WINDOW_SAMPLES, workers=1)
     if windows:
         # A dark window is solved with the light of the whole plane, as that will be
         folds = map_in_threads(lambda window: Fold(window.problem, penalty, 0, level_e), windows)
@@ -137,8 +138,8 @@ def cross_validated_weight(
 def folds_to_predict(problem: SceneProblem) -> int:
     """Return the number of folds that predict `MIN_SCORED_PIXELS`, or that of all."""
     count = len(problem.operator.seeing_views)
-    pixels_per_fold = problem.images.electrons[0].size * count / _folds(count)
-    return min(int(np.ceil(MIN_SCORED_PIXELS / pixels_per_fold)), _folds(count))
+    pixels_per_fold = problem.images.electrons[0].size * count / fold_count(count)
+    return min(int(np.ceil(MIN_SCORED_PIXELS / pixels_per_fold)), fold_count(count))
 
 
 class Fold:

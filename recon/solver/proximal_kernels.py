@@ -75,11 +75,10 @@ def step_tile(
                 _step_dual(x_ahead[k], x_ahead[next_row], size, one / length, smoothing, bounded, p[k])
                 over = p[(row - 1) % kept] if row > top else over_top
                 v, r = centre[row, west:east], reach[row, west:east]
-                _step_primal(over, p[k], v, r, length, momentum, x[k], x_ahead[k])
                 if origin.size > 0:
-                    for j in range(columns):
-                        x_ahead[k, j] -= origin[row, west + j]
-                    x_ahead[k, columns] = x_ahead[k, columns - 1]
+                    _step_primal(over, p[k], v, r, origin[row, west:east], length, momentum, x[k], x_ahead[k])
+                else:
+                    _step_primal(over, p[k], v, r, None, length, momentum, x[k], x_ahead[k])
         row = front - count
         if first <= row < stop:
             k = row % kept
@@ -154,8 +153,8 @@ def _step_dual(x, below, sizes, scale, smoothing, bounded, p):
 
 
 @compiled
-def _step_primal(above, p, centre, reach, length, momentum, x, ahead):
-    """Make a step on a row of the plane, given p in this row and the one above; set the row ahead, with x̂ = 0."""
+def _step_primal(above, p, centre, reach, origin, length, momentum, x, ahead):
+    """Make a step on a row of the plane, given p in this row and the one above; set the row ahead, less x̂ if any."""
     number = x.dtype.type
     share, zero = number(1) / (number(1) + length), number(0)
     over, down, right, left = above[0, 1:], p[0, 1:], p[1, 1:], p[1, :-1]
@@ -164,7 +163,8 @@ def _step_primal(above, p, centre, reach, length, momentum, x, ahead):
         minimum = centre[j] + reach[j] * (down[j] - over[j] + right[j] - left[j])
         after = max((before + length * minimum) * share, zero)
         x[j] = after
-        ahead[j] = after + momentum * (after - before)
+        beyond = after + momentum * (after - before)
+        ahead[j] = beyond if origin is None else beyond - origin[j]
     ahead[x.size] = ahead[x.size - 1]
 
 

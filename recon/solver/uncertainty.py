@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.recon.likelihood.images import Image, blurred
+from faintfield.recon.blur import blurred
+from faintfield.recon.likelihood.images import Image
 from faintfield.recon.operator.occlusion import opacity
 from faintfield.recon.operator.scene_operator import SceneOperator
 from faintfield.recon.solver.data_fit import DataFit

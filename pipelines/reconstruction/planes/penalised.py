@@ -27,8 +27,9 @@ from faintfield.recon.solver.uncertainty import (
 # Largest number of passes over the data.
 MAX_PASSES = 30
 
-# PMLEM stops when its plane is this close to the optimum: root mean square, relative to the plane.
-_TOLERANCE = 0.01
+# PMLEM stops when its plane is this close to the optimum: root mean square, relative to the plane. A plane from which a
+# prior begins may be farther from it.
+_TOLERANCE, _PILOT_TOLERANCE = 0.01, 0.03
 
 # Seed of the draws by which standard deviations are estimated: the same result every time.
 _SEED = 1
@@ -90,12 +91,32 @@ class Objective:
         return cls(posed, Penalty.for_noise(options.penalty, noise_e), start, level_e, options, other_colours)
 
 
-def solve_pmlem(objective: Objective) -> list[Solution]:
-    """Run PMLEM to its certificate and return the planes; all their records are of the one iteration."""
+def solve_pmlem(objective: Objective, *, as_pilot: bool = False) -> list[Solution]:
+    """Run PMLEM to its certificate and return the planes; all their records are of the one iteration.
+
+    Those from which a prior begins, the pilots, have a certificate of a larger tolerance.
+    """
+    tolerance = _PILOT_TOLERANCE if as_pilot else _TOLERANCE
     weight, start, dual, how = _choose_weight(objective)
-    record, samples = certified(objective, start, weight, dual)
+    record, samples = certified(objective, start, weight, dual, tolerance)
     record = structs.replace(record, **{"passes_before": 1.0, "penalty_weight_curve": None} | how)
     return [Solution(plane, record) for plane in objective.posed.operator.planes_of(samples)]
+
+
+def is_pilot(record: SolveRecord) -> bool:
+    """Return whether a plane was solved only as the start of a prior."""
+    return record.certificate is not None and record.certificate.tolerance == _PILOT_TOLERANCE
+
+
+def with_weight_of(record: SolveRecord, first: SolveRecord) -> SolveRecord:
+    """Return the record of a solution that began from the first: how its weight was chosen, and passes before it."""
+    return structs.replace(
+        record,
+        penalty_weight=first.penalty_weight,
+        penalty_weight_chosen=first.penalty_weight_chosen,
+        penalty_weight_curve=first.penalty_weight_curve,
+        passes_before=(first.passes_before or 0) + first.passes,
+    )
 
 
 def with_sigma(
@@ -116,7 +137,9 @@ def with_sigma(
     return found
 
 
-def certified(objective: Objective, start: Image, weight: float, dual: DualField) -> tuple[SolveRecord, Image]:
+def certified(
+    objective: Objective, start: Image, weight: float, dual: DualField, tolerance: float = _TOLERANCE
+) -> tuple[SolveRecord, Image]:
     """Run PMLEM with a given weight to its certificate; return its record and samples.
 
     The dual field says from where, and from which proposal the penalty counts.
@@ -126,17 +149,17 @@ def certified(objective: Objective, start: Image, weight: float, dual: DualField
         start,
         penalty_weight=weight,
         penalty=objective.penalty,
-        tolerance=_TOLERANCE,
+        tolerance=tolerance,
         dual=dual,
     )
-    iterate = iterate_until(iterates, _TOLERANCE, objective.options.passes or MAX_PASSES)
+    iterate = iterate_until(iterates, tolerance, objective.options.passes or MAX_PASSES)
     certificate = Certificate(
         kind=_PMLEM_CERTIFICATE,
         value=float(iterate.certificate.distance),
         stationarity=float(iterate.certificate.stationarity),
         slack=float(iterate.certificate.slack),
-        tolerance=_TOLERANCE,
-        reached=bool(iterate.certificate.distance <= _TOLERANCE),
+        tolerance=tolerance,
+        reached=bool(iterate.certificate.distance <= tolerance),
         passes=iterate.passes,
         inner_steps=iterate.inner_steps,
     )

@@ -10,7 +10,15 @@ from msgspec import UNSET, structs
 from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.formats.results.records import PriorRecord, SolveRecord
 from faintfield.pipelines.reconstruction.planes.learned_prior import learned_estimate, outside_range
-from faintfield.pipelines.reconstruction.planes.penalised import Objective, Solution, certified, with_sigma
+from faintfield.pipelines.reconstruction.planes.penalised import (
+    Objective,
+    Solution,
+    certified,
+    is_pilot,
+    solve_pmlem,
+    with_sigma,
+    with_weight_of,
+)
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.prior.collaborative import patch_candidates
 from faintfield.recon.prior.evidence import Evidence, evidence_of_planes, misfits
@@ -40,7 +48,9 @@ def with_prior(objective: Objective, solutions: Sequence[Solution]) -> list[Solu
         made = _about_proposals(objective, solutions)
         if isinstance(made, str):
             prior = PriorRecord(name="tv", left_out=made)
-            found = [replace(solution, record=structs.replace(solution.record, prior=prior)) for solution in solutions]
+            if is_pilot(solutions[0].record):
+                found = solve_pmlem(objective)
+            found = [replace(solution, record=structs.replace(solution.record, prior=prior)) for solution in found]
         else:
             found, answers = made
     return with_sigma(objective, found, answers) if objective.options.uncertainty else found
@@ -84,13 +94,7 @@ def _about_proposals(
     dual = replace(objective.posed.dual(), proposal=proposed)
     start = np.maximum(proposed, 1e-3 * objective.start)
     record, found = certified(objective, start, WEIGHT_ABOUT_PROPOSAL * weight, dual)
-    record = structs.replace(
-        record,
-        penalty_weight=first.penalty_weight,
-        penalty_weight_chosen=first.penalty_weight_chosen,
-        penalty_weight_curve=first.penalty_weight_curve,
-        passes_before=(first.passes_before or 0) + first.passes,
-    )
+    record = with_weight_of(record, first)
     planes = zip(operator.planes_of(found), solutions, proposals, strict=True)
     return [
         _solution(plane, record, solution.sidecars, proposal, options, no_network)

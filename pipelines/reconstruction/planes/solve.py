@@ -57,7 +57,7 @@ def solve(
     options: SolverOptions,
     pilot: Pilot | None = None,
 ) -> Solution:
-    """Reconstruct one plane of one colour, by a prior from its pilot if there is one.
+    """Reconstruct one plane of one colour, by a prior if the options have one, from its pilot if there is one.
 
     Raises NotConverged if the penalty weight is too large for the views.
     """
@@ -67,8 +67,14 @@ def solve(
         return Solution(plane, SolveRecord(penalty_weight=None, penalty_weight_chosen=chosen, passes=1))
     if method == "pmlem":
         objective = Objective.of(SceneProblem(operator, images), options, pilot.other_colours if pilot else None)
-        return with_prior(objective, [pilot.solution] if pilot else solve_pmlem(objective))[0]
+        solved = [pilot.solution] if pilot else solve_pmlem(objective, as_pilot=options.has_prior)
+        return with_prior(objective, solved)[0]
     return _solve_one_step_late(operator, images, method, options)
+
+
+def solve_pilot(operator: PlaneOperator, images: ElementalImages, options: SolverOptions) -> Solution:
+    """Return the plane of total variation from which a prior begins."""
+    return solve_pmlem(Objective.of(SceneProblem(operator, images), options), as_pilot=True)[0]
 
 
 def _solve_one_step_late(

@@ -29,7 +29,7 @@ from faintfield.pipelines.reconstruction.channels import load_channel
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, blind_views
 from faintfield.pipelines.reconstruction.planes.penalised import Pilot, Solution
 from faintfield.pipelines.reconstruction.planes.saturation import PixelSelection
-from faintfield.pipelines.reconstruction.planes.solve import solve, solve_together
+from faintfield.pipelines.reconstruction.planes.solve import solve, solve_pilot, solve_together
 from faintfield.recon.depth.focus import FocusMeasure, focus_measure, sharp_depths_mm
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages
@@ -84,7 +84,7 @@ class Channel:
         if any(files.method in JOINT_METHODS for files in task.files):
             return solve_together(self._factory, self._images, task.grids, ["joint"], solver)["joint"]
         operators = {place: self._operator(place, grid) for place, grid in task.grids.items()}
-        return {place: solve(operator, self._images, "pmlem", solver) for place, operator in operators.items()}
+        return {place: solve_pilot(operator, self._images, solver) for place, operator in operators.items()}
 
     def do(self, task: PlaneTask, pilots: Mapping[Place, Pilot] | None = None) -> list[str]:
         """Reconstruct and save this colour of what a task asks for, and return messages for the user."""

@@ -6,9 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from scipy import ndimage
 from scipy.optimize import brentq
 from scipy.special import gammaln, logsumexp
 from scipy.stats import norm, poisson
@@ -17,7 +14,6 @@ from faintfield.recon.likelihood.images import (
     ElementalImages,
     Image,
     LikelihoodName,
-    blurred,
     read_noise_share,
     select_likelihood,
 )
@@ -232,16 +228,3 @@ def test_binned_images_are_sums_of_valid_pixels() -> None:
     assert result.read_variance_e2 == 12.0
     assert result.valid is not None
     assert np.argwhere(~result.valid).tolist() == [[1, 1, 2]]
-
-
-@settings(max_examples=20)
-@given(st.integers(0, 2**32 - 1), st.lists(st.integers(1, 3), max_size=3))
-def test_blur_is_scipys_convolution_with_repeated_edges(seed: int, spacings: list[int]) -> None:
-    image = np.random.default_rng(seed).normal(size=(9, 12))
-    expected = image
-    for spacing in spacings:
-        kernel = np.zeros(2 * spacing + 1)
-        kernel[[0, spacing, -1]] = 0.25, 0.5, 0.25
-        for axis in (0, 1):
-            expected = ndimage.convolve1d(expected, kernel, axis=axis, mode="nearest")
-    np.testing.assert_allclose(blurred(image, spacings), expected, atol=1e-14)

@@ -8,7 +8,8 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from faintfield.recon.likelihood.images import ElementalImages, Image, LikelihoodName, blurred
+from faintfield.recon.blur import blurred
+from faintfield.recon.likelihood.images import ElementalImages, Image, LikelihoodName
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.occlusion import Occluders
 from faintfield.recon.operator.scene_operator import SceneOperator

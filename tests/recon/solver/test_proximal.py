@@ -101,9 +101,9 @@ def test_steps_follow_the_textbook_iteration() -> None:
     np.testing.assert_allclose(result.plane, x, atol=1e-12)
 
 
-def test_largest_step_is_smallest_of_changed_samples() -> None:
+def test_step_on_dual_field_is_smallest_of_changed_samples() -> None:
     reach = np.array([[1.0, 2.0, 1.0], [1.0, 1.0, 4.0]])
-    np.testing.assert_allclose(step_sizes(reach), 0.125 / np.array([[2.0, 2.0, 4.0], [1.0, 4.0, 4.0]]))
+    np.testing.assert_allclose(step_sizes(reach), 0.15 / np.array([[2.0, 2.0, 4.0], [1.0, 4.0, 4.0]]))
 
 
 def test_penalty_without_smoothing_is_refused() -> None:

@@ -8,7 +8,8 @@ import pytest
 from faintfield.pipelines.arguments import PriorName, SolverOptions
 from faintfield.pipelines.reconstruction.planes.penalised import Objective, certified, solve_pmlem
 from faintfield.pipelines.reconstruction.planes.solve import solve
-from faintfield.recon.likelihood.images import Image, blurred
+from faintfield.recon.blur import blurred
+from faintfield.recon.likelihood.images import Image
 from faintfield.recon.prior.collaborative import patch_candidates
 from faintfield.recon.prior.evidence import evidence_of_planes
 from faintfield.recon.prior.proposal import ProposalAnswers, propose

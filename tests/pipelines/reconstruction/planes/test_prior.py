@@ -75,7 +75,7 @@ def test_plane_has_proposal_change_mixtures_and_certificate(proposed: Path, with
     assert plane["certificate"]["passes"] == plane["passes"]
     for key in ("penalty_weight", "penalty_weight_chosen", "penalty_weight_curve", "penalty", "likelihood"):
         assert plane[key] == first[key]
-    assert plane["passes_before"] == pytest.approx(first["passes_before"] + first["passes"])
+    assert 0 < plane["passes_before"] - first["passes_before"] <= first["passes"]  # a pilot's certificate is wider
     assert plane["mean_e"] == pytest.approx(tifffile.imread(proposed / plane["file"]).mean(dtype=float), rel=1e-6)
     options = read_record(proposed)["options"]
     assert (options["prior"], options["proposal"]) == ("patches", True)
@@ -179,7 +179,7 @@ def _by_hand(folder: Path, depth_mm: float, settings: SolverOptions) -> list[Ima
         images = load_channel(elemental_set, layout)
         operator = OperatorFactory(elemental_set, layout, images).at(depth_mm, plane_grid(elemental_set, depth_mm))
         objectives.append(Objective.of(SceneProblem(operator, images), settings))
-        first.append(solve_pmlem(objectives[-1]))
+        first.append(solve_pmlem(objectives[-1], as_pilot=True))
     red, green, blue = (solution.plane for (solution,) in first)
     others = [green + blue, red + blue, red + green]
     return [
