@@ -145,8 +145,8 @@ class _Report:
         """Return the steps done, the time since the beginning, and about how long the rest takes."""
         steps = "" if self.total is None else f"{self.done} of {self.total}, "
         left_s = self.left_s()
-        left = "" if left_s is None else f", about {_duration(left_s)} to go"
-        return f"{steps}{_duration(self.clock() - self._started)}{left}"
+        left = "" if left_s is None else f", about {duration_text(left_s)} to go"
+        return f"{steps}{duration_text(self.clock() - self._started)}{left}"
 
     def left_s(self) -> float | None:
         """Return about how long the remaining steps take, None before it can be known.
@@ -173,7 +173,8 @@ class _Report:
         return f"{self.label}: {self.state()}"
 
 
-def _duration(seconds: float) -> str:
+def duration_text(seconds: float) -> str:
+    """Return a time in whole seconds, or in minutes if it is long."""
     return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
 
 

@@ -163,16 +163,17 @@ def _frame(
     return np.clip(np.rint(electrons * _GAIN_DN_PER_E + _OFFSET_DN), 0, 16383).astype(np.uint16)
 
 
-def run_command(arguments: list[str], stages: Path) -> tuple[float, float, float]:
-    """Run a command of faintfield, write its stages, and return seconds, CPU seconds and peak memory in MB."""
+def run_command(arguments: list[str], stages: Path) -> tuple[float, float]:
+    """Run a command of faintfield, write its stages, and return seconds and CPU seconds."""
     started = time.perf_counter()
-    process = subprocess.Popen([sys.executable, "-m", "benchmarks.speed.stages", str(stages), *arguments])
+    command = [sys.executable, "-m", "benchmarks.speed.stages", str(stages), *arguments]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     _, status, usage = os.wait4(process.pid, 0)
     seconds = time.perf_counter() - started
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode != 0:
         raise subprocess.CalledProcessError(process.returncode, arguments)
-    return seconds, usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024 / 1e6
+    return seconds, usage.ru_utime + usage.ru_stime
 
 
 def bandwidth() -> float:
@@ -199,11 +200,14 @@ def costs(mpx: float, views: int, arguments: argparse.Namespace) -> Iterator[Cos
         for name, options in commands.items():
             out = Path(folder) / name
             measured = run_command(["reconstruct", str(made), *options, "--out", str(out)], file)
-            found = {stage["name"]: stage for stage in json.loads(file.read_text(encoding="utf-8"))}
+            inside = json.loads(file.read_text(encoding="utf-8"))
+            found = {stage["name"]: stage for stage in inside["stages"]}
             stages = {stage: [round(s["seconds"], 2), round(s["cpu_seconds"], 2)] for stage, s in found.items()}
             # A pass reads one colour, on average a third of the frames, as float32 instead of their 16 bits
             read_s = found.get("passes", {}).get("calls", 0) * 2 * frame_bytes / 3 / speed
-            yield Cost(mpx, views, name, *measured, stages["passes"][0] / read_s if read_s else 0.0, stages)
+            yield Cost(
+                mpx, views, name, *measured, inside["peak_mb"], stages["passes"][0] / read_s if read_s else 0.0, stages
+            )
 
 
 def exponents(costs: Sequence[Cost]) -> Iterator[dict[str, float | str]]:

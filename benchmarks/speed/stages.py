@@ -1,7 +1,8 @@
 """Seconds and CPU seconds of the stages of a command: `python -m benchmarks.speed.stages FILE reconstruct SET …`.
 
 Functions that do a stage's work are replaced by timed ones, then the command runs as `faintfield` would. A stage within
-another counts for itself alone, except within those that choose weights: their time is all theirs. FILE is a JSON list.
+another counts for itself alone, except within those that choose weights: their time is all theirs. FILE is JSON, with
+the largest resident memory.
 """
 
 import importlib
@@ -113,6 +114,13 @@ def _clocks() -> tuple[float, float]:
     return time.perf_counter(), usage.ru_utime + usage.ru_stime
 
 
+def _peak_mb() -> float:
+    """Return the largest resident memory of this process; `ru_maxrss` begins with that of the process before it."""
+    status = Path("/proc/self/status").read_text(encoding="utf-8")
+    (kib,) = (line.split()[1] for line in status.splitlines() if line.startswith("VmHWM:"))
+    return int(kib) * 1024 / 1e6
+
+
 def main() -> None:
     """Run a command, and write what its stages took."""
     out, sys.argv[1:] = Path(sys.argv[1]), sys.argv[2:]
@@ -123,7 +131,8 @@ def main() -> None:
     try:
         faintfield()
     finally:
-        out.write_text(json.dumps([asdict(stage) for stage in stages.stages.values() if stage.calls]), encoding="utf-8")
+        found = [asdict(stage) for stage in stages.stages.values() if stage.calls]
+        out.write_text(json.dumps({"peak_mb": _peak_mb(), "stages": found}), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -22,11 +22,12 @@ from faintfield.pipelines.reconstruction.options import DEFAULTS, Options
 
 if TYPE_CHECKING:
     from faintfield.pipelines.paper.figures import FiguresMade
+    from faintfield.pipelines.reconstruction.planes.forecast import Forecast
     from faintfield.pipelines.reconstruction.run import Outcome
     from faintfield.pipelines.workflows.session import RunOutcome
 
 type Run = RunOutcome
-type Reconstruction = Outcome
+type Reconstruction = Outcome | Forecast
 type Figures = FiguresMade
 
 
@@ -53,9 +54,9 @@ def run(
     limit_px
         Largest accepted standard deviation of the transfer between views, as for `geometry`.
     """
-    # Of `reconstruct`, four options have no place here: --out, as results lie in the session; --geometry, which is
-    # measured; --scene, as the page is that of the dark scene; and --part, as the page needs all planes. The bright
-    # scene, and parts, are reconstructed by `reconstruct`
+    # Of `reconstruct`, five options have no place here: --out, as results lie in the session; --geometry, which is
+    # measured; --scene, as the page is that of the dark scene; --part, as the page needs all planes; and --dry-run, as
+    # planes need noise and geometry. The bright scene, and parts, are reconstructed by `reconstruct`
     from faintfield.pipelines.workflows.session import run_session
 
     return run_session(session, options, lens, limit_px)
@@ -70,6 +71,7 @@ def reconstruct(
     geometry: Annotated[Path | None, IN_INPUT] = None,
     scene: Annotated[SceneKind, IN_INPUT] = "dark_scene",
     part: Annotated[str | None, IN_MACHINE] = None,
+    dry_run: Annotated[bool, IN_MACHINE] = False,
 ) -> Reconstruction:
     """Reconstruct planes of the scene at chosen depths, or one picture that is sharp everywhere, with its depth.
 
@@ -91,10 +93,16 @@ def reconstruct(
     part
         I/N: make only every N-th plane from the I-th on, and no report, as one of N jobs of a cluster that write to the
         same OUT at the same time. When all have ended, the same command without --part puts the sweep together.
+    dry_run
+        Write nothing, but say how many planes are missing, and about how much time and memory they take on this
+        computer. With --part: those of the part.
     """
-    from faintfield.pipelines.workflows.reconstruct import parse_part, reconstruct_folder
+    from faintfield.pipelines.workflows.reconstruct import forecast_folder, parse_part, reconstruct_folder
 
-    return reconstruct_folder(set_path, out, options, geometry, scene, None if part is None else parse_part(part))
+    chosen = None if part is None else parse_part(part)
+    if dry_run:
+        return forecast_folder(set_path, out, options, geometry, scene, chosen)
+    return reconstruct_folder(set_path, out, options, geometry, scene, chosen)
 
 
 def report(directory: Path, /) -> dict[str, str]:

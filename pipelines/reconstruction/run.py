@@ -38,6 +38,7 @@ from faintfield.pipelines.reconstruction.depth.scene_structure import Mode, reco
 from faintfield.pipelines.reconstruction.depth.search import check_overlap, check_views, depths_of_set
 from faintfield.pipelines.reconstruction.operators import default_pitch_px, plane_grid
 from faintfield.pipelines.reconstruction.overview import inspect_set, write_overview
+from faintfield.pipelines.reconstruction.planes.forecast import Forecast, forecast
 from faintfield.pipelines.reconstruction.planes.saturation import saturation_text
 from faintfield.pipelines.reconstruction.planes.sweep import Part, PlaneTask, Runner, Sweep, run_serially
 from faintfield.pipelines.reconstruction.request import Request, folder_of_method
@@ -132,16 +133,26 @@ def reconstruct_part(
     The caller shares `out` with the other parts, see `formats.files.shared`.
     """
     folders = {name: folder_of_method(out, name, request.methods) for name in request.methods}
-    whole = _sweep(elemental_set, folders, request)
-    sweep = whole.part(part)
-    inform(f"part {part}: {len(sweep.plan.grids)} of {len(whole.plan.grids)} planes")
+    sweep = _sweep(elemental_set, folders, request).part(part)
     sweep.keep_finished()
+    planes = forecast(sweep) if runner is run_serially else f"{len(sweep.plan.grids)} plane(s)"
+    inform(f"part {part}: {planes}")
     require_room(out, sweep.needed_bytes())
     for folder in folders.values():
         remove(folder / RECONSTRUCTION_FILE)
     sweep.run(runner, out)
     _warn(elemental_set, sweep.records)
     return Outcome(out=str(out), planes=sweep.records, units=elemental_set.units)
+
+
+def forecast_set(elemental_set: ElementalSet, out: Path, request: Request, part: Part | None = None) -> Forecast:
+    """Return what the planes of a request that are missing would take on this computer, or those of a part of it."""
+    folders = {name: folder_of_method(out, name, request.methods) for name in request.methods}
+    _check(elemental_set, folders.values(), request)
+    sweep = _sweep(elemental_set, folders, request)
+    sweep = sweep if part is None else sweep.part(part)
+    sweep.keep_finished()
+    return forecast(sweep)
 
 
 def _check(elemental_set: ElementalSet, folders: Iterable[Path], request: Request) -> None:

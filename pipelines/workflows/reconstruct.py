@@ -18,10 +18,17 @@ from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, load_
 from faintfield.pipelines.reconstruction.channels import keeping_frames
 from faintfield.pipelines.reconstruction.depth.scene_structure import Mode, recommendation
 from faintfield.pipelines.reconstruction.options import OF_PLANES, Options
+from faintfield.pipelines.reconstruction.planes.forecast import Forecast, has_forecast
 from faintfield.pipelines.reconstruction.planes.sweep import Part, Runner, run_serially
 from faintfield.pipelines.reconstruction.planes.workers import make_runner
 from faintfield.pipelines.reconstruction.request import Request, folder_of_method, resolve, select_planes
-from faintfield.pipelines.reconstruction.run import Outcome, reconstruct_part, reconstruct_set, refuse_surfaces
+from faintfield.pipelines.reconstruction.run import (
+    Outcome,
+    forecast_set,
+    reconstruct_part,
+    reconstruct_set,
+    refuse_surfaces,
+)
 from faintfield.pipelines.reconstruction.surface.reconstruct import reconstruct_surface
 from faintfield.pipelines.reconstruction.surface.request import SURFACE_FOLDER, SurfaceRequest, select_surface
 from faintfield.rig.session.session import has_session
@@ -71,6 +78,29 @@ def reconstruct_folder(
     # One process for each part, whose name a killed one leaves behind for the next whole command to remove
     with shared(out), exclusive(out / f".part_{part.number}_of_{part.count}{UNFINISHED}"):
         return reconstruct_part(elemental_set, out, request, part, runner)
+
+
+def forecast_folder(
+    folder: Path, out: Path | None, options: Options, geometry: Path | None, scene: SceneKind, part: Part | None
+) -> Forecast:
+    """Say what the planes that the options ask for, or a part of them, would take on this computer; write nothing.
+
+    Raises WrongUsage for what has no forecast: planes found together, depths that must be searched, a surface, and
+    several processes.
+    """
+    check_exists(folder)
+    without = [name for name in ("surface", "depth_map", "workers", "scheduler") if getattr(options, name)]
+    if without:
+        raise WrongUsage(f"--dry-run knows no time of --{without[0].replace('_', '-')}; leave one out")
+    planes = select_planes(options)
+    if planes.auto or planes.auto_sweep:
+        raise WrongUsage("--dry-run does not search depths; give those of the planes, or a sweep from one to another")
+    if not has_forecast(planes.methods):
+        raise WrongUsage("--dry-run knows no time of planes that are solved together; give another --method")
+    elemental_set, out = open_set(folder, out, scene, geometry)
+    found = forecast_set(elemental_set, out, resolve(planes, elemental_set, out), part)
+    inform(str(found))
+    return found
 
 
 def parse_part(text: str) -> Part:

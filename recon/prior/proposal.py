@@ -45,7 +45,7 @@ WEIGHT_ABOUT_PROPOSAL = 1.2
 # Samples of the windows that stand for a large plane, together, and samples along the edges of a window that do not
 # count: filters do not know what lies beyond. Chosen on `CHOSEN_ON` in benchmarks/imaging/uncertainty.py, at 1280 x 960
 # samples: twelve windows are within 0.7 % of the error with weights from all of the plane, half as many within 3.2 %.
-_WINDOW_SAMPLES, _EDGE = 3 * 2**18, 16
+WINDOW_SAMPLES, _EDGE = 3 * 2**18, 16
 
 # A candidate is left out if the mixture predicts nearly as well without it: this share of its gain over the first
 # candidate is lost at most for each; and for all those of the samples of a large plane, which take three times as long
@@ -239,7 +239,7 @@ def _parts(
     other_colours: Image | None,
 ) -> list[_Part]:
     """Return the parts by which candidates are judged: windows of a large plane, else all."""
-    windows = windows_of(problem, MIN_VIEWS, _WINDOW_SAMPLES)
+    windows = windows_of(problem, MIN_VIEWS, WINDOW_SAMPLES)
     if not windows:
         return [_Part(problem, samples, evidences, regions, other_colours)]
     parts = []

@@ -111,8 +111,9 @@ class DataFit:
 
 
 def _at_least(share: float, metric: Image) -> Image:
-    seen = metric[metric > 0]
-    return np.maximum(metric, share * np.median(seen[:: 1 + seen.size // _MEDIAN_SAMPLES]))
+    some = metric.reshape(-1)[:: 1 + metric.size // _MEDIAN_SAMPLES]
+    seen = some[some > 0]
+    return np.maximum(metric, share * np.median(seen if seen.size else metric[metric > 0]))
 
 
 @dataclass(frozen=True)

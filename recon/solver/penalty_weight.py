@@ -41,7 +41,7 @@ SIDE = 256
 
 # The windows have so many samples together: the darkest scenes, of SNR 0.05, need that many to tell weights that are a
 # quarter apart. A plane less than twice that large stands for itself.
-_WINDOW_SAMPLES = 2**20
+WINDOW_SAMPLES = 2**20
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ def cross_validated_weight(
     the training views to all views.
     """
     samples = int(np.prod(problem.operator.samples_shape))
-    windows = windows_of(problem, MIN_VIEWS, _WINDOW_SAMPLES, workers=1)
+    windows = windows_of(problem, MIN_VIEWS, WINDOW_SAMPLES, workers=1)
     if windows:
         # A dark window is solved with the light of the whole plane, as that will be
         folds = map_in_threads(lambda window: Fold(window.problem, penalty, 0, level_e), windows)

@@ -73,7 +73,7 @@ def test_windows_stand_for_a_large_plane(monkeypatch: pytest.MonkeyPatch) -> Non
     assert set(shapes) == {(96, 96)}
     shapes.clear()
     monkeypatch.setattr(penalty_weight, "SIDE", 24)
-    monkeypatch.setattr(proposal, "_WINDOW_SAMPLES", 6 * 24**2)
+    monkeypatch.setattr(proposal, "WINDOW_SAMPLES", 6 * 24**2)
     monkeypatch.setattr(proposal, "_EDGE", 2)
     (windowed,) = propose(problem, plane, [evidence], 1.0, multiples_of_pilot)
     assert shapes.count((24, 24)) == len(shapes) - 1 >= 8

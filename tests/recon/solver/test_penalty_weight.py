@@ -63,7 +63,7 @@ def test_windows_choose_nearly_the_weight_of_whole(monkeypatch: pytest.MonkeyPat
     guess = universal_penalty_weight(operator, images, smooth_start(operator, images))
     whole = cross_validated_weight(problem, guess, Penalty())
     monkeypatch.setattr(penalty_weight, "SIDE", 32)
-    monkeypatch.setattr(penalty_weight, "_WINDOW_SAMPLES", 4_096)
+    monkeypatch.setattr(penalty_weight, "WINDOW_SAMPLES", 4_096)
     parts = cross_validated_weight(problem, guess, Penalty(), level_e=float(truth.mean()))
     assert whole.solution is not None
     assert parts.solution is None
@@ -126,7 +126,7 @@ def problem_of(shape: tuple[int, int], right: NDArray[np.float64] = FEW_SAMPLES)
 @pytest.fixture
 def small_windows(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(penalty_weight, "SIDE", 8)
-    monkeypatch.setattr(penalty_weight, "_WINDOW_SAMPLES", 8 * 8 * 6)
+    monkeypatch.setattr(penalty_weight, "WINDOW_SAMPLES", 8 * 8 * 6)
 
 
 @pytest.mark.usefixtures("small_windows")
