@@ -1,5 +1,6 @@
 """Threads that are kept between calls: starting one takes as long as a step on a small plane."""
 
+import sys
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
@@ -23,12 +24,16 @@ class _OneBlasThread:
 
     def reset(self) -> None:
         """Forget all users, as a forked process has to."""
-        self._lock, self._users = Lock(), 0
+        self._lock, self._users, self._modules = Lock(), 0, 0
 
     def __enter__(self) -> None:
         with self._lock:
             if self._users == 0:
-                self._limit = ThreadpoolController().limit(limits=1, user_api="blas")
+                if self._modules != len(
+                    sys.modules
+                ):  # a new one may have brought a BLAS; finding it takes milliseconds
+                    self._modules, self._controller = len(sys.modules), ThreadpoolController()
+                self._limit = self._controller.limit(limits=1, user_api="blas")
             self._users += 1
 
     def __exit__(self, *_: object) -> None:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from faintfield.recon.blur import blurred
 from faintfield.recon.likelihood.images import ElementalImages, Image
+from faintfield.recon.numba_tools import compiled
 from faintfield.recon.operator.scene_operator import SceneOperator, ViewSelection
 from faintfield.recon.solver.initialization import well_seen_samples
 from faintfield.recon.solver.penalty_weight import fold_count, validation_views
@@ -173,13 +174,20 @@ def _drawn_noise(
 
         def draw(view: int, variance: Image) -> None:
             random_bytes = np.random.default_rng([*seed, view]).bytes(-(-variance.size // 8))
-            bits = np.unpackbits(np.frombuffer(random_bytes, np.uint8), count=variance.size)
-            deviation = np.sqrt(variance, out=variance)
-            np.negative(deviation, out=deviation, where=bits.reshape(variance.shape).astype(bool))
+            _draw_signs(variance.reshape(-1), np.frombuffer(random_bytes, np.uint8))
 
         _for_each_view(operator.workers, draw, some.tolist(), drawn)
         total += operator.adjoint_of_views(drawn, some)
     return total
+
+
+@compiled
+def _draw_signs(variance, random_bytes):  # type: ignore[no-untyped-def]
+    """Replace variances (pixel,) by their roots, with the signs of random bits."""
+    one = variance.dtype.type(1)
+    for k in range(variance.size):
+        sign = one - 2 * one * ((random_bytes[k >> 3] >> (7 - (k & 7))) & 1)
+        variance[k] = sign * np.sqrt(variance[k])
 
 
 def _for_each_view(workers: int, work: Callable[..., None], *of_views: Iterable[Any]) -> None:

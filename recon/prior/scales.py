@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.recon.likelihood.images import Image
+from faintfield.recon.numba_tools import compiled
 from faintfield.recon.prior.evidence import Evidence, Noise
 from faintfield.recon.threads import map_in_threads
 
@@ -115,13 +116,28 @@ def _noise_of_means(kernel: NDArray[np.float64]) -> tuple[float, NDArray[np.floa
 
 def _weighted(picture: Image) -> Image:
     """Return the weighted sums of samples around every second corner, of those that there are."""
-    for axis in (0, 1):
-        lines = np.moveaxis(picture, axis, 0)
-        around = np.pad(lines, ((1, 1 + len(lines) % 2), (0, 0)))
-        sums = np.float32(_WEIGHTS[1]) * (around[1:-1:2] + around[2::2])
-        sums += np.float32(_WEIGHTS[0]) * (around[:-3:2] + around[3::2])
-        picture = np.moveaxis(sums, 0, axis)
-    return np.ascontiguousarray(picture)
+    rows, columns = picture.shape
+    sums = np.empty(((rows + 1) // 2, (columns + 1) // 2), picture.dtype)
+    _sum_around(np.ascontiguousarray(picture), _WEIGHTS.astype(picture.dtype), sums)
+    return sums
+
+
+@compiled
+def _sum_around(picture, weights, sums):  # type: ignore[no-untyped-def]
+    """Set the weighted sums of four rows and four columns, of those that there are, around every second corner."""
+    rows, columns = picture.shape
+    line = np.zeros(columns + 4, picture.dtype)  # a zero before the first column, and after the last
+    for i in range(sums.shape[0]):
+        for j in range(line.size):
+            line[j] = 0
+        for k in range(4):
+            row = 2 * i - 1 + k
+            if 0 <= row < rows:
+                for j in range(columns):
+                    line[1 + j] += weights[k] * picture[row, j]
+        for j in range(sums.shape[1]):
+            outer = weights[0] * line[2 * j] + weights[3] * line[2 * j + 3]
+            sums[i, j] = outer + weights[1] * line[2 * j + 1] + weights[2] * line[2 * j + 2]
 
 
 def _raised(picture: Image, pilots: Sequence[Image]) -> Image:

@@ -33,8 +33,9 @@ _LIGHT_SCALE = 8.0
 _MIN_SIDE, _MAX_LIGHT, _NOISE_RATIOS = 32, 60.0, (0.6, 6.0)
 _NEIGHBOURS = (-0.05, 0.55)
 
-# Part of the samples that may be brighter, darker or noisier than those that it was trained with.
-_ODD = 0.01
+# Part of the samples that may be brighter, darker or noisier than those that it was trained with, and samples that are
+# judged, about.
+_ODD, _JUDGED = 0.01, 2**20
 
 type _Tile = tuple[slice, slice]
 
@@ -89,8 +90,9 @@ def outside_range(patches: Image, noise: Noise) -> str | None:
         return f"the plane has {patches.shape[0]} x {patches.shape[1]} samples, fewer than {_MIN_SIDE} along a side"
     if not seen.any():
         return "no sample is seen by any view"
-    deviation = np.sqrt(noise.variance[seen])
-    brightest = float(np.quantile(patches[seen] / deviation, 1 - _ODD))
+    some = np.flatnonzero(seen)[:: 1 + seen.size // _JUDGED]
+    deviation = np.sqrt(noise.variance.ravel()[some])
+    brightest = float(np.quantile(patches.ravel()[some] / deviation, 1 - _ODD))
     if not brightest <= _MAX_LIGHT:
         return f"the light is up to {brightest:.0f} times its noise, more than {_MAX_LIGHT:.0f}"
     least, most = np.quantile(deviation, (_ODD, 1 - _ODD)) / np.median(deviation)

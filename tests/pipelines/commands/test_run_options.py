@@ -27,7 +27,7 @@ def test_only_options_of_sets_are_missing_from_run() -> None:
         command: {name for argument in app[command].assemble_argument_collection() for name in argument.names}
         for command in ("run", "reconstruct")
     }
-    only_of_sets = {"SESSION|SET", "--out", "--geometry", "--scene", "--part", "--dry-run"}
+    only_of_sets = {"SESSION|SET", "--out", "--geometry", "--scene", "--part", "--dry-run", "--no-dry-run"}
     assert options["reconstruct"] - options["run"] == only_of_sets
     assert options["run"] - options["reconstruct"] == {"SESSION", "--lens", "--limit-px"}
 
