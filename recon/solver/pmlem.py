@@ -20,7 +20,7 @@ from faintfield.recon.solver.proximal_kernels import squared_distance
 # An inner problem is solved until its error is this fraction of the last step, or of the tolerance, of which it is half
 # as much after each pass that hardly lowered the certificate's distance; limit on its steps, of which a pass over the
 # data takes as long as about 30.
-_INNER_OF_STEP, _INNER_OF_TOLERANCE, _MAX_INNER_STEPS = 0.3, 0.8, 2000
+_INNER_OF_STEP, _INNER_OF_TOLERANCE, _MAX_INNER_STEPS = 0.3, 0.7, 2000
 _SLOW = 0.8
 
 # Relative rise of the objective that rounding may cause; a step with a larger rise is undone.
