@@ -18,7 +18,7 @@ from faintfield.recon.solver.pmlem import norm
 from faintfield.recon.solver.proximal import DualField
 
 # Draws of the noise, and size of the small change that gives the derivative.
-_DRAWS, _SMALL_CHANGE = 4, 0.2
+DRAWS, _SMALL_CHANGE = 4, 0.2
 
 # Proximal steps of each answer; error of a step relative to its change and to the plane, and limit on its inner steps.
 _STEPS, _OF_CHANGE, _OF_PLANE, _MAX_INNER_STEPS = 3, 0.1, 3e-3, 300
@@ -94,7 +94,7 @@ def standard_deviation(
         return np.asarray(1 / np.sqrt(local.metric), local.plane.dtype)
     answers = (answers_of or Answers)(LocalProblem(local, weight, penalty))
     problem, usual = answers.problem, answers.usual
-    noises = [problem.noise(generator) for _ in range(_DRAWS)]
+    noises = [problem.noise(generator) for _ in range(DRAWS)]
     size = np.float32(usual.change)
     drawn = [answers(size * noise) / size for noise in noises]
     squares = _mean([np.square(answer) for answer in drawn])

@@ -8,6 +8,7 @@ import msgspec
 import numba
 import numpy as np
 
+from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.console import duration_text
 from faintfield.pipelines.formats.frames import ChannelLayout
 from faintfield.pipelines.formats.plane_poses import Place
@@ -22,6 +23,7 @@ from faintfield.recon.prior.proposal import WINDOW_SAMPLES as CANDIDATE_SAMPLES
 from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.solver.penalty_weight import WINDOW_SAMPLES as PENALTY_SAMPLES
 from faintfield.recon.solver.proximal import DualField
+from faintfield.recon.solver.uncertainty import DRAWS
 
 # Views of the timed pass, steps of the timed inner problem; the least of so many times counts.
 _VIEWS, _STEPS, _TIMES = 8, 40, 3
@@ -29,13 +31,12 @@ _VIEWS, _STEPS, _TIMES = 8, 40, 3
 # Time and memory of a process without data, and arrays of a plane's samples at the peak, without and with a prior.
 _PROCESS_S, _PROCESS_MB, _ARRAYS, _ARRAYS_WITH_PRIOR = 3.0, 350, 16, 35
 
-
 # Passes of methods that make no inner steps.
 _PASSES = {"backprojection": 3.0, "mlem": 22.0, "pmlem-osl": 40.0}
 
 
 class Forecast(msgspec.Struct, frozen=True, kw_only=True):
-    """Predicted cost of the planes of a command on this computer, most of which scenes and noise change by a third.
+    """Predicted cost of the planes of a command on this computer; the noise of a scene changes it by up to a third.
 
     Attributes
     ----------
@@ -72,7 +73,7 @@ def forecast(sweep: Sweep) -> Forecast:
     colours_of_plane = sum(len(other.lattices) for other in plan.layouts) / len(layout.lattices)
     seconds = _PROCESS_S + _reading_s(elemental_set, plan.layouts) * (2 if plan.solver.has_prior else 1)
     for files in missing:
-        passes, steps = _work(files.method, plan.solver.has_prior, _samples(grid))
+        passes, steps = _work(files.method, plan.solver, _samples(grid))
         share = _samples(plan.grids[files.place]) / _samples(grid)
         seconds += passes * colours_of_plane * pass_s + share * steps * len(plan.layouts) * step_s
     pixels = len(layout.lattices) * layout.lattices[0].shape[0] * layout.lattices[0].shape[1]
@@ -91,17 +92,18 @@ def _samples(grid: PlaneGrid) -> int:
     return grid.shape[0] * grid.shape[1]
 
 
-def _work(method: Method, with_prior: bool, samples: int) -> tuple[float, float]:
+def _work(method: Method, solver: SolverOptions, samples: int) -> tuple[float, float]:
     """Return about how many passes, and inner steps or what takes as long, a plane of one colour takes."""
     if method != "pmlem":
         return _PASSES[method], 0.0
     of_weight = _share(samples, PENALTY_SAMPLES)
-    passes, steps = 9 + 9 * of_weight, 650 + of_weight * (2000 if of_weight == 1 else 5000)
-    if with_prior:
+    passes, steps, answer = 9 + 9 * of_weight, 650 + of_weight * (2000 if of_weight == 1 else 5000), 1600
+    if solver.has_prior:
         of_mixture = _share(samples, CANDIDATE_SAMPLES)
-        passes += 14
-        steps += 16_750 if of_mixture == 1 else 1150 + 18_000 * of_mixture
-    return passes, steps
+        candidates = 3500 if of_mixture == 1 else 900  # of large planes mostly means of samples
+        passes, answer = passes + 14, 2 * answer + candidates
+        steps += 250 + candidates + of_mixture * (13_000 if of_mixture == 1 else 18_000)
+    return passes, steps + DRAWS * answer * solver.uncertainty
 
 
 def _share(samples: int, of_windows: int) -> float:
