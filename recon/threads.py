@@ -29,9 +29,8 @@ class _OneBlasThread:
     def __enter__(self) -> None:
         with self._lock:
             if self._users == 0:
-                if self._modules != len(
-                    sys.modules
-                ):  # a new one may have brought a BLAS; finding it takes milliseconds
+                # A new module may have brought a BLAS, and finding it takes milliseconds
+                if self._modules != len(sys.modules):
                     self._modules, self._controller = len(sys.modules), ThreadpoolController()
                 self._limit = self._controller.limit(limits=1, user_api="blas")
             self._users += 1

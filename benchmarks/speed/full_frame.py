@@ -2,8 +2,8 @@
 
 Frames of a picture on one plane are made by OpenCV's warp, without the operator that is measured; then `faintfield`
 reconstructs them as a user would. Printed for each size and number of views, as a JSON object a line: seconds, CPU
-seconds and peak memory of each command, and those of its stages; the bytes of the images that its passes read, over
-those that reading alone would have moved meanwhile; then exponents of growth, with pixels and with views.
+seconds and peak memory of each command, and the time of its stages; that of its passes over that of reading the images
+as often; then exponents of growth, with pixels and with views.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""The data of a reconstruction: the elemental images in electrons, the likelihood of their pixels, bins and a blur."""
+"""The data of a reconstruction: the elemental images in electrons, the likelihood of their pixels, and bins."""
 
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal

@@ -182,7 +182,7 @@ def _drawn_noise(
 
 
 @compiled
-def _draw_signs(variance, random_bytes):  # type: ignore[no-untyped-def]
+def _draw_signs(variance: Image, random_bytes: NDArray[np.uint8]) -> None:
     """Replace variances (pixel,) by their roots, with the signs of random bits."""
     one = variance.dtype.type(1)
     for k in range(variance.size):

@@ -123,7 +123,7 @@ def _weighted(picture: Image) -> Image:
 
 
 @compiled
-def _sum_around(picture, weights, sums):  # type: ignore[no-untyped-def]
+def _sum_around(picture: Image, weights: Image, sums: Image) -> None:
     """Set the weighted sums of four rows and four columns, of those that there are, around every second corner."""
     rows, columns = picture.shape
     line = np.zeros(columns + 4, picture.dtype)  # a zero before the first column, and after the last

@@ -182,8 +182,8 @@ class _PrimalDual:
     def advance(self) -> None:
         for _ in range(max(round(_CHECK_SHARE * self.steps / _STEPS_PER_EXCHANGE), 1)):
             # Neighbours change their rows and columns while a tile is in work
-            rows = {row: self._beside(row, 0) for row in self._edges}
-            columns = {column: self._beside(column, 1) for column in self._column_edges}
+            rows = {row: self._around_edge(row, 0) for row in self._edges}
+            columns = {column: self._around_edge(column, 1) for column in self._column_edges}
             step = partial(self._step_strip, self._next_steps(), rows, columns)
             run_in_threads(step, list(pairwise(self._edges)))
             self.steps += _STEPS_PER_EXCHANGE
@@ -216,7 +216,7 @@ class _PrimalDual:
             self._length *= float(momenta[n])
         return lengths, momenta
 
-    def _beside(self, edge: int, axis: int) -> tuple[Image, Image]:
+    def _around_edge(self, edge: int, axis: int) -> tuple[Image, Image]:
         """Return copies (4, row, column) of p, x and x ahead before and after an edge, as far as the plane has them."""
         vectors, *planes = self._changed
         before, after = slice(max(edge - _STEPS_PER_EXCHANGE, 0), edge), slice(edge, edge + _STEPS_PER_EXCHANGE)

@@ -55,13 +55,13 @@ def step_tile(
         if front < bottom:
             k = front % kept
             if front < first:
-                _load(above, front - top, west, east, 0, p[k], x[k], x_ahead[k])
+                _load(above[:2], above[2], above[3], front - top, west, east, 0, p[k], x[k], x_ahead[k])
             elif front >= stop:
-                _load(below, front - stop, west, east, 0, p[k], x[k], x_ahead[k])
+                _load(below[:2], below[2], below[3], front - stop, west, east, 0, p[k], x[k], x_ahead[k])
             else:
-                _load(before, front, 0, inner, 0, p[k], x[k], x_ahead[k])
-                _load_own(dual, plane, ahead, front, left, right, inner, p[k], x[k], x_ahead[k])
-                _load(behind, front, 0, columns - after, after, p[k], x[k], x_ahead[k])
+                _load(before[:2], before[2], before[3], front, 0, inner, 0, p[k], x[k], x_ahead[k])
+                _load(dual, plane, ahead, front, left, right, inner, p[k], x[k], x_ahead[k])
+                _load(behind[:2], behind[2], behind[3], front, 0, columns - after, after, p[k], x[k], x_ahead[k])
             x_ahead[k, columns] = x_ahead[k, columns - 1]
         for step in range(count):
             row = front - 1 - step
@@ -86,28 +86,13 @@ def step_tile(
 
 
 @compiled
-def _load(rows, row, begin, end, to, p, x, x_ahead):
-    """Copy columns of a row (4, row, column) to a row in work, from its column `to` on."""
+def _load(dual, plane, ahead, row, begin, end, to, p, x, x_ahead):
+    """Copy columns of a row of p, x and x ahead to a row in work, from its column `to` on."""
     _copy_row(
-        rows[0, row, begin:end],
-        rows[1, row, begin:end],
-        rows[2, row, begin:end],
-        rows[3, row, begin:end],
-        p[0, 1 + to :],
-        p[1, 1 + to :],
-        x[to:],
-        x_ahead[to:],
-    )
-
-
-@compiled
-def _load_own(dual, plane, ahead, row, left, right, to, p, x, x_ahead):
-    """Copy the columns of a tile to a row in work, from its column `to` on."""
-    _copy_row(
-        dual[0, row, left:right],
-        dual[1, row, left:right],
-        plane[row, left:right],
-        ahead[row, left:right],
+        dual[0, row, begin:end],
+        dual[1, row, begin:end],
+        plane[row, begin:end],
+        ahead[row, begin:end],
         p[0, 1 + to :],
         p[1, 1 + to :],
         x[to:],

@@ -121,9 +121,10 @@ def _reading_s(elemental_set: ElementalSet, layouts: Sequence[ChannelLayout]) ->
 
 def _times(elemental_set: ElementalSet, layout: ChannelLayout, place: Place, grid: PlaneGrid) -> tuple[float, float]:
     """Return the times of a pass over all views and of a step of the inner problem, for one colour of a plane."""
-    views = len(elemental_set.settings.view)
-    few = np.arange(views)[max((views - _VIEWS) // 2, 0) :][:_VIEWS]
-    operator = OperatorFactory(elemental_set, layout, None).at(place, grid, few.tolist())
+    views, factory = len(elemental_set.settings.view), OperatorFactory(elemental_set, layout, None)
+    seeing = np.unique(factory.at(place, grid).seeing_views // len(layout.lattices))
+    few = seeing[max((seeing.size - _VIEWS) // 2, 0) :][:_VIEWS]
+    operator = factory.at(place, grid, few.tolist())
     images = ElementalImages(np.zeros(operator.images_shape, np.float32), read_variance_e2=1.0)
     samples = np.ones(grid.shape, np.float32)
     dual = DualField.zero([grid.shape], samples.dtype)

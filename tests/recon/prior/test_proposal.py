@@ -13,11 +13,13 @@ from scipy.optimize import LinearConstraint, minimize
 from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.reconstruction.planes.penalised import Objective
 from faintfield.recon.likelihood.images import Image
+from faintfield.recon.prior import evidence as evidence_module
 from faintfield.recon.prior import proposal
 from faintfield.recon.prior.evidence import Evidence, Misfit, evidence_of_planes, misfits
 from faintfield.recon.prior.proposal import Scores, best_mixture, mixtures_of, propose, scores
 from faintfield.recon.solver import penalty_weight
 from faintfield.recon.solver.data_fit import SceneProblem
+from faintfield.recon.solver.penalty_weight import validation_views
 from tests.recon.displaced import dark_views, noisy_images, pieces, planes_displaced_by
 from tests.recon.operator_contract import dense_matrix
 
@@ -123,14 +125,21 @@ def test_shifted_plane_contradicts_and_true_plane_does_not() -> None:
     assert shifted.contradicts
 
 
-def test_squares_and_variances_are_those_of_dense_matrices() -> None:
+@pytest.mark.parametrize("compared_pixels", [1, 2**26])  # of a seventh of the views, and of all
+def test_squares_and_variances_are_those_of_dense_matrices(
+    compared_pixels: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(evidence_module, "_COMPARED_PIXELS", compared_pixels)
     operator, images = dark_views(pieces(20), 1)
     images = replace(images, background_e=0.3)
     plane = pieces(20) + np.float32(0.2)
-    matrix = dense_matrix(operator).T
+    count = len(operator.seeing_views)
+    views = operator.seeing_views if compared_pixels > 1 else operator.seeing_views[validation_views(count)]
+    pixels = np.isin(np.arange(images.electrons.shape[0]), views).repeat(images.electrons[0].size)
+    matrix = dense_matrix(operator).T[:, pixels]
     expected = matrix.T @ plane.ravel() + 0.3
     variance = expected + images.read_variance_e2
-    squares = np.square(images.electrons.ravel() - expected)
+    squares = np.square(images.electrons.ravel()[pixels] - expected)
     share = np.linspace(0, 1, plane.size).reshape(plane.shape)
     (result,) = misfits(operator, images, plane, [{"light, detail": share, "light, smooth": 1 - share}])
     weight = matrix.T @ share.ravel()

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.reconstruction.planes import forecast as forecast_module
 from tests.pipelines.conftest import Command
 
@@ -36,17 +35,34 @@ def test_forecast_is_of_missing_planes(
     assert _forecast(done, colour_set, "--out", out, *SWEEP)["planes"] == 0
 
 
-def test_prior_takes_more_time_and_memory(scene: Path, tmp_path: Path, done: Command) -> None:
-    """Times are of this computer, and compared by their number of steps alone: all are positive."""
-    without, with_prior = (
-        _forecast(done, scene, "--out", tmp_path / "out", "--depth-mm", "500", "--prior", prior)
-        for prior in ("tv", "auto")
+def test_prior_and_standard_deviations_take_more(
+    scene: Path, tmp_path: Path, done: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(forecast_module, "_times", lambda *_: (0.0, 1.0))
+    plain, with_sigma, with_prior, with_both = (
+        _forecast(done, scene, "--out", tmp_path / "out", "--depth-mm", "500", *options)
+        for options in (
+            ("--prior", "tv"),
+            ("--prior", "tv", "--uncertainty"),
+            ("--prior", "auto"),
+            ("--prior", "auto", "--uncertainty"),
+        )
     )
-    assert with_prior["memory_mb"] > without["memory_mb"] > 0
-    assert min(without["seconds"], with_prior["seconds"]) > 0
-    solvers = SolverOptions(prior="tv"), SolverOptions(prior="tv", uncertainty=True), SolverOptions(prior="auto")
-    works = [forecast_module._work("pmlem", solver, 10**6) for solver in solvers]  # noqa: SLF001
-    assert works == sorted(works)
+    assert plain["seconds"] < with_sigma["seconds"] < with_prior["seconds"] < with_both["seconds"]
+    assert plain["memory_mb"] < with_prior["memory_mb"]
+
+
+def test_plane_that_only_views_at_the_edge_see_has_a_forecast(
+    scene: Path, tmp_path: Path, done: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Views that see it are timed, not those in the middle of all."""
+    monkeypatch.setattr(forecast_module, "_VIEWS", 1)
+    pose = tmp_path / "aside.toml"
+    plane = ('name = "aside"', "point_mm = [-230, 0, 500]", "normal = [0, 0, -1]", "size_mm = [20, 20]")
+    pose.write_text("\n".join(("format = 1", "[[plane]]", *plane)))
+    found = _forecast(done, scene, "--out", tmp_path / "out", "--plane-pose", pose, "--method", "backprojection")
+    assert found["planes"] == 1
+    assert found["seconds"] > 0
 
 
 @pytest.mark.parametrize(
