@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.recon.numba_tools import compiled
+from faintfield.recon.threads import run_in_threads, strips
 
 
 def blurred(image: NDArray[np.floating], spacings: Sequence[int]) -> NDArray[np.floating]:
@@ -19,20 +20,24 @@ def blurred(image: NDArray[np.floating], spacings: Sequence[int]) -> NDArray[np.
     """
     image = np.ascontiguousarray(image)
     for spacing in spacings:
-        mean = np.empty_like(image)
-        _average(image, spacing, mean)
-        image = mean
+        image = _averaged(image, spacing)
     return image
 
 
+def _averaged(image: NDArray[np.floating], spacing: int) -> NDArray[np.floating]:
+    mean = np.empty_like(image)
+    run_in_threads(lambda strip: _average(*strip, image, spacing, mean), strips(image))
+    return mean
+
+
 @compiled
-def _average(image: NDArray[np.floating], spacing: int, mean: NDArray[np.floating]) -> None:
-    """Set the means of three rows, then of three columns, a spacing apart."""
+def _average(first: int, stop: int, image: NDArray[np.floating], spacing: int, mean: NDArray[np.floating]) -> None:
+    """Set rows to the means of three rows, then of three columns, a spacing apart."""
     rows, columns = image.shape
     half, quarter = image.dtype.type(0.5), image.dtype.type(0.25)
     padded = np.empty(columns + 2 * spacing, image.dtype)
     middle, after = padded[spacing:], padded[2 * spacing :]
-    for row in range(rows):
+    for row in range(first, stop):
         above, here, below = image[max(row - spacing, 0)], image[row], image[min(row + spacing, rows - 1)]
         for j in range(columns):
             middle[j] = half * here[j] + quarter * (above[j] + below[j])

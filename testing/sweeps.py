@@ -39,7 +39,7 @@ class ArraySweeps:
 
     def run(self, sweep: Sweep) -> tuple[float, Image]:
         """Do an operation view by view."""
-        operation, views, image_of_view, samples, images, expected_images, pixels = sweep
+        operation, views, image_of_view, samples, images, expected_images, pixels, seed = sweep
         value, sums = 0.0, np.zeros(kernels.size_of(self._geometry))
         light = None if samples is None else samples.reshape(-1).astype(np.float64)
         for view in views.tolist():
@@ -58,6 +58,18 @@ class ArraySweeps:
                     expected_images[image] = expected.reshape(expected_images.shape[1:])
                 elif operation == kernels.NORMAL:
                     sums += matrix.T @ expected
+                elif operation in (kernels.SQUARES, kernels.VARIANCE_OF_SQUARES, kernels.NOISE):
+                    _, background, variance, _ = self._known(view, pixels)
+                    mean = expected + background
+                    if operation == kernels.SQUARES:
+                        assert images is not None
+                        sums += matrix.T @ (images[image].reshape(-1) - mean) ** 2
+                    elif operation == kernels.VARIANCE_OF_SQUARES:
+                        sums += matrix.T @ (mean + 2 * (mean + variance) ** 2)
+                    else:
+                        key = _scramble(np.array([seed * len(self._geometry.lattice_of_view) + view], np.uint32))
+                        odd = _scramble(np.arange(mean.size, dtype=np.uint32) ^ key) % 2
+                        sums += matrix.T @ (np.where(odd, -1, 1) * np.sqrt(mean + variance))
                 elif operation in (kernels.PRECISION, kernels.PRECISION_OF_EACH):
                     precision = 1 / self._variance(view, expected, pixels)
                     alone = [matrix] if operation == kernels.PRECISION else planes
@@ -68,8 +80,8 @@ class ArraySweeps:
                     of_view, ratio = self._compare(view, expected, images[image].reshape(-1), response, pixels)
                     value += of_view
                     sums += matrix.T @ ratio
-        scatters = operation in kernels.SCATTERING
-        return value, np.asarray(sums, self._dtype) if scatters else np.zeros(1, self._dtype)
+        reads = operation in kernels.ONLY_READING
+        return value, np.zeros(1, self._dtype) if reads else np.asarray(sums, self._dtype)
 
     def _places(self, view: int) -> Iterator[tuple[Image, Image, NDArray[np.bool_], tuple[int, int]]]:
         """Yield the row and column of each pixel on each plane, whether it sees the plane, and the plane's shape."""
@@ -181,6 +193,13 @@ class ArraySweeps:
         return float(value[sees].sum()), softmax(joint, axis=1) @ _COUNTS / mean
 
 
+def _scramble(bits: NDArray[np.uint32]) -> NDArray[np.uint32]:
+    """Return the bits that `kernels.scramble` gives, all at once."""
+    for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B)):
+        bits = (bits ^ (bits >> np.uint32(shift))) * np.uint32(factor)
+    return bits ^ (bits >> np.uint32(16))
+
+
 def sweeps_contract(make: Callable[[kernels.SceneGeometry, Hiding, int], Sweeps]) -> None:
     """Check sweeps over planes, planes that hide one another, a mosaic and a surface, in float32 and float64.
 
@@ -242,6 +261,10 @@ def _check_scene(
             check_sums(kernels.PRECISION, chosen, samples=samples, pixels=pixels)
             check_sums(kernels.PRECISION_OF_EACH, chosen, samples=samples, pixels=pixels)
             of_data: dict[str, Any] = {"samples": samples, "images": images, "pixels": pixels}
+            check_sums(kernels.SQUARES, chosen, **of_data)
+            check_sums(kernels.VARIANCE_OF_SQUARES, chosen, samples=samples, pixels=pixels)
+            for seed in (0, 5):
+                check_sums(kernels.NOISE, chosen, samples=samples, pixels=pixels, seed=seed)
             # The exact model's sum over counts may leave out what is below 1e-7
             allowed = max(tolerance, 1e-6) if model == POISSON_GAUSSIAN else tolerance
             value, ratio = truth.run(Sweep(kernels.VALUE_AND_RATIO, chosen, everything, **of_data))

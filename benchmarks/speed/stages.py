@@ -26,7 +26,7 @@ _FUNCTIONS = {
     "read frames": ["faintfield.pipelines.reconstruction.channels:load_channel"],
     "operator, start": [_PLANES + "sweep:Channel._operator", _PLANES + "penalised:Objective.of"],
     _WHOLE[0]: ["faintfield.recon.solver.penalty_weight:cross_validated_weight"],
-    _WHOLE[1]: ["faintfield.recon.prior.proposal:_fold_scores"],
+    _WHOLE[1]: ["faintfield.recon.prior.proposal:_judged"],
     "inner problem": ["faintfield.recon.solver.pmlem:_Pmlem._minimum"],
     "passes": ["faintfield.recon.solver.data_fit:DataFit.value_and_gradient"],
     "metric, certificate": [

@@ -32,9 +32,6 @@ _TOLERANCE = 0.02
 # PMLEM is not interrupted before it has made so many iterates: the first is its smooth start.
 _MIN_ITERATES = 3
 
-# A plane that was zero somewhere begins at this share of the smooth start there.
-_MIN_START = 1e-3
-
 
 class _Refined(NamedTuple):
     """PMLEM's plane in electrons of one round, its dual field, its views and rounds, and whether it is the optimum."""
@@ -186,7 +183,7 @@ class PlaneAccumulator:
         before = self._refined.get(index)
         start, dual = objective.start, objective.posed.dual()
         if before is not None:
-            start, dual = np.maximum(before.plane / share, _MIN_START * start), before.dual
+            start, dual = objective.positive(before.plane / share), before.dual
         fit = objective.posed.fit(objective.level_e)
         iterates = pmlem(fit, start, penalty_weight=weight, penalty=objective.penalty, tolerance=_TOLERANCE, dual=dual)
         for count, iterate in enumerate(iterates, 1):

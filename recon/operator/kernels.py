@@ -11,23 +11,26 @@ Rows of the detector are distributed in tiles, tile `t` to worker `t mod workers
 accumulator of its own: sums are deterministic for a given number of workers.
 """
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.recon.likelihood.pixel_models import LEAST_SQUARES, form_ratio_of_block
-from faintfield.recon.numba_tools import advanced, compiled, index, pointer, prefetch
+from faintfield.recon.numba_tools import advanced, compiled, index, inlined, pointer, prefetch
 from faintfield.recon.operator.blocks import copy, gather, hide, prefetch_block, scatter, visit_plane, weigh
 from faintfield.recon.operator.placement import BLOCK_PX, COUNTED, EXPECTED, locate_on_all, unpack_relief, weights_of
 
 # Detector rows of a tile; 4, 16 or 32 rows take as long.
 TILE_ROWS = 8
 
-FORWARD, ADJOINT, RATIO, VALUE, VALUE_AND_RATIO, REACH, NORMAL, PRECISION, PRECISION_OF_EACH = range(9)
+# Those before NORMAL read images, but for FORWARD and REACH.
+FORWARD, ADJOINT, RATIO, VALUE, VALUE_AND_RATIO, REACH, SQUARES = range(7)
+NORMAL, VARIANCE_OF_SQUARES, NOISE, PRECISION, PRECISION_OF_EACH = range(7, 12)
 
-# The operations that add to the samples.
-SCATTERING = (ADJOINT, RATIO, VALUE_AND_RATIO, NORMAL, PRECISION, PRECISION_OF_EACH)
+# The operations that do not add to the samples.
+ONLY_READING = (FORWARD, VALUE, REACH)
 
 
 class SceneGeometry(NamedTuple):
@@ -103,7 +106,7 @@ class PixelModel(NamedTuple):
 @compiled
 def sweep(
     operation, planes, expected_images, accumulator, images, image_of_view, pixels, geometry, hiding, space,
-    views, worker, workers,
+    views, seed, worker, workers,
 ):  # fmt: skip
     """Process a worker's share of the detector pixels of `views`; return their negative log-likelihood.
 
@@ -115,7 +118,12 @@ def sweep(
         `VALUE`: only the returned value, which is meaningful for this operation and the next alone.
         `VALUE_AND_RATIO`: both; the logarithms of the value take a tenth of the time.
         `REACH`: geometry.reach ← where rows see the planes; it must process all views, and come first.
+        `SQUARES`: accumulator += Hᵀ (images − b − H planes)², with the background b of `pixels`.
         `NORMAL`: accumulator += Hᵀ H planes.
+        `VARIANCE_OF_SQUARES`: accumulator += Hᵀ( m + 2 (m + σ²)² ), with m = H planes + b and σ² of `pixels`: the
+        variance of such squares, of a Poisson number and a normal one.
+        `NOISE`: accumulator += Hᵀ n with n = ±√(m + σ²), where the sign of pixel `row · columns + column` of a view is
+        the last bit of `scramble(pixel ^ scramble(seed · views + view))`: minus for one.
         `PRECISION`: accumulator += Hᵀ[ (H 1)/v ], where v is `pixels.variance` plus the light of the planes, at least
         `pixels.level` for each pixel, or for least squares that level times the response.
         `PRECISION_OF_EACH`: accumulator += H_zᵀ[ (H_z 1)/v ] for each plane z.
@@ -179,12 +187,21 @@ def sweep(
                         copy(scratch, index(EXPECTED), expected_at, pixel, count)
                         continue
                     at = index((lattice * rows + row) * columns + first)
-                    if operation < NORMAL and operation != ADJOINT:
+                    if ADJOINT < operation < REACH:
                         value += form_ratio_of_block(
                             model, count, expected, advanced(images_at, pixel), advanced(background_at, at),
                             advanced(variance_at, at), counted, level, models, operation != RATIO,
                         )  # fmt: skip
-                    elif operation > NORMAL:
+                    elif operation == SQUARES:
+                        _form_squares(count, advanced(images_at, pixel), advanced(background_at, at), scratch)
+                    elif operation == VARIANCE_OF_SQUARES:
+                        _form_variance(count, advanced(background_at, at), advanced(variance_at, at), scratch)
+                    elif operation == NOISE:
+                        _draw_noise(
+                            count, advanced(background_at, at), advanced(variance_at, at),
+                            scramble(np.uint32(seed * count_of_views + view)), row * columns + first, scratch,
+                        )  # fmt: skip
+                    elif operation >= PRECISION:
                         response = advanced(maps, layer + layer + index((lattice * rows + row) * padded + first))
                         _form_precision(model, count, advanced(variance_at, at), response, level, scratch)
                     if operation == PRECISION:
@@ -196,6 +213,42 @@ def sweep(
                 if operation == REACH:
                     geometry.reach[view, row, 0], geometry.reach[view, row, 1] = left, right
     return value
+
+
+@compiled
+def _form_squares(count, observed, background, scratch):
+    """Set `EXPECTED`, the light of some pixels, to the squares of what they differ by."""
+    for k in range(count):
+        miss = observed[k] - scratch[index(EXPECTED) + k] - background[k]
+        scratch[index(EXPECTED) + k] = miss * miss
+
+
+@compiled
+def _form_variance(count, background, variance, scratch):
+    """Set `EXPECTED`, the light of some pixels, to the variance of the squares of what they differ by."""
+    number = type(scratch[0])
+    for k in range(count):
+        mean = scratch[index(EXPECTED) + k] + background[k]
+        scratch[index(EXPECTED) + k] = mean + number(2) * (mean + variance[k]) * (mean + variance[k])
+
+
+@compiled
+def _draw_noise(count, background, variance, key, first, scratch):
+    """Set `EXPECTED`, the light of some pixels from the `first` on, to noise of its variance, with random signs."""
+    zero = type(scratch[0])(0)
+    for k in range(count):
+        light = max(scratch[index(EXPECTED) + k], zero)
+        deviation = math.sqrt(light + background[k] + variance[k])
+        is_negative = scramble(np.uint32(first + k) ^ key) & np.uint32(1)
+        scratch[index(EXPECTED) + k] = -deviation if is_negative else deviation
+
+
+@inlined
+def scramble(bits):
+    """Return 32 bits that look random, others for each number (uint32): Wellons 2018, "lowbias32"."""
+    bits = np.uint32((bits ^ (bits >> np.uint32(16))) * np.uint32(0x7FEB352D))
+    bits = np.uint32((bits ^ (bits >> np.uint32(15))) * np.uint32(0x846CA68B))
+    return np.uint32(bits ^ (bits >> np.uint32(16)))
 
 
 @compiled

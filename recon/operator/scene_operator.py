@@ -114,26 +114,20 @@ class SceneOperator:
         chosen = self._views(views)
         expected = np.zeros((len(chosen), *self.images_shape[1:]), self.dtype)
         samples = self._checked("samples", samples, self.samples_shape)
-        image_of_view = self._image_of(chosen)
+        image_of_view = np.zeros(self.images_shape[0], np.intp)
+        image_of_view[chosen] = np.arange(len(chosen))
         self._sweeps.run(Sweep(kernels.FORWARD, chosen, image_of_view, samples=samples, expected_images=expected))
         return expected
 
     def adjoint(self, images: Image, views: ViewSelection = None) -> Image:
         """Return Hᵀ g (samples) of images (view, row, column), summed over `views`."""
         images = self._checked("images", images, self.images_shape)
-        return self._adjoint(images, self._views(views), self.all_views)
-
-    def adjoint_of_views(self, images: Image, views: Sequence[int] | NDArray[np.integer]) -> Image:
-        """Return Hᵀ g (samples) of the images (chosen view, row, column) of some views, as if all others were zero."""
-        chosen = self._views(views)
-        images = self._checked("images", images, (len(chosen), *self.images_shape[1:]))
-        return self._adjoint(images, chosen, self._image_of(chosen))
+        return self._sums(Sweep(kernels.ADJOINT, self._views(views), self.all_views, images=images))
 
     def adjoint_of_forward(self, samples: Image, views: ViewSelection = None) -> Image:
         """Return Hᵀ H f (samples), with no array as large as the images."""
         samples = self._checked("samples", samples, self.samples_shape)
-        sums = self._sweeps.run(Sweep(kernels.NORMAL, self._views(views), self.all_views, samples=samples))[1]
-        return sums.reshape(self.samples_shape)
+        return self._sums(Sweep(kernels.NORMAL, self._views(views), self.all_views, samples))
 
     def adjoint_of_precision(
         self,
@@ -154,20 +148,46 @@ class SceneOperator:
         pixels = kernels.PixelModel(likelihood.model, known, known, level)
         operation = kernels.PRECISION_OF_EACH if of_each else kernels.PRECISION
         samples = self._checked("samples", samples, self.samples_shape)
-        sums = self._sweeps.run(Sweep(operation, self._views(views), self.all_views, samples=samples, pixels=pixels))[1]
-        return sums.reshape(self.samples_shape)
+        return self._sums(Sweep(operation, self._views(views), self.all_views, samples, pixels=pixels))
+
+    def adjoint_of_squares(self, samples: Image, images: ElementalImages, views: ViewSelection = None) -> Image:
+        """Return Hᵀ r² (samples) of the residuals `r = g − b − H f`."""
+        return self._sums(self._comparison(kernels.SQUARES, samples, images, views, images.read_variance_e2))
+
+    def adjoint_of_variance_of_squares(
+        self, samples: Image, images: ElementalImages, views: ViewSelection = None
+    ) -> Image:
+        """Return `Hᵀ( m + 2 (m + σ²)² )` (samples), m = H f + b: the variance of squared residuals that are noise."""
+        operation, known = kernels.VARIANCE_OF_SQUARES, images.read_variance_e2
+        return self._sums(self._comparison(operation, samples, images, views, known))
+
+    def adjoint_of_noise(
+        self, samples: Image, images: ElementalImages, seed: int = 0, views: ViewSelection = None
+    ) -> Image:
+        """Return Hᵀ n (samples) of a draw of the noise n of data: its deviation √(H f + b + σ²) with random signs.
+
+        Each number from zero on is the seed of another draw.
+        """
+        sweep = self._comparison(kernels.NOISE, samples, images, views, images.read_variance_e2)
+        return self._sums(sweep._replace(seed=seed))
 
     def adjoint_of_map(self, value: float | Image, views: ViewSelection = None) -> Image:
         """Return Hᵀ g (samples) of images that all equal one map, broadcastable to (lattice, row, column)."""
-        return self._adjoint(self._map(value), self._views(views), self.lattice_of_view)
+        if np.ndim(value) == 0:
+            if value == 0:
+                return np.zeros(self.samples_shape, self.dtype)
+            return self.dtype.type(value) * self.sensitivity(views)
+        return self._sums(Sweep(kernels.ADJOINT, self._views(views), self.lattice_of_view, images=self._map(value)))
 
     def sensitivity(self, views: ViewSelection = None) -> Image:
         """Return s = Hᵀ 1 (samples): without flat field, the number of views that see each sample."""
-        return self._sensitivity.reshape(self.samples_shape) if views is None else self.adjoint_of_map(1.0, views)
+        if views is None:
+            return self._sensitivity.reshape(self.samples_shape)
+        return self._sums(Sweep(kernels.ADJOINT, self._views(views), self.lattice_of_view, images=self._map(1.0)))
 
     @cached_property
     def _sensitivity(self) -> Image:
-        sensitivity = self.adjoint_of_map(1.0)
+        sensitivity = self.sensitivity(self.all_views)
         sensitivity.flags.writeable = False
         return sensitivity
 
@@ -204,12 +224,12 @@ class SceneOperator:
 
         r is the ratio of `recon.likelihood.pixel_models`: the gradient of the negative log-likelihood is s − Hᵀ r.
         """
-        value, sums = self._likelihood(kernels.VALUE_AND_RATIO, samples, images, views)
+        value, sums = self._sweeps.run(self._likelihood(kernels.VALUE_AND_RATIO, samples, images, views))
         return value, sums.reshape(self.samples_shape)
 
     def adjoint_of_ratio(self, samples: Image, images: ElementalImages, views: ViewSelection = None) -> Image:
         """Return Hᵀ r (samples) alone: for shifted Poisson data Hᵀ[ (g + σ²)₊ / (H f + b + σ²) ], as in eq. (2)."""
-        return self._likelihood(kernels.RATIO, samples, images, views)[1].reshape(self.samples_shape)
+        return self._sums(self._likelihood(kernels.RATIO, samples, images, views))
 
     def negative_log_likelihood(self, samples: Image, images: ElementalImages, views: ViewSelection = None) -> float:
         """Return the negative log-likelihood alone, up to a constant, in a sweep that only reads.
@@ -217,7 +237,7 @@ class SceneOperator:
         For the shifted Poisson model it is `Σ m − y + y ln(y/m)`, with `y = (g + σ²)₊` and `m = H f + b + σ²`, over the
         pixels that see a plane.
         """
-        return self._likelihood(kernels.VALUE, samples, images, views)[0]
+        return self._sweeps.run(self._likelihood(kernels.VALUE, samples, images, views))[0]
 
     def planes_of[Number: np.generic](self, samples: NDArray[Number]) -> list[NDArray[Number]]:
         """Return each plane (row, column) of samples, as views into them."""
@@ -238,32 +258,30 @@ class SceneOperator:
         """Return a map (lattice, row, column) as each view has it, (view, row, column); a number as it is."""
         return float(value) if np.ndim(value) == 0 else self._map(value)[self.lattice_of_view[views]]
 
-    def _image_of(self, chosen: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Return the number of each view among the chosen ones (view,), zero for the others."""
-        image_of_view = np.zeros(self.images_shape[0], np.intp)
-        image_of_view[chosen] = np.arange(len(chosen))
-        return image_of_view
+    def _sums(self, sweep: Sweep) -> Image:
+        return self._sweeps.run(sweep)[1].reshape(self.samples_shape)
 
-    def _adjoint(self, images: Image, views: NDArray[np.intp], image_of_view: NDArray[np.intp]) -> Image:
-        sums = self._sweeps.run(Sweep(kernels.ADJOINT, views, image_of_view, images=images))[1]
-        return sums.reshape(self.samples_shape)
+    def _likelihood(self, operation: int, samples: Image, images: ElementalImages, views: ViewSelection) -> Sweep:
+        known = images.read_variance_e2 if images.likelihood.knows_read_noise else 0.0
+        return self._comparison(operation, samples, images, views, known)
 
-    def _likelihood(
-        self, operation: int, samples: Image, images: ElementalImages, views: ViewSelection
-    ) -> tuple[float, Image]:
+    def _comparison(
+        self,
+        operation: int,
+        samples: Image,
+        images: ElementalImages,
+        views: ViewSelection,
+        read_variance_e2: float | Image,
+    ) -> Sweep:
+        """Return a sweep that compares samples with images of this variance besides that of light."""
         if images.valid is not None and not self._geometry.valid.size:
             raise GeometryMismatch("the images have pixels that do not count; make the operator with their `valid`")
         likelihood = images.likelihood
-        pixels = kernels.PixelModel(
-            likelihood.model,
-            self._map(images.background_e),
-            self._map(images.read_variance_e2 if likelihood.knows_read_noise else 0.0),
-            likelihood.level_e,
-        )
+        known = self._map(images.background_e), self._map(read_variance_e2)
+        pixels = kernels.PixelModel(likelihood.model, *known, likelihood.level_e)
         samples = self._checked("samples", samples, self.samples_shape)
         data = self._checked("images", images.electrons, self.images_shape)
-        chosen = self._views(views)
-        return self._sweeps.run(Sweep(operation, chosen, self.all_views, samples=samples, images=data, pixels=pixels))
+        return Sweep(operation, self._views(views), self.all_views, samples, data, pixels=pixels)
 
     def _checked(self, name: str, array: Image, shape: tuple[int, ...]) -> Image:
         """Return samples or images in the operator's dtype, copied only where they have to be."""

@@ -30,7 +30,9 @@ class Sweep(NamedTuple):
         Images that `ADJOINT` and the operations that compare with data read; zeros, into which `FORWARD` writes
         H `samples`.
     pixels : PixelModel, optional
-        Statistics of the pixels, for operations that compare with data or take a precision.
+        Statistics of the pixels, for all operations that know of noise.
+    seed : int
+        Number of the draw of `NOISE`.
     """
 
     operation: int
@@ -40,6 +42,7 @@ class Sweep(NamedTuple):
     images: Image | None = None
     expected_images: Image | None = None
     pixels: kernels.PixelModel | None = None
+    seed: int = 0
 
 
 class Sweeps(Protocol):
@@ -68,19 +71,19 @@ class CompiledSweeps:
 
     def run(self, sweep: Sweep) -> tuple[float, Image]:
         """Run the kernel in all threads; return the sums of their values and of their samples."""
-        operation, views, image_of_view, samples, images, expected_images, pixels = sweep
+        operation, views, image_of_view, samples, images, expected_images, pixels, seed = sweep
         nothing = _read_only(np.zeros(1, self._dtype))
         planes, data = (nothing if array is None else _read_only(array) for array in (samples, images))
         background, variance = (nothing, nothing) if pixels is None else map(_read_only, pixels[1:3])
         model = kernels.PixelModel(pixels.model if pixels else 0, background, variance, pixels.level if pixels else 0.0)
-        size = kernels.size_of(self._geometry) if operation in kernels.SCATTERING else 1
+        size = 1 if operation in kernels.ONLY_READING else kernels.size_of(self._geometry)
         sums = [np.zeros(size, self._dtype) for _ in range(self._workers)]
 
         def work(worker: int) -> float:
             written = np.zeros(1, self._dtype) if expected_images is None else expected_images.reshape(-1)
             arrays = (planes, written, sums[worker], data, _read_only(image_of_view))
             space = make_workspace(len(self._geometry.layout), self._dtype)
-            share = (_read_only(views), worker, self._workers)
+            share = (_read_only(views), seed, worker, self._workers)
             return float(kernels.sweep(operation, *arrays, model, self._geometry, self._hiding, space, *share))
 
         values = run_in_threads(work, range(self._workers))

@@ -1,19 +1,18 @@
 """Evidence of the data for each plane: a picture with its noise, that of the plane without noise, and their misfit."""
 
-from collections.abc import Callable, Iterable, Sequence
-from itertools import islice, product
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.recon.blur import blurred
 from faintfield.recon.likelihood.images import ElementalImages, Image
-from faintfield.recon.numba_tools import compiled
 from faintfield.recon.operator.scene_operator import SceneOperator, ViewSelection
 from faintfield.recon.solver.initialization import well_seen_samples
 from faintfield.recon.solver.penalty_weight import fold_count, validation_views
-from faintfield.recon.threads import run_in_threads
+from faintfield.recon.threads import elementwise, summed
 
 # Spacings of the blurs of the noise of a draw, which stands in for many draws, and of the number of views.
 _WIDE_BLUR, _NARROW_BLUR = (1, 2, 4, 8, 12), (1, 1)
@@ -91,7 +90,7 @@ def evidence_of_planes(
     coverages = _alone(operator, np.ones_like(samples), operator.coverage(views), views)
     if of_all_views is None:
         variance = seen + operator.adjoint_of_map(images.background_e + images.read_variance_e2, views)
-        drawn = _drawn_noise(operator, images, samples, views, (0, 0))
+        drawn = operator.adjoint_of_noise(samples, images, views=views)
         sums = zip(coverages, operator.planes_of(variance), operator.planes_of(drawn), strict=True)
         noises = [_noise(coverage, of_variance, [of_draw]) for coverage, of_variance, of_draw in sums]
     else:
@@ -105,7 +104,7 @@ def evidence_of_planes(
         own, coverages, shown, noises, operator.planes_of(residual), strict=True
     ):
         pilot, change = (_divided(array, coverage) for array in (of_pilot, of_residual))
-        found.append(Evidence(pilot + change, pilot, noise, coverage, light))
+        found.append(Evidence(elementwise(np.add, pilot, change, out=change), pilot, noise, coverage, light))
     return found
 
 
@@ -131,79 +130,41 @@ def _alone(operator: SceneOperator, samples: Image, projected: Image, views: Vie
 
 
 def _divided(sums: Image, coverage: Image) -> Image:
-    return np.divide(sums, coverage, out=np.zeros_like(sums), where=coverage > 0)
+    return elementwise(lambda x, w: np.divide(x, w, out=np.zeros_like(x), where=w > 0), sums, coverage)
 
 
 def noise_of_back_projection(
-    operator: SceneOperator, images: ElementalImages, plane: Image, *, seed: int = 0, draws: int = 1
+    operator: SceneOperator, images: ElementalImages, plane: Image, *, draws: int = 1
 ) -> Noise:
     """Return the covariance of the back-projection's noise, for data of variance `H f + b + σ²`.
 
     A pixel of variance v adds h² v to the variance of a sum Hᵀ g, and the operator can only add h v. The ratio of the
-    two sums changes slowly over the plane, so it is measured, like the kernel, on back-projected draws of the noise,
-    one view at a time. Each draw and view has a random generator of its own.
+    two sums changes slowly over the plane, so it is measured, like the kernel, on back-projected draws of the noise.
     """
     variance = operator.adjoint_of_map(images.background_e + images.read_variance_e2)
     variance += operator.adjoint_of_forward(np.maximum(plane, 0))
-    drawn = (_drawn_noise(operator, images, plane, None, (seed, draw)) for draw in range(draws))
-    return _noise(operator.coverage(), variance, list(drawn))
+    drawn = [operator.adjoint_of_noise(plane, images, seed) for seed in range(draws)]
+    return _noise(operator.coverage(), variance, drawn)
 
 
 def _noise(coverage: Image, variance: Image, draws: list[Image]) -> Noise:
     """Return the covariance of `Hᵀ n / coverage` from `Hᵀ` of the variances, and draws of Hᵀ n."""
     seen = well_seen_samples(coverage)
     squares, products = np.zeros_like(coverage), np.zeros((3, 3))
+
+    def scaled(light: Image, variance: Image, seen: NDArray[np.bool_]) -> Image:
+        return np.asarray(np.where(seen, light, 0) / np.sqrt(np.maximum(variance, _TINY)))
+
+    def of_mean(squares: Image, wide: Image, variance: Image, coverage: Image, seen: NDArray[np.bool_]) -> Image:
+        factor = squares / (len(draws) * np.maximum(wide, _TINY)) * variance
+        return np.asarray(np.divide(factor, np.square(coverage), out=np.full_like(factor, np.inf), where=seen))
+
     for light in draws:
-        squares += np.square(light)
-        products += _products_of_neighbours(np.where(seen, light, 0) / np.sqrt(np.maximum(variance, _TINY)))
-    factor = blurred(squares, _WIDE_BLUR) / (len(draws) * np.maximum(blurred(variance, _WIDE_BLUR), _TINY))
-    factor *= blurred(variance, _NARROW_BLUR)
-    of_mean = np.full(coverage.shape, np.inf, np.float32)
-    np.divide(factor, np.square(blurred(coverage, _NARROW_BLUR)), out=of_mean, where=seen)
-    return Noise(of_mean, products / max(products[1, 1], _TINY))
-
-
-def _drawn_noise(
-    operator: SceneOperator, images: ElementalImages, samples: Image, views: ViewSelection, seed: tuple[int, int]
-) -> Image:
-    """Return Hᵀ n (samples) of one draw of the noise n of the data: its deviation with random signs, fast to draw."""
-    light, total = np.maximum(samples, 0), np.zeros_like(samples)
-    for some in _few_views(operator, operator.all_views if views is None else np.asarray(views)):
-        drawn = operator.forward(light, some)
-        drawn += operator.map_of_views(images.background_e + images.read_variance_e2, some)
-
-        def draw(view: int, variance: Image) -> None:
-            random_bytes = np.random.default_rng([*seed, view]).bytes(-(-variance.size // 8))
-            _draw_signs(variance.reshape(-1), np.frombuffer(random_bytes, np.uint8))
-
-        _for_each_view(operator.workers, draw, some.tolist(), drawn)
-        total += operator.adjoint_of_views(drawn, some)
-    return total
-
-
-@compiled
-def _draw_signs(variance: Image, random_bytes: NDArray[np.uint8]) -> None:
-    """Replace variances (pixel,) by their roots, with the signs of random bits."""
-    one = variance.dtype.type(1)
-    for k in range(variance.size):
-        sign = one - 2 * one * ((random_bytes[k >> 3] >> (7 - (k & 7))) & 1)
-        variance[k] = sign * np.sqrt(variance[k])
-
-
-def _for_each_view(workers: int, work: Callable[..., None], *of_views: Iterable[Any]) -> None:
-    """Call `work` with what belongs to each view, in threads."""
-
-    def take(worker: int) -> None:
-        for of_view in islice(zip(*of_views, strict=True), worker, None, workers):
-            work(*of_view)
-
-    run_in_threads(take, range(workers))
-
-
-def _few_views(operator: SceneOperator, views: NDArray[np.intp]) -> list[NDArray[np.intp]]:
-    """Return views in groups whose images together are about as large as the samples: each group takes some sweeps."""
-    at_a_time = max(int(np.prod(operator.samples_shape)) // int(np.prod(operator.images_shape[1:])), 1)
-    return np.array_split(views, -(-len(views) // at_a_time)) if len(views) else []
+        squares = elementwise(lambda total, light: total + np.square(light), squares, light, out=squares)
+        products += _products_of_neighbours(elementwise(scaled, light, variance, seen))
+    wide, narrow = (blurred(variance, spacings) for spacings in (_WIDE_BLUR, _NARROW_BLUR))
+    arrays = blurred(squares, _WIDE_BLUR), wide, narrow, blurred(coverage, _NARROW_BLUR), seen
+    return Noise(elementwise(of_mean, *arrays).astype(np.float32), products / max(products[1, 1], _TINY))
 
 
 def _products_of_neighbours(picture: Image) -> NDArray[np.float64]:
@@ -240,25 +201,11 @@ def misfits(
 
     `regions` are shares (row, column) of the samples of each plane in "light, detail" and "light, smooth".
     """
-    squares, spreads = (np.zeros_like(samples) for _ in range(2))
     views = _compared_views(operator)
     variances = operator.adjoint_of_forward(samples, views)
     variances += operator.adjoint_of_map(images.background_e + images.read_variance_e2, views)
-    for some in _few_views(operator, views):
-        expected = operator.forward(samples, some)
-        expected += operator.map_of_views(images.background_e, some)
-        spread = expected + operator.map_of_views(images.read_variance_e2, some)
-
-        def compare(view: int, of_view: Image, spread: Image) -> None:
-            """Set the light to squares of residuals, and the variance to that of these."""
-            spread *= 2 * spread  # of a Poisson number and a normal one
-            spread += of_view
-            np.subtract(images.electrons[view], of_view, out=of_view)
-            np.square(of_view, out=of_view)
-
-        _for_each_view(operator.workers, compare, some.tolist(), expected, spread)
-        squares += operator.adjoint_of_views(expected, some)
-        spreads += operator.adjoint_of_views(spread, some)
+    squares = operator.adjoint_of_squares(samples, images, views)
+    spreads = operator.adjoint_of_variance_of_squares(samples, images, views)
     parts = (operator.planes_of(array) for array in (squares, variances, spreads))
     return [_misfit(*of_plane) for of_plane in zip(*parts, regions, strict=True)]
 
@@ -274,13 +221,15 @@ def _compared_views(operator: SceneOperator) -> NDArray[np.intp]:
     return views[sorted(chosen)]
 
 
+def _product(terms: Image, share: Image) -> float:
+    return float(np.sum(terms * share, dtype=np.float64))
+
+
 def _misfit(squares: Image, variances: Image, spreads: Image, regions: dict[str, Image]) -> Misfit:
     """Return the misfit of one plane from back-projected squares, variances, and variances of squares."""
 
     def ratio(share: Image) -> tuple[float, float]:
-        total, expected, spread = (
-            float(np.sum(terms * share, dtype=np.float64)) for terms in (squares, variances, spreads)
-        )
+        total, expected, spread = (summed(_product, terms, share) for terms in (squares, variances, spreads))
         return (total / expected, np.sqrt(max(spread, 0.0)) / expected) if expected > 0 else (1.0, 0.0)
 
     (detail, of_detail), (smooth, of_smooth) = ratio(regions["light, detail"]), ratio(regions["light, smooth"])

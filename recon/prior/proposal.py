@@ -19,13 +19,20 @@ from faintfield.recon.prior.scales import Candidates, is_of_samples
 from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.solver.initialization import mean_light_e
 from faintfield.recon.solver.penalties import Penalty, differences
-from faintfield.recon.solver.penalty_weight import MIN_VIEWS, Fold, folds_to_predict, windows_of
+from faintfield.recon.solver.penalty_weight import (
+    MIN_VIEWS,
+    WINDOW_SAMPLES,
+    Fold,
+    fold_count,
+    folds_to_predict,
+    windows_of,
+)
 from faintfield.recon.solver.proximal import DualField
 from faintfield.recon.solver.uncertainty import Answers, Expected, LocalProblem, UsualErrors, Weights
-from faintfield.recon.threads import map_in_threads
+from faintfield.recon.threads import elementwise, map_in_threads
 
-# Fewest folds: the choice by one is noisy.
-_MIN_FOLDS = 2
+# Fewest folds of a plane that is no larger than this: the choice by one is noisy.
+_MIN_FOLDS, _SMALL_PLANE = 2, 2**19
 
 # Spacings of the blur of the border between what is lit and what is dark.
 _BORDER_BLUR = (1, 1, 2)
@@ -42,10 +49,8 @@ _SHARP_SHARE, _SHARP_BLUR = 0.1, (1,)
 # noise where the proposal is right. Chosen on the scenes of `CHOSEN_ON` in benchmarks/imaging/uncertainty.py.
 WEIGHT_ABOUT_PROPOSAL = 1.2
 
-# Samples of the windows that stand for a large plane, together, and samples along the edges of a window that do not
-# count: filters do not know what lies beyond. Chosen on `CHOSEN_ON` in benchmarks/imaging/uncertainty.py, at 1280 x 960
-# samples: twelve windows are within 0.7 % of the error with weights from all of the plane, half as many within 3.2 %.
-WINDOW_SAMPLES, _EDGE = 3 * 2**18, 16
+# Samples along the edges of a window that do not count: filters do not know what lies beyond.
+_EDGE = 16
 
 # A candidate is left out if the mixture predicts nearly as well without it: this share of its gain over the first
 # candidate is lost at most for each; and for all those of the samples of a large plane, which take three times as long
@@ -196,15 +201,8 @@ def propose(
     """
     operator = problem.operator
     regions = regions or regions_of_planes(operator, samples, evidences)
-    level_e = mean_light_e(operator, samples)
-    names: list[list[str]] = []
-    totals: list[dict[str, Scores]] = [{} for _ in evidences]
     parts = _parts(problem, samples, evidences, regions, other_colours)
-    for part in parts:
-        for number in range(max(_MIN_FOLDS, folds_to_predict(problem))):
-            names, found = _fold_scores(part, penalty_weight, level_e, number, candidates)
-            for total, more in zip(totals, found, strict=True):
-                total.update({name: total[name] + new if name in total else new for name, new in more.items()})
+    names, totals = _judged(parts, penalty_weight, mean_light_e(operator, samples), candidates)
     is_slow = is_of_samples if len(parts) > 1 else None
     mixtures = [mixtures_of(*of_plane, is_slow=is_slow) for of_plane in zip(names, totals, strict=True)]
     planes = zip(operator.planes_of(samples), evidences, regions, mixtures, strict=True)
@@ -239,7 +237,7 @@ def _parts(
     other_colours: Image | None,
 ) -> list[_Part]:
     """Return the parts by which candidates are judged: windows of a large plane, else all."""
-    windows = windows_of(problem, MIN_VIEWS, WINDOW_SAMPLES)
+    windows = windows_of(problem, MIN_VIEWS, WINDOW_SAMPLES, workers=1)
     if not windows:
         return [_Part(problem, samples, evidences, regions, other_colours)]
     parts = []
@@ -269,21 +267,49 @@ def regions_of_planes(operator: SceneOperator, samples: Image, evidences: Sequen
 def regions_of(plane: Image, evidence: Evidence) -> Regions:
     """Return the regions of a plane: with light or without, with detail or without."""
     lit = blurred((opacity(plane) > 0.5).astype(np.float32), _BORDER_BLUR)
-    seen = np.isfinite(evidence.noise.variance)
-    change = np.hypot(*differences(evidence.pilot))
-    noise = np.sqrt(np.where(seen, evidence.noise.variance, 1))
-    np.divide(change, noise, out=change, where=noise > 0)
+    change = elementwise(_in_units_of_noise, *differences(evidence.pilot), evidence.noise.variance)
     detail = blurred((blurred(change, _CHANGE_BLUR) > _DETAIL_SHARE).astype(np.float32), _DETAIL_BLUR)
+    dark, smooth = (elementwise(lambda share: 1 - share, share) for share in (lit, detail))
     return {
-        "light, detail": lit * detail,
-        "light, smooth": lit * (1 - detail),
-        "dark, detail": (1 - lit) * detail,
-        "dark, smooth": (1 - lit) * (1 - detail),
+        "light, detail": elementwise(np.multiply, lit, detail),
+        "light, smooth": elementwise(np.multiply, lit, smooth),
+        "dark, detail": elementwise(np.multiply, dark, detail, out=detail),
+        "dark, smooth": elementwise(np.multiply, dark, smooth, out=smooth),
     }
 
 
+def _in_units_of_noise(down: Image, right: Image, variance: Image) -> Image:
+    """Return the length of differences over the deviation of the noise, in electrons where there is none."""
+    change, noise = np.hypot(down, right), np.sqrt(np.where(np.isfinite(variance), variance, 1))
+    return np.divide(change, noise, out=change, where=noise > 0)
+
+
+def _judged(
+    parts: Sequence[_Part], penalty_weight: float, level_e: float, candidates: Candidates
+) -> tuple[list[list[str]], list[dict[str, Scores]]]:
+    """Return the names of each plane's candidates, and their scores by region, in some folds of all parts."""
+
+    def judge(job: tuple[_Part, int]) -> tuple[list[list[str]], list[dict[str, Scores]]]:
+        return _fold_scores(*job, penalty_weight, level_e, candidates)
+
+    if len(parts) > 1:  # each window in a fold of its own
+        views = [len(part.problem.operator.seeing_views) for part in parts]
+        folds = [number % fold_count(count) for number, count in enumerate(views)]
+        found = map_in_threads(judge, list(zip(parts, folds, strict=True)))
+    else:
+        problem = parts[0].problem
+        is_small = int(np.prod(problem.operator.samples_shape)) <= _SMALL_PLANE
+        count = max(_MIN_FOLDS if is_small else 1, folds_to_predict(problem))
+        found = [judge((parts[0], fold)) for fold in range(count)]
+    totals: list[dict[str, Scores]] = [{} for _ in parts[0].evidences]
+    for _, of_planes in found:
+        for total, more in zip(totals, of_planes, strict=True):
+            total.update({name: total[name] + new if name in total else new for name, new in more.items()})
+    return found[0][0], totals
+
+
 def _fold_scores(
-    part: _Part, penalty_weight: float, level_e: float, number: int, candidates: Candidates
+    part: _Part, number: int, penalty_weight: float, level_e: float, candidates: Candidates
 ) -> tuple[list[list[str]], list[dict[str, Scores]]]:
     """Return the names of each plane's candidates, and their scores from the training views of a fold, by region."""
     problem, fold = part.problem, Fold(part.problem, Penalty(), number, level_e)
@@ -311,14 +337,15 @@ def _sharpened(mixed: Image, plane: Image, evidence: Evidence) -> Image:
     They are `s (f − u)` with `s = d / (d + c v)`, d the mean of (f − u)² nearby and v the noise's variance, because
     large noise does more harm than the blur. Where no view sees the plane, f is all there is.
     """
-    edges = plane - evidence.pilot
-    variance = evidence.noise.variance
-    seen = np.isfinite(variance)
-    squares = blurred(np.square(edges).astype(np.float32), _SHARP_BLUR)
-    noise = np.float32(_SHARP_SHARE) * np.where(seen, variance, 0)
+    squares = blurred(elementwise(lambda f, u: np.square(f - u), plane, evidence.pilot), _SHARP_BLUR)
+    return elementwise(_with_edges, mixed, plane, evidence.pilot, squares, evidence.noise.variance)
+
+
+def _with_edges(mixed: Image, plane: Image, pilot: Image, squares: Image, variance: Image) -> Image:
+    noise = np.float32(_SHARP_SHARE) * np.where(np.isfinite(variance), variance, 0)
     share = np.ones_like(squares)
     np.divide(squares, squares + noise, out=share, where=noise > 0)
-    return np.asarray(np.maximum(mixed + share * edges, 0), mixed.dtype)
+    return np.maximum(mixed + share * (plane - pilot), 0)
 
 
 def _mixed(

@@ -10,6 +10,7 @@ from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.scene_operator import SceneOperator, ViewSelection
 from faintfield.recon.solver.initialization import smooth_start, well_seen_samples
 from faintfield.recon.solver.proximal import DualField
+from faintfield.recon.threads import elementwise
 
 # Smallest value of a metric relative to its median over seen samples; samples below follow their neighbours. Solvers
 # take a hundredth, as for samples that are not well seen: with less, those hold up all others. Errors take less.
@@ -87,18 +88,24 @@ class DataFit:
         return [_at_least(_MIN_METRIC_OF_ERRORS, of_plane) for of_plane in operator.planes_of(metric)]
 
     def _metric_of_plane(self, samples: Image) -> Image:
-        likelihood = self._images.likelihood
-        fixed = likelihood.name == "least-squares"
-        # Each array is as large as the plane: work in place
-        variance_e2 = np.full_like(samples, likelihood.level_e) if fixed else np.maximum(samples, self._min_light_e)
-        seen = self.sensitivity > 0
-        np.multiply(variance_e2, self._coverage, out=variance_e2, where=seen)
-        np.divide(variance_e2, self.sensitivity, out=variance_e2, where=seen)
-        variance_e2 += self._known_e2
-        (precision,) = self._operator.planes_of(np.reciprocal(variance_e2, out=variance_e2))
-        metric = blurred(precision, (1,)).reshape(samples.shape)
-        metric *= self._coverage
-        return metric
+        likelihood, number = self._images.likelihood, samples.dtype.type
+        least, most = number(self._min_light_e), None
+        if likelihood.name == "least-squares":
+            least = most = number(likelihood.level_e)
+
+        def precision(light: Image, coverage: Image, sensitivity: Image, known_e2: Image) -> Image:
+            """Return the inverse variance of a pixel of each sample's mean response."""
+            variance_e2 = np.clip(light, least, most)
+            np.multiply(variance_e2, coverage, out=variance_e2, where=sensitivity > 0)
+            np.divide(variance_e2, sensitivity, out=variance_e2, where=sensitivity > 0)
+            variance_e2 += known_e2
+            return np.reciprocal(variance_e2, out=variance_e2)
+
+        known_e2 = np.broadcast_to(np.asarray(self._known_e2, samples.dtype), samples.shape)
+        of_samples = elementwise(precision, samples, self._coverage, self.sensitivity, known_e2)
+        (of_plane,) = self._operator.planes_of(of_samples)
+        metric = blurred(of_plane, (1,)).reshape(samples.shape)
+        return elementwise(np.multiply, metric, self._coverage, out=metric)
 
     def _averaged(self, known_e2: NDArray[np.float64], level_e: float) -> float | Image:
         """Return b + σ² for each sample, averaged such that the inverse of its sum with typical light is kept."""
@@ -113,7 +120,8 @@ class DataFit:
 def _at_least(share: float, metric: Image) -> Image:
     some = metric.reshape(-1)[:: 1 + metric.size // _MEDIAN_SAMPLES]
     seen = some[some > 0]
-    return np.maximum(metric, share * np.median(seen if seen.size else metric[metric > 0]))
+    least = metric.dtype.type(share * np.median(seen if seen.size else metric[metric > 0]))
+    return elementwise(lambda w: np.maximum(w, least), metric)
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,14 @@
 """The start of every reconstruction: back-projection, and smooth positive samples."""
 
+from functools import partial
+
 import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.recon.blur import blurred
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.scene_operator import SceneOperator, ViewSelection
+from faintfield.recon.threads import elementwise
 
 # Spacings of the blur, which has a standard deviation of 2 samples.
 _START_BLUR = (1, 1, 1, 1, 2)
@@ -44,10 +47,15 @@ def smooth_start(operator: SceneOperator, images: ElementalImages, views: ViewSe
     starts = []
     for light, coverage in zip(lights, coverages, strict=True):
         covered = blurred(coverage, _START_BLUR)
-        start = np.full_like(light, level)
-        np.divide(blurred(light, _START_BLUR), covered, out=start, where=covered > 1e-3 * covered.max())
-        starts.append(np.maximum(start, 0.01 * level, out=start))
+        positive_mean = partial(_positive_mean, level, 1e-3 * float(covered.max()))
+        starts.append(elementwise(positive_mean, blurred(light, _START_BLUR), covered))
     return operator.samples_of(starts)
+
+
+def _positive_mean(level: float, least: float, light: Image, coverage: Image) -> Image:
+    mean = np.full_like(light, level)
+    np.divide(light, coverage, out=mean, where=coverage > least)
+    return np.maximum(mean, 0.01 * level, out=mean)
 
 
 def well_seen_samples(sensitivity: Image) -> NDArray[np.bool_]:

@@ -7,6 +7,7 @@ work is thus done on the plane, where it is cheap, and few passes over the data 
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -15,7 +16,8 @@ from faintfield.recon.likelihood.images import Image
 from faintfield.recon.solver.data_fit import DataFit
 from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.solver.proximal import DualField
-from faintfield.recon.solver.proximal_kernels import squared_distance
+from faintfield.recon.solver.proximal_kernels import residual_and_excess, squared_distance
+from faintfield.recon.threads import elementwise, summed
 
 # An inner problem is solved until its error is this fraction of the last step, or of the tolerance, of which it is half
 # as much after each pass that hardly lowered the certificate's distance; limit on its steps, of which a pass over the
@@ -163,7 +165,7 @@ class _Pmlem:
                 if passes <= _PASSES_WITH_NEW_METRIC:
                     del metric
                     metric = self._fit.metric(plane)
-                point = plane - gradient / (metric * metric.dtype.type(self._scale))
+                point = elementwise(partial(_stepped, metric.dtype.type(self._scale)), plane, gradient, metric)
             else:
                 self._scale *= 2
                 point = (accepted.plane + point) / 2  # half the way
@@ -199,17 +201,19 @@ class _Pmlem:
         return plane
 
     def _certificate(self, plane: Image, gradient: Image, metric: Image, dual: DualField) -> Certificate:
-        reach = plane.dtype.type(self._weight) / metric
-        after = dual.primal(plane - gradient / metric, reach)
-        residual = distance(plane, np.maximum(after, 0), metric)
-        slack = self._weight * dual.penalty_and_slack(plane, self._penalty)[1]
-        below = np.minimum(after, 0, out=after)
-        below *= metric
-        below *= plane
-        slack -= float(np.sum(below, dtype=np.float64))
-        size = norm(plane, metric)
+        one, weight = plane.dtype.type(1), plane.dtype.type(self._weight)
+        after = elementwise(partial(_stepped, one), plane, gradient, metric)
+        after = dual.primal(after, elementwise(lambda w: weight / w, metric))
+        square, excess = summed(residual_and_excess, *(array.reshape(-1) for array in (plane, after, metric)))
+        residual, size = float(np.sqrt(square)), norm(plane, metric)
+        slack = self._weight * dual.penalty_and_slack(plane, self._penalty)[1] + float(excess)
         parts = (residual + np.sqrt(residual**2 + 2 * slack), residual, np.sqrt(2 * slack))
         return Certificate(*(_relative(part, size) for part in parts))
+
+
+def _stepped(scale: np.floating, plane: Image, gradient: Image, metric: Image) -> Image:
+    """Return f − ∇L/(scale w), where the quadratic has its minimum."""
+    return plane - gradient / (scale * metric)
 
 
 def _relative(part: float, size: float) -> float:
@@ -226,4 +230,5 @@ def norm(plane: Image, metric: Image) -> float:
 
 def distance(plane: Image, other: Image, metric: Image) -> float:
     """Return √ Σ w (x − y)², summed in float64; y = 0 if it has no samples."""
-    return float(np.sqrt(squared_distance(plane.reshape(-1), other.reshape(-1), metric.reshape(-1))))
+    flat = (array.reshape(-1) for array in (plane, other, metric))
+    return float(np.sqrt(summed(squared_distance, *flat)))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.solver import proximal_kernels
 from faintfield.recon.solver.penalties import Penalty
-from faintfield.recon.threads import run_in_threads
+from faintfield.recon.threads import elementwise, run_in_threads
 
 # Steps that a strip makes before it exchanges its edges with its neighbours, and its fewest rows: it also works on as
 # many rows of its neighbours as it makes steps.
@@ -30,6 +30,9 @@ _CHECK_SHARE = 0.1
 
 # Samples along a side of the coarsest problem from which others begin, and most steps that each of these makes.
 _COARSEST, _MAX_COARSE_STEPS = 64, 600
+
+# Shares of the change from a proposal that are compared, from zero to one.
+_SHARES = 11
 
 # Length of the first step on the plane in the metric, and the strong convexity that the acceleration relies on; the
 # metric's own is 1, and less converges faster.
@@ -95,7 +98,8 @@ class DualField:
                 problem = _sums_of_four(w * v) / coarse_w, coarse_w, 2 * weight, penalty
                 coarse.begin_coarse(*problem, gap)
                 coarse.prox(*problem, lambda _: gap, _MAX_COARSE_STEPS)
-                _interpolate_edges(coarse.vectors[0], vectors)
+                rows = _edges(coarse_w.shape[0], self.workers)
+                _on_strips(proximal_kernels.interpolate_edges, rows, coarse.vectors[0], vectors)
 
     def primal(self, point: Image, reach: Image) -> Image:
         """Return `v − β/w ∇ᵀp` (samples), not clipped at zero, for a point v and a reach β/w."""
@@ -106,7 +110,7 @@ class DualField:
 
     def penalty_and_slack(self, plane: Image, penalty: Penalty) -> tuple[float, float]:
         """Return `Σ φ(|∇x|)`, and `Σ φ(|∇x|) + φ*(p) − p·∇x ≥ 0`, which is zero where p belongs to x; x is x − x̂."""
-        change = plane if self.proposal is None else plane - self.proposal
+        change = plane if self.proposal is None else elementwise(np.subtract, plane, self.proposal)
         sums = [
             _penalty_and_slack(vectors, part, penalty, self.workers)
             for vectors, (part,) in zip(self.vectors, self._planes(change), strict=True)
@@ -133,8 +137,10 @@ class DualField:
         max_steps : int
             Limit on the steps for each plane, rounded up to the next check of the gap.
         """
-        reach = point.dtype.type(weight) / metric
-        plane = np.maximum(self.primal(point, reach), 0)
+        scaled = point.dtype.type(weight)
+        reach = elementwise(lambda w: scaled / w, metric)
+        plane = self.primal(point, reach)
+        np.maximum(plane, 0, out=plane)
         gap, steps = 0.0, 0
         # The kernel takes an array without samples for a proposal of zeros
         proposals = [np.empty((0, 0), point.dtype)] * len(self.vectors)
@@ -144,9 +150,10 @@ class DualField:
             iteration = _PrimalDual(self.vectors[index], x, v, r, proposals[index], penalty, self.workers)
             while True:
                 iteration.advance()
-                gap_of_plane = weight * iteration.gap()
+                share, gap_of_plane = iteration.share_and_gap(weight)
                 if iteration.steps >= max_steps or gap_of_plane <= gap_tolerance(plane) / len(self.vectors):
                     break
+            iteration.reduce_change(share)
             gap, steps = gap + gap_of_plane, max(steps, iteration.steps)
         return ProxResult(plane, gap, steps)
 
@@ -175,6 +182,7 @@ class _PrimalDual:
         self._changed = vectors, plane, self._ahead
         self._fixed = point, reach, step_sizes(reach), proposal, penalty.smoothing_e, penalty.bounded
         self._point, self._reach, self._proposal, self._penalty = point, reach, proposal, penalty
+        self._may_stay = proposal.size > 0 and bool(proposal.min() >= 0)
         self._edges, self._workers = _edges(len(plane), workers), workers
         tiles = max(round(plane.shape[1] / _TILE_COLUMNS), 1)
         self._column_edges = [tile * plane.shape[1] // tiles for tile in range(tiles + 1)]
@@ -201,13 +209,38 @@ class _PrimalDual:
             around = rows[first][0], rows[stop][1], columns[left][0], columns[right][1]
             proximal_kernels.step_tile(first, stop, left, right, *around, *self._changed, *self._fixed, *steps)
 
-    def gap(self) -> float:
-        """Return the gap relative to the weight."""
+    def share_and_gap(self, weight: float) -> tuple[float, float]:
+        """Return a share θ and a bound on the gap of `x̂ + θ (x − x̂)`, the best of some.
+
+        The change of x from its proposal x̂ has small waves for long after p is right, and where x̂ is nearly the
+        minimum they make up most of the gap. That is d + s, with the distance d from the primal of p and the slack s of
+        the penalty. √d is convex in θ, and s ≤ θ s(1). Below θ = 1 the bound is `(√d + √(d + s))² ≥ d + s`, half the
+        square of that which `recon.solver.pmlem.Certificate` gives. A proposal with negative light is left out.
+        """
         vectors, plane, _ = self._changed
-        arguments = (plane, vectors, self._point, self._reach)
-        distance: float = sum(_on_strips(proximal_kernels.distance_from_primal, self._edges, *arguments))
-        change = plane - self._proposal if self._proposal.size else plane
-        return distance + _penalty_and_slack(vectors, change, self._penalty, self._workers)[1]
+        change = elementwise(np.subtract, plane, self._proposal) if self._proposal.size else plane
+        slack = _penalty_and_slack(vectors, change, self._penalty, self._workers)[1]
+        of_plane = self._distance(plane)
+        if not self._may_stay:
+            return 1.0, weight * (of_plane + slack)
+        of_proposal = self._distance(self._proposal)
+        shares = np.linspace(0, 1, _SHARES)
+        roots = (1 - shares) * np.sqrt(of_proposal) + shares * np.sqrt(of_plane)
+        gaps = (roots + np.sqrt(roots**2 + shares * slack)) ** 2
+        gaps[-1] = of_plane + slack
+        best = int(gaps.argmin())
+        return float(shares[best]), weight * float(gaps[best])
+
+    def reduce_change(self, share: float) -> None:
+        """Set x to `x̂ + θ (x − x̂)`, given θ."""
+        if share < 1:
+            plane = self._changed[1]
+            part = plane.dtype.type(share)
+            elementwise(lambda x, proposal: proposal + part * (x - proposal), plane, self._proposal, out=plane)
+
+    def _distance(self, plane: Image) -> float:
+        arguments = (plane, self._changed[0], self._point, self._reach)
+        return float(sum(_on_strips(proximal_kernels.distance_from_primal, self._edges, *arguments)))
 
     def _next_steps(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         lengths, momenta = np.empty((2, _STEPS_PER_EXCHANGE))
@@ -236,18 +269,6 @@ def _sums_of_four(picture: Image) -> Image:
     sums += padded[::2, 1::2]
     sums += padded[1::2, 1::2]
     return sums
-
-
-def _interpolate_edges(coarse: Image, fine: Image) -> None:
-    """Set the vectors (2, row, column) at the edges of fine samples to those of coarse ones, linearly between them."""
-    for axis in (0, 1):
-        lines = np.moveaxis(coarse[axis], axis, 0)
-        between = lines / 2
-        between[1:] += lines[:-1] / 2
-        for first, along in ((0, between), (1, lines)):
-            target = np.moveaxis(fine[axis], axis, 0)[first::2]
-            target[:] = np.repeat(along, 2, axis=1)[: len(target), : target.shape[1]]
-        np.moveaxis(fine[axis], axis, 0)[-1] = 0  # beyond the last sample
 
 
 def step_sizes(reach: Image) -> Image:

@@ -217,6 +217,27 @@ def penalty_and_slack(first, stop, plane, dual, smoothing, bounded):
 
 
 @compiled
+def interpolate_edges(first, stop, coarse, fine):
+    """Set the vectors (2, row, column) at the edges of fine samples to those of coarse ones, linearly between them.
+
+    That is done for the fine samples of rows of coarse ones; beyond the last sample there is no vector.
+    """
+    rows, columns = fine.shape[1:]
+    half, zero = fine.dtype.type(0.5), fine.dtype.type(0)
+    for row in range(2 * first, min(2 * stop, rows)):
+        i = row // 2
+        for column in range(columns):
+            j = column // 2
+            down, right = coarse[0, i, j], coarse[1, i, j]
+            if row % 2 == 0:
+                down = half * (down + (coarse[0, i - 1, j] if i > 0 else zero))
+            if column % 2 == 0:
+                right = half * (right + (coarse[1, i, j - 1] if j > 0 else zero))
+            fine[0, row, column] = down if row < rows - 1 else zero
+            fine[1, row, column] = right if column < columns - 1 else zero
+
+
+@compiled
 def squared_distance(plane, other, metric):
     """Return Σ w (x − y)² over samples (sample,), summed in float64; y = 0 if it has no samples."""
     total = 0.0
@@ -228,3 +249,14 @@ def squared_distance(plane, other, metric):
         for k in range(plane.size):
             total += np.float64(metric[k] * plane[k] * plane[k])
     return total
+
+
+@compiled
+def residual_and_excess(plane, after, metric):
+    """Return Σ w (x − a₊)² and Σ w x (−a)₊ over samples (sample,), summed in float64."""
+    zero, square, excess = plane.dtype.type(0), 0.0, 0.0
+    for k in range(plane.size):
+        change = plane[k] - max(after[k], zero)
+        square += np.float64(metric[k] * change * change)
+        excess += np.float64(metric[k] * plane[k] * max(-after[k], zero))
+    return np.array([square, excess])

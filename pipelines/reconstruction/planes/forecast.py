@@ -19,9 +19,8 @@ from faintfield.pipelines.reconstruction.operators import OperatorFactory
 from faintfield.pipelines.reconstruction.planes.sweep import Sweep
 from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.prior.proposal import WINDOW_SAMPLES as CANDIDATE_SAMPLES
 from faintfield.recon.solver.penalties import Penalty
-from faintfield.recon.solver.penalty_weight import WINDOW_SAMPLES as PENALTY_SAMPLES
+from faintfield.recon.solver.penalty_weight import WINDOW_SAMPLES
 from faintfield.recon.solver.proximal import DualField
 from faintfield.recon.solver.uncertainty import DRAWS
 
@@ -96,13 +95,12 @@ def _work(method: Method, solver: SolverOptions, samples: int) -> tuple[float, f
     """Return about how many passes, and inner steps or what takes as long, a plane of one colour takes."""
     if method != "pmlem":
         return _PASSES[method], 0.0
-    of_weight = _share(samples, PENALTY_SAMPLES)
+    of_weight = _share(samples, WINDOW_SAMPLES)
     passes, steps, answer = 9 + 9 * of_weight, 650 + of_weight * (2000 if of_weight == 1 else 5000), 1600
     if solver.has_prior:
-        of_mixture = _share(samples, CANDIDATE_SAMPLES)
-        candidates = 3500 if of_mixture == 1 else 900  # of large planes mostly means of samples
+        candidates = 3500 if of_weight == 1 else 900  # of large planes mostly means of samples
         passes, answer = passes + 14, 2 * answer + candidates
-        steps += 250 + candidates + of_mixture * (13_000 if of_mixture == 1 else 18_000)
+        steps += 250 + candidates + of_weight * (13_000 if of_weight == 1 else 18_000)
     return passes, steps + DRAWS * answer * solver.uncertainty
 
 

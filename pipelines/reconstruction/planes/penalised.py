@@ -27,6 +27,9 @@ from faintfield.recon.solver.uncertainty import (
 # Largest number of passes over the data.
 MAX_PASSES = 30
 
+# Least light of samples to start from, relative to the mean light.
+_LEAST_START = 1e-3
+
 # PMLEM stops when its plane is this close to the optimum: root mean square, relative to the plane. A plane from which a
 # prior begins may be farther from it.
 _TOLERANCE, _PILOT_TOLERANCE = 0.01, 0.03
@@ -66,8 +69,9 @@ class Pilot:
 class Objective:
     """Objective that PMLEM minimises, without the penalty's weight.
 
-    `posed` is the operator, and the images with their likelihood; `level_e` the mean light of the samples that the
-    views see, in electrons. In the sum with `other_colours` (samples) a prior finds groups of alike patches.
+    `posed` is the operator, and the images with their likelihood; `start` (samples) are planes that are roughly right,
+    and `level_e` the mean light of those samples that the views see, in electrons. In the sum with `other_colours`
+    (samples) a prior finds groups of alike patches.
     """
 
     posed: SceneProblem
@@ -78,9 +82,18 @@ class Objective:
     other_colours: Image | None = None
 
     @classmethod
-    def of(cls, posed: SceneProblem, options: SolverOptions, other_colours: Image | None = None) -> "Objective":
-        """Choose likelihood and penalty according to the options, the light and the noise."""
-        start = posed.start()
+    def of(
+        cls,
+        posed: SceneProblem,
+        options: SolverOptions,
+        start: Image | None = None,
+        other_colours: Image | None = None,
+    ) -> "Objective":
+        """Choose likelihood and penalty according to the options, the light and the noise.
+
+        The light is that of samples to start from, by default the blurred back-projection.
+        """
+        start = posed.start() if start is None else start
         level_e = mean_light_e(posed.operator, start)
         likelihood = select_likelihood(posed.images, options.likelihood, level_e)
         posed = replace(posed, images=replace(posed.images, likelihood=likelihood))
@@ -89,6 +102,10 @@ class Objective:
             return float(1 / np.sqrt(np.median(posed.fit(level_e).metric(start)[posed.well_seen()])))
 
         return cls(posed, Penalty.for_noise(options.penalty, noise_e), start, level_e, options, other_colours)
+
+    def positive(self, samples: Image) -> Image:
+        """Return samples to start from, all of them positive."""
+        return np.maximum(samples, samples.dtype.type(_LEAST_START * self.level_e))
 
 
 def solve_pmlem(objective: Objective, *, as_pilot: bool = False) -> list[Solution]:
@@ -206,4 +223,4 @@ def _choose_weight(objective: Objective) -> tuple[float, Image, DualField, dict[
     if found.solution is None:
         how["penalty_weight_chosen"] = f"{how['penalty_weight_chosen']}, in windows of the plane"
         return found.weight, start, posed.dual(), how
-    return found.weight, np.maximum(found.solution.plane, 1e-3 * start), found.solution.dual, how
+    return found.weight, objective.positive(found.solution.plane), found.solution.dual, how

@@ -49,7 +49,7 @@ def with_prior(objective: Objective, solutions: Sequence[Solution]) -> list[Solu
         if isinstance(made, str):
             prior = PriorRecord(name="tv", left_out=made)
             if is_pilot(solutions[0].record):
-                found = solve_pmlem(objective)
+                found = solve_pmlem(Objective.of(objective.posed, objective.options))
             found = [replace(solution, record=structs.replace(solution.record, prior=prior)) for solution in found]
         else:
             found, answers = made
@@ -92,8 +92,7 @@ def _about_proposals(
         return "total variation predicts held-out views best"
     proposed = operator.samples_of([proposal.picture for proposal in proposals])
     dual = replace(objective.posed.dual(), proposal=proposed)
-    start = np.maximum(proposed, 1e-3 * objective.start)
-    record, found = certified(objective, start, WEIGHT_ABOUT_PROPOSAL * weight, dual)
+    record, found = certified(objective, objective.positive(proposed), WEIGHT_ABOUT_PROPOSAL * weight, dual)
     record = with_weight_of(record, first)
     planes = zip(operator.planes_of(found), solutions, proposals, strict=True)
     return [

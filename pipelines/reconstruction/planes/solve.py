@@ -66,9 +66,12 @@ def solve(
         chosen = "none: a mean of the views"
         return Solution(plane, SolveRecord(penalty_weight=None, penalty_weight_chosen=chosen, passes=1))
     if method == "pmlem":
-        objective = Objective.of(SceneProblem(operator, images), options, pilot.other_colours if pilot else None)
-        solved = [pilot.solution] if pilot else solve_pmlem(objective, as_pilot=options.has_prior)
-        return with_prior(objective, solved)[0]
+        problem = SceneProblem(operator, images)
+        if pilot:
+            objective = Objective.of(problem, options, pilot.solution.plane, pilot.other_colours)
+            return with_prior(objective, [pilot.solution])[0]
+        objective = Objective.of(problem, options)
+        return with_prior(objective, solve_pmlem(objective, as_pilot=options.has_prior))[0]
     return _solve_one_step_late(operator, images, method, options)
 
 
@@ -131,9 +134,15 @@ def solve_together(
     """
     _check_memory(grids.values())
     operator = factory.of_scene(grids)
-    other_colours = operator.samples_of([pilots[place].other_colours for place in grids]) if pilots else None
-    objective = Objective.of(SceneProblem(operator, images), options, other_colours)
-    joint = [pilots[place].solution for place in grids] if pilots else solve_pmlem(objective)
+    problem = SceneProblem(operator, images)
+    if pilots:
+        joint = [pilots[place].solution for place in grids]
+        near = operator.samples_of([solution.plane for solution in joint])
+        other_colours = operator.samples_of([pilots[place].other_colours for place in grids])
+        objective = Objective.of(problem, options, near, other_colours)
+    else:
+        objective = Objective.of(problem, options)
+        joint = solve_pmlem(objective)
     found: dict[Method, list[Solution]] = {}
     if "joint" in methods:
         found["joint"] = with_prior(objective, joint)
@@ -183,7 +192,7 @@ def _with_occlusion(
     options = replace(objective.options, penalty_weight=first.penalty_weight or 0.0)
     behind = replace(objective, posed=replace(objective.posed, operator=occluded), options=options)
     near = objective.posed.operator.samples_of([solution.plane for solution in joint])
-    better = solve_pmlem(replace(behind, start=np.maximum(near, 1e-3 * behind.start)))
+    better = solve_pmlem(replace(behind, start=behind.positive(near)))
     if (better[0].record.objective or 0.0) >= (first.objective or 0.0):
         return without("it explains the images no better")
     return [_of_opaque_part(solution, first) for solution in with_prior(behind, better)]
