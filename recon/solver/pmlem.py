@@ -23,6 +23,11 @@ from faintfield.recon.threads import elementwise, summed
 # as much after each pass that hardly lowered the certificate's distance; limit on its steps, of which a pass over the
 # data takes as long as about 30.
 _INNER_OF_STEP, _INNER_OF_TOLERANCE, _MAX_INNER_STEPS = 0.3, 0.7, 2000
+
+# That part of the tolerance near a proposal, where the first step is short and the quadratic hardly differs from L.
+_INNER_NEAR_PROPOSAL = 0.9
+
+# A certificate's distance that falls less than to this share of the last is slow.
 _SLOW = 0.8
 
 # Relative rise of the objective that rounding may cause; a step with a larger rise is undone.
@@ -144,6 +149,8 @@ class _Pmlem:
     def iterates(self, plane: Image, dual: DualField) -> Iterator[PmlemIterate]:
         """Iterate without end; arrays as large as the plane are dropped before the next of their kind is made."""
         metric = self._fit.metric(plane)
+        if dual.proposal is not None:
+            self._inner_of_tolerance = _INNER_NEAR_PROPOSAL
         accepted, point = None, plane
         passes, lowest = 0, np.inf
         while True:
