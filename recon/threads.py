@@ -145,8 +145,8 @@ def _on_parts[Result](work: Callable[[slice], Result], array: NDArray[Any]) -> l
     length = len(array)
     step = max(_PART * length // max(array.size, 1), 1)
     parts = [slice(first, first + step) for first in range(0, length, step)]
-    workers = min(_threads(), len(parts))
-    found = run_in_threads(lambda worker: [work(part) for part in parts[worker::workers]], range(max(workers, 1)))
+    workers = max(min(_threads(), len(parts)), 1)
+    found = run_in_threads(lambda worker: [work(part) for part in parts[worker::workers]], range(workers))
     return [found[number % workers][number // workers] for number in range(len(parts))]
 
 

@@ -32,7 +32,7 @@ from faintfield.recon.solver.uncertainty import Answers, Expected, LocalProblem,
 from faintfield.recon.threads import elementwise, map_in_threads
 
 # Fewest folds of a plane that is no larger than this: the choice by one is noisy.
-_MIN_FOLDS, _SMALL_PLANE = 2, 2**19
+_MIN_FOLDS, _SMALL_PLANE = 2, 3 * 2**18
 
 # Spacings of the blur of the border between what is lit and what is dark.
 _BORDER_BLUR = (1, 1, 2)

@@ -182,7 +182,7 @@ class _PrimalDual:
         self._changed = vectors, plane, self._ahead
         self._fixed = point, reach, step_sizes(reach), proposal, penalty.smoothing_e, penalty.bounded
         self._point, self._reach, self._proposal, self._penalty = point, reach, proposal, penalty
-        self._may_stay = proposal.size > 0 and bool(proposal.min() >= 0)
+        self._may_stay = proposal.size > 0 and penalty.smoothing_e == 0 and bool(proposal.min() >= 0)
         self._edges, self._workers = _edges(len(plane), workers), workers
         tiles = max(round(plane.shape[1] / _TILE_COLUMNS), 1)
         self._column_edges = [tile * plane.shape[1] // tiles for tile in range(tiles + 1)]
@@ -213,21 +213,23 @@ class _PrimalDual:
         """Return a share θ and a bound on the gap of `x̂ + θ (x − x̂)`, the best of some.
 
         The change of x from its proposal x̂ has small waves for long after p is right, and where x̂ is nearly the
-        minimum they make up most of the gap. That is d + s, with the distance d from the primal of p and the slack s of
-        the penalty. √d is convex in θ, and s ≤ θ s(1). Below θ = 1 the bound is `(√d + √(d + s))² ≥ d + s`, half the
-        square of that which `recon.solver.pmlem.Certificate` gives. A proposal with negative light is left out.
+        minimum they make up most of the gap q + l + s: square q and excess l are those from the primal of p, s is the
+        slack of the penalty. √q is convex in θ, l and s are in proportion. Below θ = 1 the bound is
+        `(√q + √(q + l + s))²`, half the square of that which `recon.solver.pmlem.Certificate` gives. Proposals with
+        negative light, and smoothed penalties, are left out.
         """
         vectors, plane, _ = self._changed
         change = elementwise(np.subtract, plane, self._proposal) if self._proposal.size else plane
         slack = _penalty_and_slack(vectors, change, self._penalty, self._workers)[1]
-        of_plane = self._distance(plane)
+        square, excess = self._distance(plane)
+        gap = square + excess + slack
         if not self._may_stay:
-            return 1.0, weight * (of_plane + slack)
-        of_proposal = self._distance(self._proposal)
+            return 1.0, weight * gap
+        square_of_proposal, excess_of_proposal = self._distance(self._proposal)
         shares = np.linspace(0, 1, _SHARES)
-        roots = (1 - shares) * np.sqrt(of_proposal) + shares * np.sqrt(of_plane)
-        gaps = (roots + np.sqrt(roots**2 + shares * slack)) ** 2
-        gaps[-1] = of_plane + slack
+        roots = (1 - shares) * np.sqrt(square_of_proposal) + shares * np.sqrt(square)
+        gaps = (roots + np.sqrt(roots**2 + (1 - shares) * excess_of_proposal + shares * (excess + slack))) ** 2
+        gaps[-1] = gap
         best = int(gaps.argmin())
         return float(shares[best]), weight * float(gaps[best])
 
@@ -238,9 +240,9 @@ class _PrimalDual:
             part = plane.dtype.type(share)
             elementwise(lambda x, proposal: proposal + part * (x - proposal), plane, self._proposal, out=plane)
 
-    def _distance(self, plane: Image) -> float:
+    def _distance(self, plane: Image) -> NDArray[np.float64]:
         arguments = (plane, self._changed[0], self._point, self._reach)
-        return float(sum(_on_strips(proximal_kernels.distance_from_primal, self._edges, *arguments)))
+        return np.sum(_on_strips(proximal_kernels.distance_from_primal, self._edges, *arguments), axis=0)
 
     def _next_steps(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         lengths, momenta = np.empty((2, _STEPS_PER_EXCHANGE))

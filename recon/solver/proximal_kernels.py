@@ -167,13 +167,13 @@ def primal_of_dual(first, stop, dual, centre, reach, plane):
 
 @compiled
 def distance_from_primal(first, stop, plane, dual, centre, reach):
-    """Return Σ w/β ( ½ (x − (u)₊)² + (−u)₊ x ) over rows of a plane x ≥ 0, with `u = v − β/w ∇ᵀp`.
+    """Return Σ w/2β (x − u₊)² and Σ w/β (−u)₊ x over rows of a plane x ≥ 0, with `u = v − β/w ∇ᵀp`.
 
-    It is how far x is from the minimum for a fixed p; each term is at least zero.
+    Their sum is how far x is from the minimum for a fixed p; each term is at least zero.
     """
-    zero, half, total = centre.dtype.type(0), centre.dtype.type(0.5), 0.0
+    zero, half, square, excess = centre.dtype.type(0), centre.dtype.type(0.5), 0.0, 0.0
     for row in range(first, stop):
-        of_row = zero
+        square_of_row, excess_of_row = zero, zero
         for j in range(centre.shape[1]):
             divergence = dual[0, row, j] + dual[1, row, j]
             divergence -= dual[0, row - 1, j] if row > 0 else zero
@@ -181,9 +181,11 @@ def distance_from_primal(first, stop, plane, dual, centre, reach):
             minimum = centre[row, j] + reach[row, j] * divergence
             x = plane[row, j]
             change = x - max(minimum, zero)
-            of_row += (half * change * change + max(-minimum, zero) * x) / reach[row, j]
-        total += of_row
-    return total
+            square_of_row += half * change * change / reach[row, j]
+            excess_of_row += max(-minimum, zero) * x / reach[row, j]
+        square += square_of_row
+        excess += excess_of_row
+    return np.array([square, excess])
 
 
 @compiled
