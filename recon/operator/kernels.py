@@ -25,9 +25,9 @@ from faintfield.recon.operator.placement import BLOCK_PX, COUNTED, EXPECTED, loc
 # Detector rows of a tile; 4, 16 or 32 rows take as long.
 TILE_ROWS = 8
 
-# Those before NORMAL read images, but for FORWARD and REACH.
+# Those up to SQUARES read images, but for FORWARD and REACH.
 FORWARD, ADJOINT, RATIO, VALUE, VALUE_AND_RATIO, REACH, SQUARES = range(7)
-NORMAL, VARIANCE_OF_SQUARES, NOISE, PRECISION, PRECISION_OF_EACH = range(7, 12)
+VARIANCE_OF_SQUARES, NOISE, NORMAL, PRECISION, PRECISION_OF_EACH = range(7, 12)
 
 # The operations that do not add to the samples.
 ONLY_READING = (FORWARD, VALUE, REACH)
@@ -177,7 +177,7 @@ def sweep(
                     if hides:
                         hide(opacities, opaque, depths, layout, count_of_planes, scratch, blocks)
                     pixel = index((image * rows + row) * columns + first)
-                    if operation < NORMAL:
+                    if operation <= SQUARES:
                         prefetch_block(images_at, pixel + index(columns))
                     if operation == ADJOINT:
                         copy(images_at, pixel, scratch, index(EXPECTED), count)
@@ -192,16 +192,12 @@ def sweep(
                             model, count, expected, advanced(images_at, pixel), advanced(background_at, at),
                             advanced(variance_at, at), counted, level, models, operation != RATIO,
                         )  # fmt: skip
-                    elif operation == SQUARES:
-                        _form_squares(count, advanced(images_at, pixel), advanced(background_at, at), scratch)
-                    elif operation == VARIANCE_OF_SQUARES:
-                        _form_variance(count, advanced(background_at, at), advanced(variance_at, at), scratch)
-                    elif operation == NOISE:
-                        _draw_noise(
-                            count, advanced(background_at, at), advanced(variance_at, at),
-                            scramble(np.uint32(seed * count_of_views + view)), row * columns + first, scratch,
+                    elif REACH < operation < NORMAL:
+                        _form_noise(
+                            operation, count, advanced(images_at, pixel), advanced(background_at, at),
+                            advanced(variance_at, at), seed * count_of_views + view, row * columns + first, scratch,
                         )  # fmt: skip
-                    elif operation >= PRECISION:
+                    elif operation > NORMAL:
                         response = advanced(maps, layer + layer + index((lattice * rows + row) * padded + first))
                         _form_precision(model, count, advanced(variance_at, at), response, level, scratch)
                     if operation == PRECISION:
@@ -216,31 +212,18 @@ def sweep(
 
 
 @compiled
-def _form_squares(count, observed, background, scratch):
-    """Set `EXPECTED`, the light of some pixels, to the squares of what they differ by."""
+def _form_noise(operation, count, observed, background, variance, draw, first, scratch):
+    """Set `EXPECTED`, the light of pixels from the `first` on, to squares of residuals, their variance, or noise."""
+    number, light, key = type(scratch[0]), advanced(scratch, index(EXPECTED)), scramble(np.uint32(draw))
     for k in range(count):
-        miss = observed[k] - scratch[index(EXPECTED) + k] - background[k]
-        scratch[index(EXPECTED) + k] = miss * miss
-
-
-@compiled
-def _form_variance(count, background, variance, scratch):
-    """Set `EXPECTED`, the light of some pixels, to the variance of the squares of what they differ by."""
-    number = type(scratch[0])
-    for k in range(count):
-        mean = scratch[index(EXPECTED) + k] + background[k]
-        scratch[index(EXPECTED) + k] = mean + number(2) * (mean + variance[k]) * (mean + variance[k])
-
-
-@compiled
-def _draw_noise(count, background, variance, key, first, scratch):
-    """Set `EXPECTED`, the light of some pixels from the `first` on, to noise of its variance, with random signs."""
-    zero = type(scratch[0])(0)
-    for k in range(count):
-        light = max(scratch[index(EXPECTED) + k], zero)
-        deviation = math.sqrt(light + background[k] + variance[k])
-        is_negative = scramble(np.uint32(first + k) ^ key) & np.uint32(1)
-        scratch[index(EXPECTED) + k] = -deviation if is_negative else deviation
+        mean = light[k] + background[k]
+        if operation == SQUARES:
+            light[k] = (observed[k] - mean) * (observed[k] - mean)
+        elif operation == VARIANCE_OF_SQUARES:
+            light[k] = mean + number(2) * (mean + variance[k]) * (mean + variance[k])
+        else:
+            deviation = math.sqrt(max(mean + variance[k], number(0)))
+            light[k] = -deviation if scramble(np.uint32(first + k) ^ key) & np.uint32(1) else deviation
 
 
 @inlined

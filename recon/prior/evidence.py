@@ -142,8 +142,9 @@ def noise_of_back_projection(
     two sums changes slowly over the plane, so it is measured, like the kernel, on back-projected draws of the noise.
     """
     variance = operator.adjoint_of_map(images.background_e + images.read_variance_e2)
-    variance += operator.adjoint_of_forward(np.maximum(plane, 0))
-    drawn = [operator.adjoint_of_noise(plane, images, seed) for seed in range(draws)]
+    light = np.maximum(plane, 0)
+    variance += operator.adjoint_of_forward(light)
+    drawn = [operator.adjoint_of_noise(light, images, seed) for seed in range(draws)]
     return _noise(operator.coverage(), variance, drawn)
 
 
@@ -152,12 +153,12 @@ def _noise(coverage: Image, variance: Image, draws: list[Image]) -> Noise:
     seen = well_seen_samples(coverage)
     squares, products = np.zeros_like(coverage), np.zeros((3, 3))
 
-    def scaled(light: Image, variance: Image, seen: NDArray[np.bool_]) -> Image:
-        return np.asarray(np.where(seen, light, 0) / np.sqrt(np.maximum(variance, _TINY)))
+    def scaled(light: Image, variance: Image, mask: NDArray[np.bool_]) -> Image:
+        return np.asarray(np.where(mask, light, 0) / np.sqrt(np.maximum(variance, _TINY)))
 
-    def of_mean(squares: Image, wide: Image, variance: Image, coverage: Image, seen: NDArray[np.bool_]) -> Image:
+    def of_mean(squares: Image, wide: Image, variance: Image, coverage: Image, mask: NDArray[np.bool_]) -> Image:
         factor = squares / (len(draws) * np.maximum(wide, _TINY)) * variance
-        return np.asarray(np.divide(factor, np.square(coverage), out=np.full_like(factor, np.inf), where=seen))
+        return np.asarray(np.divide(factor, np.square(coverage), out=np.full_like(factor, np.inf), where=mask))
 
     for light in draws:
         squares = elementwise(lambda total, light: total + np.square(light), squares, light, out=squares)

@@ -31,9 +31,6 @@ _CHECK_SHARE = 0.1
 # Samples along a side of the coarsest problem from which others begin, and most steps that each of these makes.
 _COARSEST, _MAX_COARSE_STEPS = 64, 600
 
-# Shares of the change from a proposal that are compared, from zero to one.
-_SHARES = 11
-
 # Length of the first step on the plane in the metric, and the strong convexity that the acceleration relies on; the
 # metric's own is 1, and less converges faster.
 _FIRST_LENGTH, _CONVEXITY = 1.0, 0.6
@@ -150,11 +147,13 @@ class DualField:
             iteration = _PrimalDual(self.vectors[index], x, v, r, proposals[index], penalty, self.workers)
             while True:
                 iteration.advance()
-                share, gap_of_plane = iteration.share_and_gap(weight)
-                if iteration.steps >= max_steps or gap_of_plane <= gap_tolerance(plane) / len(self.vectors):
+                gap_of_plane, is_proposal = iteration.gap()
+                within = weight * gap_of_plane <= gap_tolerance(plane) / len(self.vectors)
+                if iteration.steps >= max_steps or within:
                     break
-            iteration.reduce_change(share)
-            gap, steps = gap + gap_of_plane, max(steps, iteration.steps)
+            if is_proposal:
+                x[:] = proposals[index]
+            gap, steps = gap + weight * gap_of_plane, max(steps, iteration.steps)
         return ProxResult(plane, gap, steps)
 
     def _planes(self, *samples: Image) -> Iterator[list[Image]]:
@@ -209,36 +208,25 @@ class _PrimalDual:
             around = rows[first][0], rows[stop][1], columns[left][0], columns[right][1]
             proximal_kernels.step_tile(first, stop, left, right, *around, *self._changed, *self._fixed, *steps)
 
-    def share_and_gap(self, weight: float) -> tuple[float, float]:
-        """Return a share θ and a bound on the gap of `x̂ + θ (x − x̂)`, the best of some.
+    def gap(self) -> tuple[float, bool]:
+        """Return a bound on the gap relative to the weight, and True if it is that of the proposal in place of x.
 
         The change of x from its proposal x̂ has small waves for long after p is right, and where x̂ is nearly the
         minimum they make up most of the gap q + l + s: square q and excess l are those from the primal of p, s is the
-        slack of the penalty. √q is convex in θ, l and s are in proportion. Below θ = 1 the bound is
-        `(√q + √(q + l + s))²`, half the square of that which `recon.solver.pmlem.Certificate` gives. Proposals with
-        negative light, and smoothed penalties, are left out.
+        slack of the penalty, of which x̂ has none. The bound for x̂ is `(√q + √(q + l))² ≥ q + l`, half the square of
+        that which `recon.solver.pmlem.Certificate` gives. Proposals with negative light, and smoothed penalties, are
+        left out.
         """
         vectors, plane, _ = self._changed
         change = elementwise(np.subtract, plane, self._proposal) if self._proposal.size else plane
         slack = _penalty_and_slack(vectors, change, self._penalty, self._workers)[1]
-        square, excess = self._distance(plane)
-        gap = square + excess + slack
-        if not self._may_stay:
-            return 1.0, weight * gap
-        square_of_proposal, excess_of_proposal = self._distance(self._proposal)
-        shares = np.linspace(0, 1, _SHARES)
-        roots = (1 - shares) * np.sqrt(square_of_proposal) + shares * np.sqrt(square)
-        gaps = (roots + np.sqrt(roots**2 + (1 - shares) * excess_of_proposal + shares * (excess + slack))) ** 2
-        gaps[-1] = gap
-        best = int(gaps.argmin())
-        return float(shares[best]), weight * float(gaps[best])
-
-    def reduce_change(self, share: float) -> None:
-        """Set x to `x̂ + θ (x − x̂)`, given θ."""
-        if share < 1:
-            plane = self._changed[1]
-            part = plane.dtype.type(share)
-            elementwise(lambda x, proposal: proposal + part * (x - proposal), plane, self._proposal, out=plane)
+        gap = float(sum(self._distance(plane))) + slack
+        if self._may_stay:
+            square, excess = self._distance(self._proposal)
+            of_proposal = float(np.sqrt(square) + np.sqrt(square + excess)) ** 2
+            if of_proposal < gap:
+                return of_proposal, True
+        return gap, False
 
     def _distance(self, plane: Image) -> NDArray[np.float64]:
         arguments = (plane, self._changed[0], self._point, self._reach)

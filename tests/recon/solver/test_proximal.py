@@ -160,6 +160,36 @@ def test_prox_agrees_with_slow_primal_dual_method(penalty: Penalty, about: bool)
         assert rough.gap < 10
 
 
+@pytest.mark.parametrize("penalty", [TV, Penalty("huber-tv", 0.02)])
+@pytest.mark.parametrize("contrast", [0.0, 0.5])
+def test_gap_bounds_plane_that_may_be_its_proposal(penalty: Penalty, contrast: float) -> None:
+    """The bound is no less than the distance of cost and dual cost.
+
+    The data are the proposal and noise, and a square that the proposal lacks.
+    """
+    generator = np.random.default_rng(3)
+    proposal, w = np.abs(generator.normal(1, 1, (48, 40))), generator.uniform(0.5, 2, (48, 40))
+    v = proposal + 0.05 * generator.normal(size=proposal.shape)
+    v[8:40, 8:32] += contrast
+
+    def solved(gap: float) -> tuple[ProxResult, Image]:
+        dual = DualField([np.zeros((2, *v.shape))], proposal)
+        return dual.prox(v, w, 0.5, penalty, lambda _: gap, 3000), dual.vectors[0]
+
+    changes = []
+    for gap in (10.0, 3.0, 1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 1e-5):
+        result, p = solved(gap)
+        best = np.maximum(v - 0.5 / w * _adjoint(p), 0)
+        conjugate = 0.5 * penalty.smoothing_e * np.sum(p**2)
+        dual_cost = 0.5 * np.sum(w * (best - v) ** 2)
+        dual_cost += 0.5 * (np.sum(p * differences_of(best - proposal)) - conjugate)
+        assert np.hypot(*p).max() <= 1 + 1e-9
+        assert cost_about(result.plane, v, w, 0.5, proposal, penalty) - dual_cost <= result.gap + 1e-9
+        changes.append(float(np.abs(result.plane - proposal).max()))
+    if penalty.name == "tv":
+        assert (changes[3] == 0) == (contrast == 0), "noise is explained without a change, the square is not"
+
+
 def test_each_plane_has_its_part_of_the_proposal() -> None:
     generator = np.random.default_rng(12)
     shapes = [(5, 6), (8, 4), (3, 7)]
