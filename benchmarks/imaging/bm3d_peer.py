@@ -32,10 +32,13 @@ from faintfield.recon.solver.initialization import back_projection
 
 # BM3D with its profile for white noise: picture, result, and σ in electrons.
 _PROGRAM = """
-import sys
+import sys, time
 import bm3d, numpy
 picture = numpy.load(sys.argv[1], allow_pickle=False).astype(float)
-numpy.save(sys.argv[2], bm3d.bm3d(picture, sigma_psd=float(sys.argv[3])))
+started = time.perf_counter()
+made = bm3d.bm3d(picture, sigma_psd=float(sys.argv[3]))
+print(time.perf_counter() - started)
+numpy.save(sys.argv[2], made)
 """
 
 _VERSION = "from importlib.metadata import version; print('bm3d', version('bm3d'))"
@@ -55,11 +58,17 @@ class Bm3d:
 
     def denoised(self, picture: Image, sigma_e: float) -> Image:
         """Return a picture (row, column) denoised for noise of that standard deviation, clipped at zero."""
+        return self.timed(picture, sigma_e)[0]
+
+    def timed(self, picture: Image, sigma_e: float) -> tuple[Image, float]:
+        """Return the same, and the seconds that BM3D took."""
         with TemporaryDirectory() as folder:
             given, made = Path(folder) / "given.npy", Path(folder) / "made.npy"
             np.save(given, picture, allow_pickle=False)
-            subprocess.run([str(self.python), "-c", _PROGRAM, str(given), str(made), repr(sigma_e)], check=True)
-            return np.asarray(np.maximum(np.load(made, allow_pickle=False), 0), np.float32)
+            command = [str(self.python), "-c", _PROGRAM, str(given), str(made), repr(sigma_e)]
+            shown = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
+            plane = np.asarray(np.maximum(np.load(made, allow_pickle=False), 0), np.float32)
+            return plane, float(shown.split()[-1])
 
     def best_sigma_e(self, picture: Image, error: Callable[[Image], float], start_e: float = _FIRST_SIGMA_E) -> float:
         """Return the σ whose result has the least error, found from `start_e` in steps of 8 %."""

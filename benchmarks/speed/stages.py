@@ -2,7 +2,7 @@
 
 Functions that do a stage's work are replaced by timed ones, then the command runs as `faintfield` would. A stage within
 another counts for itself alone, except within those that choose weights: their time is all theirs. FILE is JSON, with
-the largest resident memory.
+the largest resident memory, also of each stage.
 """
 
 import importlib
@@ -47,12 +47,13 @@ _FUNCTIONS = {
 
 @dataclass
 class Stage:
-    """Time of a stage: elapsed, and of all threads; number of calls."""
+    """Time of a stage: elapsed, and of all threads; number of calls; largest resident memory while it ran."""
 
     name: str
     seconds: float = 0.0
     cpu_seconds: float = 0.0
     calls: int = 0
+    peak_mb: float = 0.0
 
 
 class Stages:
@@ -61,7 +62,9 @@ class Stages:
     def __init__(self) -> None:
         self.stages = {name: Stage(name) for name in _FUNCTIONS}
         self._inner: list[tuple[float, float]] = []
+        self._names: list[str] = []
         self._whole = False
+        self.peak_mb = 0.0
 
     def timed(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
         """Return a function that does the same, and adds what it takes to a stage."""
@@ -70,8 +73,10 @@ class Stages:
             if self._whole:
                 return function(*arguments, **options)
             self._whole = name in _WHOLE
+            self.measure_memory()
             started = _clocks()
             self._inner.append((0.0, 0.0))
+            self._names.append(name)
             try:
                 return function(*arguments, **options)
             finally:
@@ -81,13 +86,23 @@ class Stages:
         return run
 
     def _add(self, name: str, seconds: float, cpu_seconds: float) -> None:
-        inner, stage = self._inner.pop(), self.stages[name]
+        self.measure_memory()
+        inner, stage = self._inner.pop(), self.stages[self._names.pop()]
         stage.seconds += seconds - inner[0]
         stage.cpu_seconds += cpu_seconds - inner[1]
         stage.calls += 1
         if self._inner:
             outer = self._inner[-1]
             self._inner[-1] = outer[0] + seconds, outer[1] + cpu_seconds
+
+    def measure_memory(self) -> None:
+        """Note the largest memory since the last call for the stage in work, and forget it."""
+        peak_mb = _peak_mb()
+        self.peak_mb = max(self.peak_mb, peak_mb)
+        if self._names:
+            stage = self.stages[self._names[-1]]
+            stage.peak_mb = max(stage.peak_mb, peak_mb)
+        Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")
 
     def replace_functions(self) -> None:
         """Time all functions of stages, wherever they were imported to."""
@@ -115,7 +130,7 @@ def _clocks() -> tuple[float, float]:
 
 
 def _peak_mb() -> float:
-    """Return the largest resident memory of this process; `ru_maxrss` begins with that of the process before it."""
+    """Return the largest resident memory of this process since that was forgotten."""
     status = Path("/proc/self/status").read_text(encoding="utf-8")
     (kib,) = (line.split()[1] for line in status.splitlines() if line.startswith("VmHWM:"))
     return int(kib) * 1024 / 1e6
@@ -131,8 +146,9 @@ def main() -> None:
     try:
         faintfield()
     finally:
+        stages.measure_memory()
         found = [asdict(stage) for stage in stages.stages.values() if stage.calls]
-        out.write_text(json.dumps({"peak_mb": _peak_mb(), "stages": found}), encoding="utf-8")
+        out.write_text(json.dumps({"peak_mb": stages.peak_mb, "stages": found}), encoding="utf-8")
 
 
 if __name__ == "__main__":

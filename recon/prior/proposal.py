@@ -142,6 +142,14 @@ def mixtures_of(
     return {region: dict(zip(names, of_region.tolist(), strict=True)) for region, of_region in weights.items()}
 
 
+class ProposalSource(NamedTuple):
+    """The evidence of a proposal, what makes candidates of evidence, and the regions of their weights."""
+
+    evidence: Evidence
+    candidates: Candidates
+    regions: Regions
+
+
 @dataclass(frozen=True)
 class PlaneProposal:
     """The proposal for one plane.
@@ -152,22 +160,19 @@ class PlaneProposal:
         x̂ ≥ 0 and the standard deviation of the back-projection, in electrons; σ is infinite where no view sees.
     mixture : dict of str to dict of str to float
         Weight of each candidate, by region: "light" or "dark", "detail" or "smooth".
-    evidence : Evidence
-        Its evidence.
-    candidates, regions : callable, dict of str to float array (row, column)
-        What the picture is mixed of.
+    source : ProposalSource, optional
+        What the picture is mixed of: as large as ten planes, and needed to make it again.
     """
 
     picture: Image
     sigma: Image
     mixture: dict[str, dict[str, float]]
-    evidence: Evidence
-    candidates: Candidates
-    regions: Regions
+    source: ProposalSource | None
 
     def again(self, evidence: Evidence, plane: Image) -> Image:
         """Return the picture of other evidence and total variation's plane by the same mixture."""
-        return _mixed(self.candidates, evidence, plane, self.regions, self.mixture)
+        assert self.source is not None
+        return _mixed(self.source.candidates, evidence, plane, self.source.regions, self.mixture)
 
 
 def propose(
@@ -211,9 +216,7 @@ def propose(
             _mixed(candidates, evidence, plane, shares, mixture),
             np.sqrt(evidence.noise.variance),
             mixture,
-            evidence,
-            candidates,
-            shares,
+            ProposalSource(evidence, candidates, shares),
         )
         for plane, evidence, shares, mixture in planes
     ]
@@ -392,7 +395,8 @@ class ProposalAnswers(Answers):
 
     def __call__(self, change: Image) -> Image:
         """Return the change of the optimum (row, column) for a change of −∇L."""
-        problem, evidence = self.problem, self._proposal.evidence
+        assert self._proposal.source is not None
+        problem, evidence = self.problem, self._proposal.source.evidence
         plane = problem.optimum(change, self._pilot, self._pilot_dual.copy())
         seen = np.isfinite(evidence.noise.variance)
         picture = evidence.picture + np.where(seen, change / problem.local.metric, 0).astype(np.float32)

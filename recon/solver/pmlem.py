@@ -16,7 +16,7 @@ from faintfield.recon.likelihood.images import Image
 from faintfield.recon.solver.data_fit import DataFit
 from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.solver.proximal import DualField
-from faintfield.recon.solver.proximal_kernels import residual_and_excess, squared_distance
+from faintfield.recon.solver.proximal_kernels import squared_distance
 from faintfield.recon.threads import elementwise, summed
 
 # An inner problem is solved until its error is this fraction of the last step, or of the tolerance, of which it is half
@@ -208,12 +208,10 @@ class _Pmlem:
         return plane
 
     def _certificate(self, plane: Image, gradient: Image, metric: Image, dual: DualField) -> Certificate:
-        one, weight = plane.dtype.type(1), plane.dtype.type(self._weight)
-        after = elementwise(partial(_stepped, one), plane, gradient, metric)
-        after = dual.primal(after, elementwise(lambda w: weight / w, metric))
-        square, excess = summed(residual_and_excess, *(array.reshape(-1) for array in (plane, after, metric)))
-        residual, size = float(np.sqrt(square)), norm(plane, metric)
-        slack = self._weight * dual.penalty_and_slack(plane, self._penalty)[1] + float(excess)
+        point = elementwise(partial(_stepped, plane.dtype.type(1)), plane, gradient, metric)
+        square, excess = dual.distance_from_primal(plane, point, metric, self._weight)
+        residual, size = float(np.sqrt(2 * square)), norm(plane, metric)
+        slack = self._weight * dual.penalty_and_slack(plane, self._penalty)[1] + excess
         parts = (residual + np.sqrt(residual**2 + 2 * slack), residual, np.sqrt(2 * slack))
         return Certificate(*(_relative(part, size) for part in parts))
 

@@ -3,7 +3,7 @@
 That is `min ½ Σ w (x − v)² + β Σ φ(|∇(x − x̂)|)` over x ≥ 0, with a proposal x̂ that is zero unless given.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
@@ -34,6 +34,9 @@ _COARSEST, _MAX_COARSE_STEPS = 64, 600
 # Length of the first step on the plane in the metric, and the strong convexity that the acceleration relies on; the
 # metric's own is 1, and less converges faster.
 _FIRST_LENGTH, _CONVEXITY = 1.0, 0.6
+
+
+type _Pair = tuple[float, float]
 
 
 class ProxResult(NamedTuple):
@@ -105,14 +108,16 @@ class DualField:
             _on_strips(proximal_kernels.primal_of_dual, _edges(vectors.shape[1], self.workers), vectors, *part)
         return plane
 
-    def penalty_and_slack(self, plane: Image, penalty: Penalty) -> tuple[float, float]:
+    def distance_from_primal(self, plane: Image, point: Image, metric: Image, weight: float) -> _Pair:
+        """Return `Σ ½ w (x − u₊)²` and `Σ w (−u)₊ x` for planes x ≥ 0 and the primal `u = v − β/w ∇ᵀp`."""
+        parts = zip(self.vectors, self._planes(plane, point, metric), strict=True)
+        return _sum(_distance(x, vectors, v, w, weight, self.workers) for vectors, (x, v, w) in parts)
+
+    def penalty_and_slack(self, plane: Image, penalty: Penalty) -> _Pair:
         """Return `Σ φ(|∇x|)`, and `Σ φ(|∇x|) + φ*(p) − p·∇x ≥ 0`, which is zero where p belongs to x; x is x − x̂."""
         change = plane if self.proposal is None else elementwise(np.subtract, plane, self.proposal)
-        sums = [
-            _penalty_and_slack(vectors, part, penalty, self.workers)
-            for vectors, (part,) in zip(self.vectors, self._planes(change), strict=True)
-        ]
-        return sum(part[0] for part in sums), sum(part[1] for part in sums)
+        parts = zip(self.vectors, self._planes(change), strict=True)
+        return _sum(_penalty_and_slack(vectors, part, penalty, self.workers) for vectors, (part,) in parts)
 
     def prox(
         self,
@@ -143,17 +148,16 @@ class DualField:
         proposals = [np.empty((0, 0), point.dtype)] * len(self.vectors)
         if self.proposal is not None:
             proposals = [part for (part,) in self._planes(self.proposal)]
-        for index, (v, r, x) in enumerate(self._planes(point, reach, plane)):
+        for index, (v, r, x, w) in enumerate(self._planes(point, reach, plane, metric)):
             iteration = _PrimalDual(self.vectors[index], x, v, r, proposals[index], penalty, self.workers)
             while True:
                 iteration.advance()
-                gap_of_plane, is_proposal = iteration.gap()
-                within = weight * gap_of_plane <= gap_tolerance(plane) / len(self.vectors)
-                if iteration.steps >= max_steps or within:
+                gap_of_plane, is_proposal = iteration.gap(w, weight)
+                if iteration.steps >= max_steps or gap_of_plane <= gap_tolerance(plane) / len(self.vectors):
                     break
             if is_proposal:
                 x[:] = proposals[index]
-            gap, steps = gap + weight * gap_of_plane, max(steps, iteration.steps)
+            gap, steps = gap + gap_of_plane, max(steps, iteration.steps)
         return ProxResult(plane, gap, steps)
 
     def _planes(self, *samples: Image) -> Iterator[list[Image]]:
@@ -180,7 +184,7 @@ class _PrimalDual:
         self._ahead = plane - proposal if proposal.size else plane.copy()
         self._changed = vectors, plane, self._ahead
         self._fixed = point, reach, step_sizes(reach), proposal, penalty.smoothing_e, penalty.bounded
-        self._point, self._reach, self._proposal, self._penalty = point, reach, proposal, penalty
+        self._point, self._proposal, self._penalty = point, proposal, penalty
         self._may_stay = proposal.size > 0 and penalty.smoothing_e == 0 and bool(proposal.min() >= 0)
         self._edges, self._workers = _edges(len(plane), workers), workers
         tiles = max(round(plane.shape[1] / _TILE_COLUMNS), 1)
@@ -208,8 +212,8 @@ class _PrimalDual:
             around = rows[first][0], rows[stop][1], columns[left][0], columns[right][1]
             proximal_kernels.step_tile(first, stop, left, right, *around, *self._changed, *self._fixed, *steps)
 
-    def gap(self) -> tuple[float, bool]:
-        """Return a bound on the gap relative to the weight, and True if it is that of the proposal in place of x.
+    def gap(self, metric: Image, weight: float) -> tuple[float, bool]:
+        """Return a bound on the gap, and True if it is that of the proposal in place of x.
 
         The change of x from its proposal x̂ has small waves for long after p is right, and where x̂ is nearly the
         minimum they make up most of the gap q + l + s: square q and excess l are those from the primal of p, s is the
@@ -220,17 +224,14 @@ class _PrimalDual:
         vectors, plane, _ = self._changed
         change = elementwise(np.subtract, plane, self._proposal) if self._proposal.size else plane
         slack = _penalty_and_slack(vectors, change, self._penalty, self._workers)[1]
-        gap = float(sum(self._distance(plane))) + slack
+        problem = vectors, self._point, metric, weight, self._workers
+        gap = float(sum(_distance(plane, *problem)) + weight * slack)
         if self._may_stay:
-            square, excess = self._distance(self._proposal)
+            square, excess = _distance(self._proposal, *problem)
             of_proposal = float(np.sqrt(square) + np.sqrt(square + excess)) ** 2
             if of_proposal < gap:
                 return of_proposal, True
         return gap, False
-
-    def _distance(self, plane: Image) -> NDArray[np.float64]:
-        arguments = (plane, self._changed[0], self._point, self._reach)
-        return np.sum(_on_strips(proximal_kernels.distance_from_primal, self._edges, *arguments), axis=0)
 
     def _next_steps(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         lengths, momenta = np.empty((2, _STEPS_PER_EXCHANGE))
@@ -273,10 +274,19 @@ def step_sizes(reach: Image) -> Image:
     return np.divide(reach.dtype.type(0.15), largest, out=largest)
 
 
-def _penalty_and_slack(vectors: Image, plane: Image, penalty: Penalty, workers: int) -> tuple[float, float]:
+def _distance(plane: Image, vectors: Image, point: Image, metric: Image, weight: float, workers: int) -> _Pair:
+    arguments = (plane, vectors, point, metric, plane.dtype.type(weight))
+    return _sum(_on_strips(proximal_kernels.distance_from_primal, _edges(len(plane), workers), *arguments))
+
+
+def _penalty_and_slack(vectors: Image, plane: Image, penalty: Penalty, workers: int) -> _Pair:
     arguments = (plane, vectors, penalty.smoothing_e, penalty.bounded)
-    sums = _on_strips(proximal_kernels.penalty_and_slack, _edges(len(plane), workers), *arguments)
-    return sum(part[0] for part in sums), sum(part[1] for part in sums)
+    return _sum(_on_strips(proximal_kernels.penalty_and_slack, _edges(len(plane), workers), *arguments))
+
+
+def _sum(pairs: Iterable[Sequence[float]]) -> _Pair:
+    first, second = map(sum, zip(*pairs, strict=True))
+    return float(first), float(second)
 
 
 def _edges(rows: int, workers: int) -> list[int]:

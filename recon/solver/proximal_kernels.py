@@ -166,8 +166,8 @@ def primal_of_dual(first, stop, dual, centre, reach, plane):
 
 
 @compiled
-def distance_from_primal(first, stop, plane, dual, centre, reach):
-    """Return Σ w/2β (x − u₊)² and Σ w/β (−u)₊ x over rows of a plane x ≥ 0, with `u = v − β/w ∇ᵀp`.
+def distance_from_primal(first, stop, plane, dual, centre, metric, weight):
+    """Return Σ ½ w (x − u₊)² and Σ w (−u)₊ x over rows of a plane x ≥ 0, with `u = v − β/w ∇ᵀp`.
 
     Their sum is how far x is from the minimum for a fixed p; each term is at least zero.
     """
@@ -178,11 +178,11 @@ def distance_from_primal(first, stop, plane, dual, centre, reach):
             divergence = dual[0, row, j] + dual[1, row, j]
             divergence -= dual[0, row - 1, j] if row > 0 else zero
             divergence -= dual[1, row, j - 1] if j > 0 else zero
-            minimum = centre[row, j] + reach[row, j] * divergence
-            x = plane[row, j]
+            w, x = metric[row, j], plane[row, j]
+            minimum = centre[row, j] + weight / w * divergence
             change = x - max(minimum, zero)
-            square_of_row += half * change * change / reach[row, j]
-            excess_of_row += max(-minimum, zero) * x / reach[row, j]
+            square_of_row += half * w * change * change
+            excess_of_row += w * max(-minimum, zero) * x
         square += square_of_row
         excess += excess_of_row
     return np.array([square, excess])
@@ -251,14 +251,3 @@ def squared_distance(plane, other, metric):
         for k in range(plane.size):
             total += np.float64(metric[k] * plane[k] * plane[k])
     return total
-
-
-@compiled
-def residual_and_excess(plane, after, metric):
-    """Return Σ w (x − a₊)² and Σ w x (−a)₊ over samples (sample,), summed in float64."""
-    zero, square, excess = plane.dtype.type(0), 0.0, 0.0
-    for k in range(plane.size):
-        change = plane[k] - max(after[k], zero)
-        square += np.float64(metric[k] * change * change)
-        excess += np.float64(metric[k] * plane[k] * max(-after[k], zero))
-    return np.array([square, excess])

@@ -169,6 +169,7 @@ def certified(
         tolerance=tolerance,
         dual=dual,
     )
+    del start  # the iterates drop it after the first step
     iterate = iterate_until(iterates, tolerance, objective.options.passes or MAX_PASSES)
     certificate = Certificate(
         kind=_PMLEM_CERTIFICATE,

@@ -91,6 +91,9 @@ def _about_proposals(
     if all(weights.get("tv") == 1 for proposal in proposals for weights in proposal.mixture.values()):
         return "total variation predicts held-out views best"
     proposed = operator.samples_of([proposal.picture for proposal in proposals])
+    del evidences, regions
+    if not options.uncertainty:
+        proposals = [replace(proposal, source=None) for proposal in proposals]
     dual = replace(objective.posed.dual(), proposal=proposed)
     record, found = certified(objective, objective.positive(proposed), WEIGHT_ABOUT_PROPOSAL * weight, dual)
     record = with_weight_of(record, first)

@@ -174,13 +174,12 @@ def do_task(task: PlaneTask, opened: Callable[[ChannelLayout], Channel]) -> list
     If colours are compared, total variation gives the planes of all of them first. One is opened after the other, so
     that only one has to be in memory.
     """
-    pilots: dict[str, dict[Place, Pilot]] = {}
-    if len(task.layouts) > 1:
-        planes = {layout.name: opened(layout).total_variation(task) for layout in task.layouts}
-        pilots = {name: {place: _pilot(planes, name, place) for place in task.grids} for name in planes}
+    if len(task.layouts) == 1:
+        return opened(task.layouts[0]).do(task)
+    planes = {layout.name: opened(layout).total_variation(task) for layout in task.layouts}
     messages: list[str] = []
     for layout in reversed(task.layouts):  # the last is still open
-        messages += opened(layout).do(task, pilots.get(layout.name))
+        messages += opened(layout).do(task, {place: _pilot(planes, layout.name, place) for place in task.grids})
     return messages
 
 
