@@ -14,6 +14,7 @@ from faintfield.calib.noise import NoiseCalibration
 from faintfield.calib.noise.strips import release
 from faintfield.pipelines.calibration.noise import Readout, SensorCalibration
 from faintfield.pipelines.formats.files import sha256
+from faintfield.pipelines.formats.frames import read_ahead
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.results.noise import (
     CovarianceRecord,
@@ -71,7 +72,9 @@ def noise_record(sensor: SensorCalibration) -> NoiseRecord:
         temperature_c=frames.temperature_range,
         frames=frames.settings.frame,
         warnings=list(dict.fromkeys(warnings)),
-        provenance=provenance("noise", {}, {name: sha256(frames.folder / name) for name in frames.file_names}),
+        provenance=provenance(
+            "noise", {}, dict(read_ahead(frames.file_names, lambda name: sha256(frames.folder / name)))
+        ),
         fit=UNSET if readout.mosaic else _fit_record(phases[0]),
         emva1288=UNSET if readout.mosaic else sensor.phases[0].record(),
     )
