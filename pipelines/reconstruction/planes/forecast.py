@@ -98,9 +98,9 @@ def _work(method: Method, solver: SolverOptions, samples: int) -> tuple[float, f
     of_weight = _share(samples, WINDOW_SAMPLES)
     passes, steps, answer = 9 + 9 * of_weight, 650 + of_weight * (2000 if of_weight == 1 else 5000), 1600
     if solver.has_prior:
-        candidates = 3500 if of_weight == 1 else 900  # of large planes mostly means of samples
-        passes, answer = passes + 14, 2 * answer + candidates
-        steps += 250 + candidates + of_weight * (13_000 if of_weight == 1 else 18_000)
+        candidates = 3500 if of_weight == 1 else 1000  # of large planes mostly means of samples
+        passes, answer = passes + 8, 2 * answer + candidates
+        steps += 100 + candidates + of_weight * 8000
     return passes, steps + DRAWS * answer * solver.uncertainty
 
 
