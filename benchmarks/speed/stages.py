@@ -61,8 +61,8 @@ class Stages:
 
     def __init__(self) -> None:
         self.stages = {name: Stage(name) for name in _FUNCTIONS}
-        self._inner: list[tuple[float, float]] = []
-        self._names: list[str] = []
+        # Stages that have begun, the innermost last: name, and seconds and CPU seconds of stages within
+        self._begun: list[tuple[str, float, float]] = []
         self._whole = False
         self.peak_mb = 0.0
 
@@ -75,32 +75,33 @@ class Stages:
             self._whole = name in _WHOLE
             self.measure_memory()
             started = _clocks()
-            self._inner.append((0.0, 0.0))
-            self._names.append(name)
+            self._begun.append((name, 0.0, 0.0))
             try:
                 return function(*arguments, **options)
             finally:
                 self._whole = False
-                self._add(name, *(stop - start for stop, start in zip(_clocks(), started, strict=True)))
+                self._add(*(stop - start for stop, start in zip(_clocks(), started, strict=True)))
 
         return run
 
-    def _add(self, name: str, seconds: float, cpu_seconds: float) -> None:
+    def _add(self, seconds: float, cpu_seconds: float) -> None:
+        """End the innermost stage, which took so long with those within."""
         self.measure_memory()
-        inner, stage = self._inner.pop(), self.stages[self._names.pop()]
-        stage.seconds += seconds - inner[0]
-        stage.cpu_seconds += cpu_seconds - inner[1]
+        name, seconds_within, cpu_seconds_within = self._begun.pop()
+        stage = self.stages[name]
+        stage.seconds += seconds - seconds_within
+        stage.cpu_seconds += cpu_seconds - cpu_seconds_within
         stage.calls += 1
-        if self._inner:
-            outer = self._inner[-1]
-            self._inner[-1] = outer[0] + seconds, outer[1] + cpu_seconds
+        if self._begun:
+            outer, *within = self._begun[-1]
+            self._begun[-1] = outer, within[0] + seconds, within[1] + cpu_seconds
 
     def measure_memory(self) -> None:
         """Note the largest memory since the last call for the stage in work, and forget it."""
         peak_mb = _peak_mb()
         self.peak_mb = max(self.peak_mb, peak_mb)
-        if self._names:
-            stage = self.stages[self._names[-1]]
+        if self._begun:
+            stage = self.stages[self._begun[-1][0]]
             stage.peak_mb = max(stage.peak_mb, peak_mb)
         Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")
 
