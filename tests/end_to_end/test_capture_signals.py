@@ -79,7 +79,12 @@ def test_stage_rests_after_capture_is_ended(tmp_path: Path, end: signal.Signals 
         program = "from faintfield.pipelines.cli import main; main()"
         command = [sys.executable, "-c", program, "capture", str(rig), str(session), "--yes"]
         near, far = os.openpty()
-        process = subprocess.Popen(command, preexec_fn=lambda: os.login_tty(far))
+
+        def begin() -> None:
+            signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests themselves may run under nohup
+            os.login_tty(far)
+
+        process = subprocess.Popen(command, preexec_fn=begin)
         os.close(far)
         controller.run_until(controller.moves)
         sent = len(controller.received)
