@@ -131,12 +131,12 @@ class NoiseModel:
         return np.asarray((charge + self.read_noise_e**2) * self.local_gain_dn_per_e(frame_dn) ** 2 + 1.0 / 12.0)
 
     def saturated(self, frame_dn: NDArray[Any]) -> NDArray[np.bool_]:
-        """Return the saturated pixels of a frame (row, column)."""
+        """Return the saturated pixels of a frame (row, column); of real numbers, those that are NaN, too."""
         if frame_dn.dtype.kind in "iu":  # compared as whole numbers, which takes no array of floats
             if self.saturation_dn > np.iinfo(frame_dn.dtype).max:
                 return np.zeros(frame_dn.shape, bool)
             return np.asarray(frame_dn >= int(np.ceil(self.saturation_dn)))
-        return np.asarray(frame_dn >= self.saturation_dn)
+        return ~np.asarray(frame_dn < self.saturation_dn)
 
     def background_e(self, exposure_s: float) -> Map:
         """Return the expected dark electrons `D t` of one exposure."""

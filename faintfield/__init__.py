@@ -19,15 +19,21 @@ _MODULES = {
     "Grid": "rig.plan",
     "InputError": "pipelines.errors",
     "Lens": "calib.lens",
+    "LightField": "pipelines.notebook.light_field",
     "MotionLimits": "rig.stages.protocol",
+    "NoiseModel": "calib.noise_model",
     "OutsideTravel": "rig.errors",
+    "Plane": "pipelines.notebook.results",
     "PlaneGrid": "recon.operator.grid",
     "PlaneOperator": "recon.operator.single_plane",
+    "PlaneOptions": "pipelines.notebook.light_field",
+    "Planes": "pipelines.notebook.results",
     "Point": "rig.stages.protocol",
     "ReconstructionError": "recon.errors",
     "RigError": "rig.errors",
     "RigSettings": "rig.settings",
     "StageSettings": "rig.stages.protocol",
+    "Surface": "pipelines.notebook.results",
     "SyntheticOptions": "pipelines.simulation.options",
     "CaptureStep": "rig.plan",
     "Target": "calib.geometry",
@@ -40,11 +46,13 @@ _MODULES = {
     "load_channel": "pipelines.reconstruction.channels",
     "load_set": "pipelines.formats.sets.elemental_set",
     "measure_series": "calib.noise",
+    "open": "pipelines.notebook.opening:open_path",
     "open_rig": "rig.devices",
     "open_stage": "rig.devices",
     "plane_from_ray": "calib.homography",
     "pmlem": "recon.solver.pmlem",
     "read_frame": "pipelines.formats.frames",
+    "reconstruct": "pipelines.notebook.light_field",
     "simulate": "pipelines.commands.simulation",
     "smooth_start": "recon.solver.initialization",
     "taken_frames": "rig.session.session",
@@ -65,10 +73,18 @@ if TYPE_CHECKING:  # type checkers and editors read these lines; a test compares
     from faintfield.calib.noise import Conditions as Conditions
     from faintfield.calib.noise import calibrate
     from faintfield.calib.noise import measure_series as measure_series
+    from faintfield.calib.noise_model import NoiseModel as NoiseModel
     from faintfield.pipelines.commands.simulation import simulate as simulate
     from faintfield.pipelines.errors import InputError as InputError
     from faintfield.pipelines.formats.frames import read_frame as read_frame
     from faintfield.pipelines.formats.sets.elemental_set import load_set as load_set
+    from faintfield.pipelines.notebook.light_field import LightField as LightField
+    from faintfield.pipelines.notebook.light_field import PlaneOptions as PlaneOptions
+    from faintfield.pipelines.notebook.light_field import reconstruct as reconstruct
+    from faintfield.pipelines.notebook.opening import open_path
+    from faintfield.pipelines.notebook.results import Plane as Plane
+    from faintfield.pipelines.notebook.results import Planes as Planes
+    from faintfield.pipelines.notebook.results import Surface as Surface
     from faintfield.pipelines.reconstruction.channels import channel_layouts as channel_layouts
     from faintfield.pipelines.reconstruction.channels import load_channel as load_channel
     from faintfield.pipelines.simulation.options import SyntheticOptions as SyntheticOptions
@@ -95,7 +111,7 @@ if TYPE_CHECKING:  # type checkers and editors read these lines; a test compares
     from faintfield.rig.stages.protocol import StageSettings as StageSettings
 
     __version__: str
-    calibrate_noise = calibrate
+    calibrate_noise, open = calibrate, open_path
 else:
 
     def __getattr__(name: str) -> object:

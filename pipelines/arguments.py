@@ -1,8 +1,8 @@
 """Types of command-line arguments, apart from the code that acts on them: numbers within limits, words, options."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from cyclopts import Group, Parameter
 
@@ -115,3 +115,7 @@ class SolverOptions:
     def has_prior(self) -> bool:
         """Return whether more than total variation is expected of a picture."""
         return self.prior not in (None, "tv")
+
+    def without_prior(self) -> Self:
+        """Return the options of planes from which a prior begins."""
+        return replace(self, prior="tv", uncertainty=False)

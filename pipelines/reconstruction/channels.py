@@ -152,7 +152,7 @@ def checked_frame(elemental_set: ElementalSet, path: Path, layout: ChannelLayout
         raise UnreadableImage(
             f"{path}: is {kind}, unlike the set's first view; all views must be of one kind; export all alike"
         )
-    if found.dtype not in (np.uint8, np.uint16):
+    if found.dtype not in (np.uint8, np.uint16) and not elemental_set.in_memory:
         raise WrongBitDepth(
             f"{path}: holds {found.dtype} pixels; elemental images are 8- or 16-bit whole numbers; export them so"
         )

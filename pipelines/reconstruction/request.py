@@ -1,7 +1,7 @@
 """Requests for planes: options are checked as they enter, and resolved for a set."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Literal
 
@@ -38,6 +38,9 @@ _MIN_DEPTHS_OF_A_MAP = 5
 
 # Methods whose planes a prior can improve.
 _WITH_PRIOR: frozenset[Method] = frozenset({"pmlem", *JOINT_METHODS})
+
+# Names of the options of solvers that are recorded.
+_SOLVER_OPTIONS = [option.name for option in fields(SolverOptions)]
 
 # Units in which planes are asked for: mm, px of disparity, or that of the set.
 type _Unit = Literal["mm", "px", "own"]
@@ -76,7 +79,7 @@ class Request:
         return ReconstructionOptions(
             method=method,
             depth_mm=depths_mm,
-            **vars(solver) | effective,
+            **{name: getattr(solver, name) for name in _SOLVER_OPTIONS} | effective,
             pitch_mm=self.pitch_mm,
             focus=self.with_focus,
             auto_sweep=self.auto_sweep if place is None else UNSET,

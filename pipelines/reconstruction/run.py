@@ -76,8 +76,8 @@ def reconstruct_set(elemental_set: ElementalSet, out: Path, request: Request, ru
     started = time.monotonic()
     found = in_units(elemental_set, request.found) if request.found else None
     folders = {name: folder_of_method(out, name, request.methods) for name in request.methods}
-    _check(elemental_set, folders.values(), request)
-    sweep = _sweep(elemental_set, folders, request)
+    check_request(elemental_set, folders.values(), request)
+    sweep = plan_sweep(elemental_set, folders, request)
     sweep.keep_finished()
     needed_bytes = sweep.needed_bytes()
     # Decoded frames take the rest
@@ -114,7 +114,7 @@ def reconstruct_set(elemental_set: ElementalSet, out: Path, request: Request, ru
         if not (request.with_focus and write_stack(folder, result.planes, elemental_set.units)):
             remove(folder / STACK_FILE)  # of an earlier sweep
         shutil.rmtree(folder / PARTS, ignore_errors=True)  # also those of another call that was interrupted
-    _warn(elemental_set, records)
+    warn_of(elemental_set, records)
     searched = depth_map or found
     used: tuple[Mode, ...] = ("occlusion",) if "occlusion" in folders else ()
     advice = recommendation(searched, used) if searched else None
@@ -133,7 +133,7 @@ def reconstruct_part(
     The caller shares `out` with the other parts, see `formats.files.shared`.
     """
     folders = {name: folder_of_method(out, name, request.methods) for name in request.methods}
-    sweep = _sweep(elemental_set, folders, request).part(part)
+    sweep = plan_sweep(elemental_set, folders, request).part(part)
     sweep.keep_finished()
     planes = forecast(sweep) if runner is run_serially else f"{len(sweep.plan.grids)} plane(s)"
     inform(f"part {part}: {planes}")
@@ -141,21 +141,21 @@ def reconstruct_part(
     for folder in folders.values():
         remove(folder / RECONSTRUCTION_FILE)
     sweep.run(runner, out)
-    _warn(elemental_set, sweep.records)
+    warn_of(elemental_set, sweep.records)
     return Outcome(out=str(out), planes=sweep.records, units=elemental_set.units)
 
 
 def forecast_set(elemental_set: ElementalSet, out: Path, request: Request, part: Part | None = None) -> Forecast:
     """Return what the planes of a request that are missing would take on this computer, or those of a part of it."""
     folders = {name: folder_of_method(out, name, request.methods) for name in request.methods}
-    _check(elemental_set, folders.values(), request)
-    sweep = _sweep(elemental_set, folders, request)
+    check_request(elemental_set, folders.values(), request)
+    sweep = plan_sweep(elemental_set, folders, request)
     sweep = sweep if part is None else sweep.part(part)
     sweep.keep_finished()
     return forecast(sweep)
 
 
-def _check(elemental_set: ElementalSet, folders: Iterable[Path], request: Request) -> None:
+def check_request(elemental_set: ElementalSet, folders: Iterable[Path], request: Request) -> None:
     """Refuse a pitch in mm for a set that knows no lengths, and sets and folders that can have no depth map."""
     if request.pitch_mm and elemental_set.units.depth == "disparity_px":
         raise BadValue(
@@ -198,7 +198,13 @@ def _make_planes(sweep: Sweep, folders: dict[Method, Path], out: Path, runner: R
                 (folder / PARTS).rmdir()  # stays while it holds colours of incomplete planes
 
 
-def _sweep(elemental_set: ElementalSet, folders: dict[Method, Path], request: Request) -> Sweep:
+def plan_sweep(
+    elemental_set: ElementalSet,
+    folders: dict[Method, Path],
+    request: Request,
+    keep: type[PlaneFiles] = PlaneFiles,
+) -> Sweep:
+    """Return the sweep of a request, whose planes are kept in files in the folder of their method, or elsewhere."""
     layouts = elemental_set.layouts
     mm_per_depth = default_pitch_px(elemental_set) / elemental_set.settings.camera.fx_px
     places: list[Place] = [*request.depths_mm, *request.tilted]
@@ -213,7 +219,7 @@ def _sweep(elemental_set: ElementalSet, folders: dict[Method, Path], request: Re
 
     channels = tuple(layout.name for layout in layouts)
     files = tuple(
-        PlaneFiles(folder, name, place, channels, origin(name, place), plane_stem(elemental_set, place))
+        keep(folder, name, place, channels, origin(name, place), plane_stem(elemental_set, place))
         for place in grids
         for name, folder in folders.items()
     )
@@ -221,7 +227,8 @@ def _sweep(elemental_set: ElementalSet, folders: dict[Method, Path], request: Re
     return Sweep(elemental_set, plan, {name: origin(name) for name in folders})
 
 
-def _warn(elemental_set: ElementalSet, records: list[PlaneRecord]) -> None:
+def warn_of(elemental_set: ElementalSet, records: list[PlaneRecord]) -> None:
+    """Say what is doubtful about planes: certificates that were missed, priors left out, saturation, darkness."""
     certificates = [record.certificate for record in records if record.certificate]
     steps = [certificate for certificate in certificates if certificate.oscillates is not UNSET]
     swings = [certificate.relative_change or 0.0 for certificate in steps if certificate.oscillates]

@@ -14,6 +14,7 @@ from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.scene_operator import SceneOperator
 from faintfield.recon.operator.single_plane import PlaneOperator
+from faintfield.recon.solver.custom_penalty import ProximalPenalty
 from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.solver.initialization import mean_light_e, well_seen_samples
 from faintfield.recon.solver.penalties import Penalty
@@ -98,7 +99,7 @@ def fold_count(views: int) -> int:
 
 
 def cross_validated_weight(
-    problem: SceneProblem, guess: float, penalty: Penalty, level_e: float | None = None
+    problem: SceneProblem, guess: float, penalty: Penalty | ProximalPenalty, level_e: float | None = None
 ) -> CrossValidatedWeight:
     """Return the penalty weight under which the training views best predict the validation views.
 
@@ -107,7 +108,7 @@ def cross_validated_weight(
 
     Parameters
     ----------
-    problem, penalty : SceneProblem, Penalty
+    problem, penalty : SceneProblem, Penalty or ProximalPenalty
         One plane, or several planes together, that at least `MIN_VIEWS` views see; φ.
     guess : float
         A weight to start from, for all views.
@@ -145,7 +146,9 @@ def folds_to_predict(problem: SceneProblem) -> int:
 class Fold:
     """Training and validation views of a fold, and the solutions so far."""
 
-    def __init__(self, problem: SceneProblem, penalty: Penalty, fold: int, level_e: float | None = None) -> None:
+    def __init__(
+        self, problem: SceneProblem, penalty: Penalty | ProximalPenalty, fold: int, level_e: float | None = None
+    ) -> None:
         views = problem.operator.seeing_views
         self.validation = views[validation_views(len(views), fold)]
         self.training = np.setdiff1d(views, self.validation)

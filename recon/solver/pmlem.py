@@ -13,6 +13,7 @@ import numpy as np
 
 from faintfield.recon.errors import NotConverged
 from faintfield.recon.likelihood.images import Image
+from faintfield.recon.solver.custom_penalty import ProximalField, ProximalPenalty
 from faintfield.recon.solver.data_fit import DataFit
 from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.solver.proximal import DualField
@@ -56,12 +57,21 @@ class Certificate:
     Attributes
     ----------
     distance, stationarity, slack : float
-        The bound, zero only at the optimum, and its parts a/‖f‖ and √(2e)/‖f‖.
+        The bound, zero only at the optimum, and its parts a/‖f‖ and √(2e)/‖f‖. With a penalty of one's own there is no
+        bound, NaN, and a is the length of the next step.
     """
 
     distance: float
     stationarity: float
     slack: float
+
+    def within(self, tolerance: float) -> bool:
+        """Return whether the distance is within a tolerance.
+
+        Without a bound, three times the next step takes its place: the distance is no longer if the curvature is at
+        least half the metric.
+        """
+        return (3 * self.stationarity if np.isnan(self.distance) else self.distance) <= tolerance
 
 
 @dataclass(frozen=True)
@@ -93,7 +103,7 @@ def pmlem(
     start: Image,
     *,
     penalty_weight: float,
-    penalty: Penalty | None = None,
+    penalty: Penalty | ProximalPenalty | None = None,
     tolerance: float = 0.01,
     dual: DualField | None = None,
 ) -> Iterator[PmlemIterate]:
@@ -107,8 +117,8 @@ def pmlem(
     ----------
     fit, start : DataFit, float array (samples)
         L; positive samples to start from.
-    penalty_weight, penalty : float, Penalty
-        β ≥ 0, in the unit of s, and φ, total variation by default.
+    penalty_weight, penalty : float, Penalty or ProximalPenalty
+        β ≥ 0, in the unit of s, and φ, total variation by default, or a penalty of one's own.
     tolerance : float
         The distance that the caller wants to reach, which sets the accuracy of inner problems.
     dual : DualField, optional
@@ -126,16 +136,18 @@ def pmlem(
     if not (start > 0).all():
         raise ValueError(f"start must be positive everywhere, its smallest value is {start.min()}")
     penalty = penalty or Penalty()
+    dual = dual or DualField.zero([(start.shape[0], start.shape[1])], start.dtype)
+    if not isinstance(penalty, Penalty):
+        dual, penalty = ProximalField.of(penalty, dual), Penalty()  # the field has the penalty
     if penalty_weight == 0 or penalty.name == "none":
         penalty_weight, penalty = 0.0, Penalty("none")
-    dual = dual or DualField.zero([(start.shape[0], start.shape[1])], start.dtype)
     return _Pmlem(fit, penalty_weight, penalty, tolerance).iterates(start, dual)
 
 
 def iterate_until(iterates: Iterator[PmlemIterate], tolerance: float, max_passes: int) -> PmlemIterate:
     """Return the first iterate that is certified within a tolerance, or the one after `max_passes`."""
     for count, iterate in enumerate(iterates, 1):  # where no step lowers the objective, passes stay as they are
-        if iterate.certificate.distance <= tolerance or max(count, iterate.passes) >= max_passes:
+        if iterate.certificate.within(tolerance) or max(count, iterate.passes) >= max_passes:
             break
     return iterate
 
@@ -161,7 +173,7 @@ class _Pmlem:
                 raise NotConverged(f"pass {passes} left the finite numbers; give a smaller penalty weight")
             certificate = self._certificate(plane, gradient, metric, dual)
             is_lower = np.isinf(lowest) or objective <= lowest + _ROUNDING * abs(lowest)
-            if accepted is None or is_lower or certificate.distance <= self._tolerance:
+            if accepted is None or is_lower or certificate.within(self._tolerance):
                 lowest = min(lowest, objective)
                 if accepted is not None and certificate.distance > _SLOW * accepted.certificate.distance:
                     self._inner_of_tolerance /= 2
@@ -197,9 +209,8 @@ class _Pmlem:
                 return 0.5 * max(_INNER_OF_STEP * step, self._inner_of_tolerance * self._tolerance * size) ** 2
 
             weight = self._weight / self._scale
-            if self._penalty.bounded and not any(vectors.any() for vectors in dual.vectors):
-                gap = 0.5 * (self._inner_of_tolerance * self._tolerance * size) ** 2
-                dual.begin_coarse(point, metric, weight, self._penalty, gap)
+            gap = 0.5 * (self._inner_of_tolerance * self._tolerance * size) ** 2
+            dual.begin_coarse(point, metric, weight, self._penalty, gap)
             found = dual.prox(point, metric, weight, self._penalty, gap_tolerance, _MAX_INNER_STEPS)
             plane = found.plane
             self._inner_steps += found.steps
@@ -212,7 +223,8 @@ class _Pmlem:
         square, excess = dual.distance_from_primal(plane, point, metric, self._weight)
         residual, size = float(np.sqrt(2 * square)), norm(plane, metric)
         slack = self._weight * dual.penalty_and_slack(plane, self._penalty)[1] + excess
-        parts = (residual + np.sqrt(residual**2 + 2 * slack), residual, np.sqrt(2 * slack))
+        bound = residual + np.sqrt(residual**2 + 2 * slack) if dual.certifies else np.nan
+        parts = (bound, residual, np.sqrt(2 * slack))
         return Certificate(*(_relative(part, size) for part in parts))
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple, Self
 
 import numba
 import numpy as np
@@ -68,24 +68,29 @@ class DualField:
     proposal: Image | None = None
     workers: int = field(default_factory=lambda: int(numba.config.NUMBA_NUM_THREADS))
 
+    # True if it proves how far a plane is from the optimum
+    certifies: ClassVar[bool] = True
+
     @classmethod
     def zero(cls, shapes: Sequence[tuple[int, int]], dtype: np.dtype[np.floating]) -> "DualField":
         """Return the field of constant planes of the given shapes."""
         return cls([np.zeros((2, *shape), dtype) for shape in shapes])
 
-    def copy(self) -> "DualField":
+    def copy(self) -> Self:
         """Return a copy that can be changed without changing this field."""
         return replace(self, vectors=[vectors.copy() for vectors in self.vectors])
 
     def begin_coarse(self, point: Image, metric: Image, weight: float, penalty: Penalty, gap: float) -> None:
         """Set this field to that of planes of half as many rows and columns: a start from which fewer steps are left.
 
+        A field that has begun stays, and so does that of a φ of unbounded slope.
         Light is averaged over wide even parts in few steps on coarse samples and in many on fine ones. A sum over 2 x 2
         samples of the quadratic is that of a coarse sample; its steps to the next count along two fine edges, so
         that β is twice as large. Coarse problems, too, begin with coarser ones, and are solved until their gap is
-        `gap`. The other parameters are as for `prox`; φ must be of bounded slope. Vectors may be longer than one, which
-        the first step mends.
+        `gap`. The other parameters are as for `prox`. Vectors may be longer than one, which the first step mends.
         """
+        if not penalty.bounded or any(vectors.any() for vectors in self.vectors):
+            return
         for vectors, (v, w, *x) in zip(
             self.vectors,
             self._planes(point, metric, *([] if self.proposal is None else [self.proposal])),

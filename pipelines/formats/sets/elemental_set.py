@@ -52,7 +52,8 @@ class ElementalSet:
     `unusable` are the pixels that are left out (hot, dead). `measured_in` is the geometry.json of the lens, if it is
     not the set's own; `described_in` the file that says what the images are. `noise_reference` are exposures without
     light, and `bright_view` is the reference view in plenty of light with its exposure in s, if there are any.
-    `read_frame` reads a frame, given its path and its size in px; see `reconstruction.channels.keeping_frames`.
+    `read_frame` reads a frame, given its path and its size in px; see `reconstruction.channels.keeping_frames`. Frames
+    of a set `in_memory` may be real numbers, and are no files.
     """
 
     folder: Path
@@ -66,6 +67,7 @@ class ElementalSet:
     noise_reference: tuple[Path, ...] = ()
     bright_view: tuple[Path, float] | None = None
     read_frame: Callable[[Path, tuple[int, int]], Frame] = field(default=read_frame, compare=False, repr=False)
+    in_memory: bool = False
 
     @cached_property
     def lens(self) -> Lens:
@@ -214,7 +216,9 @@ class ElementalSet:
         return steps, centres - centres[self.reference_view]
 
     def input_hashes(self) -> dict[str, str]:
-        """Return the SHA-256 of every file that a reconstruction reads, by name."""
+        """Return the SHA-256 of every file that a reconstruction reads, by name; none of a set in memory."""
+        if self.in_memory:
+            return {}
         files = {name: self.folder / name for name in (self.described_in, *named_files(self.settings))}
         if isinstance(self.settings.noise, str):
             maps = (self.folder / self.settings.noise).with_name(NOISE_MAPS)

@@ -10,12 +10,14 @@ from msgspec import structs
 
 from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.formats.results.records import Certificate, PenaltyRecord, SolveRecord, WeightScore
+from faintfield.pipelines.reconstruction.planes.custom import CustomOptions
 from faintfield.recon.likelihood.images import Image, select_likelihood
+from faintfield.recon.solver.custom_penalty import ProximalPenalty
 from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.solver.initialization import mean_light_e
-from faintfield.recon.solver.penalties import Penalty
+from faintfield.recon.solver.penalties import Penalty, total_variation
 from faintfield.recon.solver.penalty_weight import MIN_VIEWS, cross_validated_weight, universal_penalty_weight
-from faintfield.recon.solver.pmlem import iterate_until, pmlem
+from faintfield.recon.solver.pmlem import PmlemIterate, iterate_until, pmlem
 from faintfield.recon.solver.proximal import DualField
 from faintfield.recon.solver.uncertainty import (
     Answers,
@@ -42,6 +44,7 @@ _PMLEM_CERTIFICATE = (
     "bound on the relative distance to the optimum, from its optimality conditions in the metric of the data; "
     "see docs/physics.md"
 )
+_CUSTOM_CERTIFICATE = "relative length of the next step; with a penalty of one's own, nothing bounds the distance"
 
 
 @dataclass(frozen=True)
@@ -75,7 +78,7 @@ class Objective:
     """
 
     posed: SceneProblem
-    penalty: Penalty
+    penalty: Penalty | ProximalPenalty
     start: Image
     level_e: float
     options: SolverOptions
@@ -101,7 +104,9 @@ class Objective:
         def noise_e() -> float:
             return float(1 / np.sqrt(np.median(posed.fit(level_e).metric(start)[posed.well_seen()])))
 
-        return cls(posed, Penalty.for_noise(options.penalty, noise_e), start, level_e, options, other_colours)
+        custom = options.custom_penalty if isinstance(options, CustomOptions) else None
+        penalty = custom or Penalty.for_noise(options.penalty, noise_e)
+        return cls(posed, penalty, start, level_e, options, other_colours)
 
     def positive(self, samples: Image) -> Image:
         """Return samples to start from, all of them positive."""
@@ -143,13 +148,14 @@ def with_sigma(
 
     `responses` are those of each plane, as for `standard_deviation`; of likelihood and penalty by default.
     """
-    operator, weight = objective.posed.operator, solutions[0].record.penalty_weight or 0.0
+    operator, weight, penalty = objective.posed.operator, solutions[0].record.penalty_weight or 0.0, objective.penalty
+    assert isinstance(penalty, Penalty), "nobody knows the errors under a penalty of one's own"
     samples = operator.samples_of([solution.plane for solution in solutions])
     generator = np.random.default_rng(_SEED)
     fits = local_fits(operator, objective.posed.fit(objective.level_e), samples)
     found = []
     for solution, local, of_plane in zip(solutions, fits, responses or [None] * len(fits), strict=True):
-        sigma = standard_deviation(local, weight, objective.penalty, generator, of_plane)
+        sigma = standard_deviation(local, weight, penalty, generator, of_plane)
         found.append(replace(solution, sidecars=solution.sidecars | {"sigma": sigma}))
     return found
 
@@ -171,26 +177,38 @@ def certified(
     )
     del start  # the iterates drop it after the first step
     iterate = iterate_until(iterates, tolerance, objective.options.passes or MAX_PASSES)
-    certificate = Certificate(
-        kind=_PMLEM_CERTIFICATE,
-        value=float(iterate.certificate.distance),
-        stationarity=float(iterate.certificate.stationarity),
-        slack=float(iterate.certificate.slack),
-        tolerance=tolerance,
-        reached=bool(iterate.certificate.distance <= tolerance),
-        passes=iterate.passes,
-        inner_steps=iterate.inner_steps,
-    )
     record = SolveRecord(
         penalty_weight=weight,
         penalty_weight_chosen="given",
         passes=iterate.passes,
         objective=iterate.objective,
-        certificate=certificate,
-        penalty=PenaltyRecord(objective.penalty.name, objective.penalty.smoothing_e),
+        certificate=_certificate(iterate, objective.penalty, tolerance),
+        penalty=_penalty_record(objective.penalty),
         likelihood=objective.posed.images.likelihood.name,
     )
     return record, iterate.plane
+
+
+def _certificate(iterate: PmlemIterate, penalty: Penalty | ProximalPenalty, tolerance: float) -> Certificate:
+    if not isinstance(penalty, Penalty):
+        change, settled = float(iterate.certificate.stationarity), iterate.certificate.within(tolerance)
+        return Certificate(kind=_CUSTOM_CERTIFICATE, relative_change=change, settled=bool(settled))
+    return Certificate(
+        kind=_PMLEM_CERTIFICATE,
+        value=float(iterate.certificate.distance),
+        stationarity=float(iterate.certificate.stationarity),
+        slack=float(iterate.certificate.slack),
+        tolerance=tolerance,
+        reached=bool(iterate.certificate.within(tolerance)),
+        passes=iterate.passes,
+        inner_steps=iterate.inner_steps,
+    )
+
+
+def _penalty_record(penalty: Penalty | ProximalPenalty) -> PenaltyRecord:
+    if isinstance(penalty, Penalty):
+        return PenaltyRecord(penalty.name, penalty.smoothing_e)
+    return PenaltyRecord(type(penalty).__name__, 0.0)
 
 
 def solve_then_sigma(objective: Objective) -> tuple[Solution, Callable[[], Image]]:
@@ -200,8 +218,15 @@ def solve_then_sigma(objective: Objective) -> tuple[Solution, Callable[[], Image
     """
     (solution,) = solve_pmlem(objective)
     (local,) = local_fits(objective.posed.operator, objective.posed.fit(objective.level_e), solution.plane)
-    weight, generator = solution.record.penalty_weight or 0.0, np.random.default_rng(_SEED)
-    return solution, partial(standard_deviation, local, weight, objective.penalty, generator)
+    weight, generator, penalty = solution.record.penalty_weight or 0.0, np.random.default_rng(_SEED), objective.penalty
+    assert isinstance(penalty, Penalty), "nobody knows the errors under a penalty of one's own"
+    return solution, partial(standard_deviation, local, weight, penalty, generator)
+
+
+def _variation_over(penalty: ProximalPenalty, planes: Sequence[Image]) -> float:
+    """Return by how much larger the weight of a penalty is than that of total variation, for equal parts of both."""
+    variation, value = (sum(map(of, planes)) for of in (partial(total_variation, epsilon=0.0), penalty.value))
+    return variation / value if value > 0 else 1.0
 
 
 def _choose_weight(objective: Objective) -> tuple[float, Image, DualField, dict[str, Any]]:
@@ -212,6 +237,8 @@ def _choose_weight(objective: Objective) -> tuple[float, Image, DualField, dict[
     if options.penalty_weight != "auto":
         return options.penalty_weight, start, posed.dual(), {"penalty_weight_chosen": "given"}
     guess = universal_penalty_weight(posed.operator, posed.images, start)
+    if not isinstance(objective.penalty, Penalty):
+        guess *= _variation_over(objective.penalty, posed.operator.planes_of(start))
     if len(posed.operator.seeing_views) < MIN_VIEWS:
         chosen = "from the noise level: too few views to hold some out"
         return guess, start, posed.dual(), {"penalty_weight_chosen": chosen}

@@ -9,6 +9,7 @@ from msgspec import UNSET, structs
 
 from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.formats.results.records import PriorRecord, SolveRecord
+from faintfield.pipelines.reconstruction.planes.custom import CustomOptions
 from faintfield.pipelines.reconstruction.planes.learned_prior import learned_estimate, outside_range
 from faintfield.pipelines.reconstruction.planes.penalised import (
     Objective,
@@ -21,6 +22,7 @@ from faintfield.pipelines.reconstruction.planes.penalised import (
 )
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.prior.collaborative import patch_candidates
+from faintfield.recon.prior.denoiser import DenoiserCandidates, name_of
 from faintfield.recon.prior.evidence import Evidence, evidence_of_planes, misfits
 from faintfield.recon.prior.proposal import (
     WEIGHT_ABOUT_PROPOSAL,
@@ -112,6 +114,9 @@ def _makers(options: SolverOptions, evidences: Sequence[Evidence]) -> tuple[list
     makers: list[Candidates] = []
     reasons: list[str | None] = []
     for of_scale in zip(*map(scales, evidences), strict=False):
+        if isinstance(options, CustomOptions) and options.denoiser is not None:
+            makers.append(DenoiserCandidates(options.denoiser))
+            continue
         if options.prior == "patches":
             makers.append(patch_candidates)
             continue
@@ -146,8 +151,9 @@ def _solution(
     np.divide(plane - proposal.picture, proposal.sigma, out=moved, where=proposal.sigma > 0)
     seen = np.isfinite(proposal.sigma)
     rms = float(np.sqrt(np.mean(np.square(moved[seen], dtype=np.float64))))
+    denoiser = options.denoiser if isinstance(options, CustomOptions) else None
     prior = PriorRecord(
-        name=options.prior or "tv",
+        name=name_of(denoiser) if denoiser is not None else options.prior or "tv",
         mixture=proposal.mixture,
         moved_sigma=rms,
         penalty_weight=WEIGHT_ABOUT_PROPOSAL * (record.penalty_weight or 0.0),

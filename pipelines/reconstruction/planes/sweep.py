@@ -80,7 +80,7 @@ class Channel:
 
     def total_variation(self, task: PlaneTask) -> dict[Place, Solution]:
         """Return the planes from which the priors of a task begin."""
-        solver = replace(task.solver, prior="tv", uncertainty=False)
+        solver = task.solver.without_prior()
         if any(files.method in JOINT_METHODS for files in task.files):
             return solve_together(self._factory, self._images, task.grids, ["joint"], solver)["joint"]
         operators = {place: self._operator(place, grid) for place, grid in task.grids.items()}
@@ -252,7 +252,7 @@ class Sweep:
     def run(self, runner: Runner, out: Path) -> None:
         """Run the missing tasks, and write each plane at once (FileFailed: a colour cannot be read back)."""
         planned = self.plan.files
-        tasks = self._tasks()
+        tasks = self.tasks()
         self._write_complete(planned)
         with closing(runner(self.elemental_set, out, tasks)) as done:
             cost = sum(task.cost for task in tasks)
@@ -269,7 +269,7 @@ class Sweep:
                     "run the same command again"
                 )
 
-    def _tasks(self) -> list[PlaneTask]:
+    def tasks(self) -> list[PlaneTask]:
         """Return the missing tasks, one channel after the other; with all channels in each if a prior compares them."""
         plan, tasks = self.plan, []
         wanted = [files for files in plan.files if (files.method, files.place) not in self.finished]

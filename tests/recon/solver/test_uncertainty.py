@@ -147,6 +147,7 @@ def test_plane_about_proposal_answers_as_to_other_data() -> None:
 
     (local,) = local_fits(operator, objective.posed.fit(objective.level_e), plane)
     gradient = others.fit(objective.level_e).value_and_gradient(plane)[1]
+    assert isinstance(objective.penalty, Penalty)
     answer = ProposalAnswers(LocalProblem(local, weight, objective.penalty), proposal, pilot.plane)(
         (local.gradient - gradient).astype(np.float32)
     )

@@ -1,0 +1,1 @@
+"""The front door in Python: light fields and results as objects with arrays, for notebooks and scripts."""

@@ -1,0 +1,445 @@
+"""A light field: the views of a scene with their poses, lens and noise, and the planes reconstructed from them."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal, Self, TypedDict, Unpack
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintfield.calib.lens import Lens
+from faintfield.calib.noise_model import NoiseModel
+from faintfield.pipelines.arguments import Method, PriorName
+from faintfield.pipelines.console import inform
+from faintfield.pipelines.errors import BadValue, import_optional
+from faintfield.pipelines.formats.frames import ChannelLayout
+from faintfield.pipelines.formats.results.plane_files import PlaneFiles
+from faintfield.pipelines.formats.results.records import FocusPoint, PlaneRecord
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, light_per_e
+from faintfield.pipelines.formats.units import Node, StatedUnits
+from faintfield.pipelines.notebook import plotting
+from faintfield.pipelines.notebook.array_set import set_of_arrays
+from faintfield.pipelines.notebook.results import Array, Plane, Planes
+from faintfield.pipelines.reconstruction.channels import keeping_frames, load_channel
+from faintfield.pipelines.reconstruction.depth.autofocus import best_focus
+from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
+from faintfield.pipelines.reconstruction.options import Options
+from faintfield.pipelines.reconstruction.planes.custom import CustomOptions
+from faintfield.pipelines.reconstruction.planes.sweep import run_serially
+from faintfield.pipelines.reconstruction.request import resolve, select_planes
+from faintfield.pipelines.reconstruction.run import check_request, plan_sweep, warn_of
+from faintfield.recon.likelihood.images import ElementalImages
+from faintfield.recon.names import LikelihoodName, PenaltyName
+from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.single_plane import PlaneOperator
+from faintfield.recon.prior.denoiser import Denoiser
+from faintfield.recon.solver.custom_penalty import ProximalPenalty
+
+
+class PlaneOptions(TypedDict, total=False):
+    """Options of reconstructed planes; those of `faintfield reconstruct` by the same names.
+
+    Attributes
+    ----------
+    method : str
+        "pmlem" by default; "backprojection", "mlem", "pmlem-osl", or of all planes together "joint" or "occlusion".
+    prior : str or Denoiser
+        "tv", "patches", "learned", "auto" (the default with total variation), or a function that removes noise.
+    penalty : str or ProximalPenalty
+        "tv" by default, "huber-tv", "quadratic", "none", or an object with `value` and `prox`.
+    penalty_weight : float
+        β; by default the one that best predicts held-out views.
+    likelihood : str
+        "poisson-gaussian", "shifted-poisson", "poisson" or "least-squares"; by default the first or second.
+    uncertainty : bool
+        Also return the standard deviation of each sample.
+    pitch : float
+        Distance of samples in mm; by default one pixel of the reference view.
+    passes : int
+        Largest number of passes over the data.
+    progress : callable
+        Is called with the number of steps done and that of all.
+    """
+
+    method: Method
+    prior: PriorName | Denoiser
+    penalty: PenaltyName | ProximalPenalty
+    penalty_weight: float
+    likelihood: LikelihoodName
+    uncertainty: bool
+    pitch: float
+    passes: int
+    progress: Callable[[int, int], object]
+
+
+@dataclass(frozen=True, eq=False)
+class LightField:
+    """The views of a scene, with the poses, lens and noise of their camera, from files or arrays.
+
+    `faintfield.open` returns that of a set or session, `from_arrays` makes one of arrays.
+
+    Parameters
+    ----------
+    elemental_set : ElementalSet
+        Images, poses, lens and noise, checked.
+
+    Examples
+    --------
+    >>> import faintfield, tempfile
+    >>> from pathlib import Path
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     options = faintfield.SyntheticOptions(rows=3, columns=3, size_px=(64, 48), snr=1.0)
+    ...     _ = faintfield.simulate(Path(folder) / "set", options=options)
+    ...     light_field = faintfield.open(Path(folder) / "set")
+    ...     images_e = light_field.images_e
+    >>> light_field
+    <light field of 9 views of 64 x 48 px, grey, poses stated, depths in mm>
+    >>> images_e.shape, light_field.poses.shape
+    ((9, 48, 64), (9, 6))
+    """
+
+    elemental_set: ElementalSet
+
+    @classmethod
+    def from_arrays(
+        cls,
+        images: ArrayLike,
+        poses: ArrayLike,
+        lens: Lens,
+        noise: NoiseModel,
+        *,
+        reference: int | None = None,
+        nodes: Sequence[tuple[int, int]] | None = None,
+        exposure_s: float | None = None,
+        mosaic: Sequence[str] | None = None,
+        flat: ArrayLike | None = None,
+        unusable: ArrayLike | None = None,
+    ) -> Self:
+        """Return a light field of arrays, which are not copied.
+
+        Parameters
+        ----------
+        images : array (view, row, column) or (view, row, column, RGB)
+            The camera's values in DN, as the noise model counts; electrons with a gain of 1 and an offset of 0. Pixels
+            that are NaN or saturated do not count.
+        poses : array (view, 6)
+            Rodrigues rad and mm, from a common frame to each camera; depths are along the axis of the reference view.
+        lens : Lens
+            Lens of all views.
+        noise : NoiseModel
+            Offset, gain, read noise and dark current.
+        reference : int, optional
+            Number of the reference view; by default the one whose pose is zero.
+        nodes : sequence of (int, int), optional
+            Row and column of each view in the grid.
+        exposure_s : float, optional
+            Exposure of each view, with which dark current counts.
+        mosaic : sequence of str, optional
+            Rows of the smallest period of colour filters, such as ("RG", "GB").
+        flat : array (row, column), optional
+            Relative response of each pixel.
+        unusable : bool array (row, column), optional
+            Pixels that are left out.
+
+        Raises
+        ------
+        BadValue
+            Shapes do not fit together, or a number is impossible; the message names it.
+        """
+        return cls(
+            set_of_arrays(
+                images, poses, lens, noise, reference=reference, nodes=nodes, exposure_s=exposure_s, mosaic=mosaic,
+                flat=flat, unusable=unusable,
+            )
+        )  # fmt: skip
+
+    def __repr__(self) -> str:
+        width, height = self.lens.size_px
+        return (
+            f"<light field of {len(self.poses)} views of {width} x {height} px, {', '.join(self.channels)}, "
+            f"poses {self.elemental_set.poses}, depths in {self.units.length or 'no unit'}>"
+        )
+
+    @property
+    def poses(self) -> NDArray[np.float64]:
+        """Poses rt_cam_ref (view, 6): Rodrigues rad and mm, from the reference camera to each camera."""
+        return self.elemental_set.poses_rt_cam_ref
+
+    @property
+    def nodes(self) -> list[Node]:
+        """Row and column of each view in the grid."""
+        return self.elemental_set.nodes
+
+    @property
+    def reference(self) -> int:
+        """Number of the reference view."""
+        return self.elemental_set.reference_view
+
+    @property
+    def lens(self) -> Lens:
+        """Lens of all views."""
+        return self.elemental_set.lens
+
+    @property
+    def noise(self) -> NoiseModel:
+        """Noise model of the camera."""
+        return self.elemental_set.noise
+
+    @property
+    def units(self) -> StatedUnits:
+        """Units of depth and light of all planes."""
+        return self.elemental_set.units
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of the colours, ("grey",) without any."""
+        return tuple(layout.name for layout in self.elemental_set.layouts)
+
+    @cached_property
+    def images_e(self) -> Array:
+        """All views in electrons (view, row, column[, colour]), those of a mosaic as its pixels; NaN where saturated.
+
+        Read at the first use and kept; `data` has one colour as solvers take it.
+        """
+        elemental_set, layouts = self.elemental_set, self.elemental_set.layouts
+        width, height = self.lens.size_px
+        colours = () if layouts[0].plane_of_colour is None else (len(layouts),)
+        images = np.full((len(self.poses), height, width, *colours), np.nan, np.float32)
+        for layout in layouts:
+            data = load_channel(elemental_set, layout)
+            electrons = data.electrons if data.valid is None else np.where(data.valid, data.electrons, np.nan)
+            phases = len(layout.lattices)
+            for phase, lattice in enumerate(layout.lattices):
+                for view, image in enumerate(images):
+                    lattice.of(layout.of(image))[:] = electrons[view * phases + phase]
+        return images
+
+    def data(self, channel: str | None = None) -> ElementalImages:
+        """Return one colour of all views in electrons, with background and read variance; the last one is kept."""
+        layout = self._layout(channel)
+        if layout.name not in self._data:
+            self._data.clear()
+            self._data[layout.name] = load_channel(self.elemental_set, layout)
+        return self._data[layout.name]
+
+    def grid(self, depth: float, pitch: float | None = None) -> PlaneGrid:
+        """Return the samples of a plane at a depth, one per pixel of the reference view by default."""
+        return plane_grid(self.elemental_set, self._depth_mm(depth), pitch)
+
+    def operator(self, depth: float, channel: str | None = None, pitch: float | None = None) -> PlaneOperator:
+        """Return H of a plane at a depth, for the pixels of `data`."""
+        factory = OperatorFactory(self.elemental_set, self._layout(channel), self.data(channel))
+        return factory.at(self._depth_mm(depth), self.grid(depth, pitch))
+
+    def find_depths(self, near: float | None = None, far: float | None = None) -> list[float]:
+        """Return the depths of objects, found by comparing the views, in a range or at all depths that they share.
+
+        Raises
+        ------
+        NothingInFocus
+            The views agree on nothing, or no better than shuffled ones.
+        """
+        if (near is None) != (far is None):
+            raise BadValue(f"the range from {near} to {far} has one end; give both or none")
+        limits = None if near is None or far is None else (self._depth_mm(near), self._depth_mm(far))
+        with _scratch() as folder:
+            depths_mm = best_focus(self.elemental_set, folder, limits).depth_mm
+        return [self.elemental_set.stated_depth(depth_mm) for depth_mm in depths_mm]
+
+    def plane(self, depth: float, **options: Unpack[PlaneOptions]) -> Plane:
+        """Reconstruct one plane; the options are those of `PlaneOptions`, and the failures those of `planes`."""
+        return self.planes([depth], **options)[0]
+
+    def planes(
+        self, depths: Sequence[float] | NDArray[Any] | Literal["auto"] = "auto", **options: Unpack[PlaneOptions]
+    ) -> Planes:
+        """Reconstruct planes at depths in the unit of the set, or at those of objects that are found.
+
+        Parameters
+        ----------
+        depths : sequence of float or "auto"
+            In mm, or what the set states depths in.
+        **options
+            Those of `PlaneOptions`.
+
+        Raises
+        ------
+        BadValue, WrongUsage
+            Options contradict one another.
+        GeometryMismatch
+            No two views see the same part of a plane.
+        NothingInFocus
+            No depth was found.
+        NotConverged
+            The penalty weight is too large.
+        """
+        method, progress = options.get("method", "pmlem"), options.get("progress")
+        with _scratch() as folder:
+            elemental_set = keeping_frames(self.elemental_set, folder)
+            asked: list[float | Literal["auto"]] = ["auto"] if isinstance(depths, str) else [float(d) for d in depths]
+            selection = select_planes(
+                Options(depth=asked, method=[method], solver=_solver(options), pitch_mm=options.get("pitch"))
+            )
+            request = resolve(selection, elemental_set, folder)
+            check_request(elemental_set, [], request)
+            sweep = plan_sweep(elemental_set, {method: folder}, request, KeptPlane)
+            tasks = sweep.tasks()
+            for number, (_, messages) in enumerate(run_serially(elemental_set, folder, tasks), 1):
+                for message in messages:
+                    inform(message)
+                if progress is not None:
+                    progress(number, len(tasks))
+        kept = sorted((files for files in sweep.plan.files if isinstance(files, KeptPlane)), key=KeptPlane.depth)
+        planes = [files.plane(self.units) for files in kept]
+        warn_of(elemental_set, [record for plane in planes for record in plane.records])
+        return Planes(tuple(plane.records for plane in planes), self.units, planes.__getitem__)
+
+    def plot(self, view: int | None = None, axes: Any = None) -> Any:
+        """Draw one view in electrons, by default the reference view, and return the matplotlib axes."""
+        view = self.reference if view is None else view
+        light = self.images_e[view] * np.float32(light_per_e(self.elemental_set))
+        return plotting.draw_light(axes, light, self.units, title=f"view {view}")
+
+    def to_xarray(self) -> Any:
+        """Return `images_e`, poses and nodes as an `xarray.Dataset`; MissingPackage without xarray."""
+        xarray = import_optional("xarray", "notebook")
+        names = ("view", "row", "column", "colour")[: self.images_e.ndim]
+        rows, columns = np.array(self.nodes).T
+        arrays = {
+            "images": (names, self.images_e, {"units": "electrons"}),
+            "poses": (("view", "rt_cam_ref"), self.poses, {"units": "rad, mm"}),
+        }
+        return xarray.Dataset(arrays, {"node_row": ("view", rows), "node_column": ("view", columns)})
+
+    @cached_property
+    def _data(self) -> dict[str, ElementalImages]:
+        return {}
+
+    def _layout(self, channel: str | None) -> ChannelLayout:
+        layouts = {layout.name: layout for layout in self.elemental_set.layouts}
+        if channel is None and len(layouts) == 1:
+            return next(iter(layouts.values()))
+        if channel not in layouts:
+            raise BadValue(f"channel {channel!r}: the views have {', '.join(layouts)}; name one of these")
+        return layouts[channel]
+
+    def _depth_mm(self, depth: float) -> float:
+        return self.elemental_set.depth_in_mm(depth)
+
+
+@dataclass(frozen=True)
+class KeptPlane(PlaneFiles):
+    """A plane that is kept in memory."""
+
+    parts: dict[str, tuple[Mapping[str, NDArray[np.floating]], PlaneRecord]] = field(default_factory=dict)
+
+    def missing(self) -> list[str]:
+        """Return the colours that are still to be reconstructed."""
+        return [channel for channel in self.channels if channel not in self.parts]
+
+    def save_part(
+        self, channel: str, arrays: Mapping[str, NDArray[np.floating]], record: PlaneRecord, focus: FocusPoint | None
+    ) -> None:
+        """Keep one colour."""
+        self.parts[channel] = arrays, record
+
+    def depth(self) -> float:
+        """Return the depth in the unit of the set."""
+        return self.parts[self.channels[0]][1].depth_mm
+
+    def plane(self, units: StatedUnits) -> Plane:
+        """Return the plane of all colours."""
+        parts = [self.parts[channel] for channel in self.channels]
+        names = [name for name in parts[0][0] if all(name in arrays for arrays, _ in parts)]
+
+        def joined(name: str) -> Array:
+            colours = [np.asarray(arrays[name], np.float32) for arrays, _ in parts]
+            return colours[0] if len(colours) == 1 else np.stack(colours, axis=-1)
+
+        maps = {name: joined(name) for name in names}
+        return Plane(maps.pop("plane"), tuple(record for _, record in parts), units, maps)
+
+
+def reconstruct(
+    images: ArrayLike,
+    poses: ArrayLike,
+    lens: Lens,
+    noise: NoiseModel,
+    depths: Sequence[float] | NDArray[Any] | Literal["auto"] = "auto",
+    *,
+    reference: int | None = None,
+    exposure_s: float | None = None,
+    **options: Unpack[PlaneOptions],
+) -> Planes:
+    """Reconstruct planes from arrays, without files.
+
+    Parameters
+    ----------
+    images, poses, lens, noise, reference, exposure_s
+        As for `LightField.from_arrays`, which takes mosaics, flat fields and bad pixels, too.
+    depths : sequence of float or "auto"
+        Depths in mm along the axis of the reference view, or "auto" for those of objects that are found.
+    **options
+        Those of `PlaneOptions`: prior, penalty, uncertainty, progress and others.
+
+    Returns
+    -------
+    Planes
+        A sequence of planes, with their light in electrons per pixel.
+
+    Raises
+    ------
+    BadValue
+        Shapes do not fit together, or a number is impossible; see also `LightField.planes`.
+
+    Examples
+    --------
+    Four views of an even scene at 400 mm, of 2 electrons per pixel and a read noise of 3 electrons:
+
+    >>> import numpy as np
+    >>> from faintfield import Lens, NoiseModel, reconstruct
+    >>> lens = Lens(size_px=(32, 24), fx_px=40.0, fy_px=40.0, cx_px=15.5, cy_px=11.5)
+    >>> poses = np.zeros((4, 6))
+    >>> poses[:, 3] = [0.0, -10.0, -20.0, -30.0]  # a camera moved to the right maps points to the left
+    >>> rng = np.random.default_rng(1)
+    >>> images = rng.poisson(2.0, (4, 24, 32)) + rng.normal(0.0, 3.0, (4, 24, 32))
+    >>> noise = NoiseModel(offset_dn=0.0, gain_dn_per_e=1.0, read_noise_e=3.0)
+    >>> (plane,) = reconstruct(images, poses, lens, noise, [400.0], prior="tv", penalty_weight=2.0)
+    >>> plane.image.shape, bool(abs(plane.image.mean() - 2.0) < 0.3)
+    ((24, 32), True)
+    """
+    light_field = LightField.from_arrays(images, poses, lens, noise, reference=reference, exposure_s=exposure_s)
+    return light_field.planes(depths, **options)
+
+
+def _solver(options: PlaneOptions) -> CustomOptions:
+    """Return the options of solvers; a penalty or prior that is an object goes to a field of its own."""
+    penalty, prior = options.get("penalty", "tv"), options.get("prior")
+    custom_penalty = None if isinstance(penalty, str) else penalty
+    denoiser = None if prior is None or isinstance(prior, str) else prior
+    named_prior = prior if isinstance(prior, str) else None
+    if custom_penalty is not None and (denoiser is not None or named_prior not in (None, "tv")):
+        raise BadValue("prior: it starts from total variation, not from a penalty of one's own; leave one out")
+    if custom_penalty is not None and options.get("uncertainty"):
+        raise BadValue("uncertainty: nobody knows the errors under a penalty of one's own; leave it out")
+    return CustomOptions(
+        penalty=penalty if isinstance(penalty, str) else "tv",
+        prior="tv" if custom_penalty is not None or denoiser is not None else named_prior,
+        penalty_weight=options.get("penalty_weight", "auto"),
+        likelihood=options.get("likelihood", "auto"),
+        uncertainty=options.get("uncertainty", False),
+        passes=options.get("passes"),
+        custom_penalty=custom_penalty,
+        denoiser=denoiser,
+    )
+
+
+@contextmanager
+def _scratch() -> Iterator[Path]:
+    """Make a folder for frames and electrons that do not fit into memory, and remove it."""
+    with TemporaryDirectory(prefix="faintfield-") as folder:
+        yield Path(folder)
