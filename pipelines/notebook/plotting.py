@@ -69,8 +69,8 @@ def draw_surface(surface: "Surface") -> Any:
     figure, (left, right) = plt.subplots(1, 2, figsize=size, layout="constrained")
     draw_light(left, surface.picture, surface.units, title="picture")
     depth = right.imshow(np.where(surface.sure, surface.depth, np.nan), interpolation="nearest")
-    right.set(title=f"sure depths: {surface.sure.mean():.0%} of the samples", xticks=[], yticks=[], facecolor="0.5")
-    figure.colorbar(depth, ax=right, label=f"depth, {surface.result.surface.unit}")
+    right.set(title=f"sure depths: {surface.sure.mean():.0%} of the samples", xlabel="x, px", facecolor="0.5")
+    figure.colorbar(depth, ax=right, label=f"depth, {surface.result.surface.unit}", fraction=0.036, pad=0.02)
     return figure
 
 
