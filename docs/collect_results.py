@@ -1,6 +1,8 @@
-"""Put the numbers of a finished demo into docs/results.json and README.md: `python docs/collect_results.py demo`.
+"""Put the numbers of a finished demo into docs/results.json, README.md and the paper.
 
-`filled` makes README's table from results.json, and a test compares the two, so that no number is typed by hand.
+`python docs/collect_results.py demo`
+
+`filled` makes their table from results.json, and a test compares the two, so that no number is typed by hand.
 """
 
 import json
@@ -10,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 _DOCS = Path(__file__).parent
-RESULTS, README = _DOCS / "results.json", _DOCS.parent / "README.md"
+RESULTS = _DOCS / "results.json"
+PAGES = _DOCS.parent / "README.md", _DOCS.parent / "paper" / "paper.md"
 _BLOCK = re.compile(
     r"(?<=<!-- results: made by docs/collect_results.py -->\n).*?(?=<!-- end of results -->)", re.DOTALL
 )
@@ -29,7 +32,7 @@ _NOISE = {
 
 
 def collect(demo: Path) -> dict[str, Any]:
-    """Return the numbers of the demo in a folder that README states, rounded to their precision."""
+    """Return the numbers of the demo in a folder that pages state, rounded to their precision."""
     metrics = json.loads((demo / "metrics.json").read_text())
     made = json.loads(next(demo.rglob("reconstruction.json")).read_text())
     planes = [
@@ -82,15 +85,16 @@ def table(results: dict[str, Any]) -> str:
     return "\n".join([*lines, *(["", f"Measured on the way: {'; '.join(measured)}."] if measured else [])]) + "\n"
 
 
-def filled(readme: str, results: dict[str, Any]) -> str:
-    """Return the text of README.md with its marked block replaced."""
-    made, count = _BLOCK.subn(lambda _: table(results), readme)
+def filled(page: str, results: dict[str, Any]) -> str:
+    """Return the text of a page with its marked block replaced."""
+    made, count = _BLOCK.subn(lambda _: table(results), page)
     if count != 1:
-        raise ValueError(f"README.md has {count} marked blocks of results; leave exactly one")
+        raise ValueError(f"the page has {count} marked blocks of results; leave exactly one")
     return made
 
 
 if __name__ == "__main__":
     found = collect(Path(sys.argv[1]))
     RESULTS.write_text(json.dumps(found, indent=2) + "\n")
-    README.write_text(filled(README.read_text(), found))
+    for page in PAGES:
+        page.write_text(filled(page.read_text(), found))
