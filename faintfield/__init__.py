@@ -14,6 +14,7 @@ _MODULES = {
     "CalibrationError": "calib.errors",
     "CapturePlan": "rig.plan",
     "Conditions": "calib.noise",
+    "Denoiser": "recon.prior.denoiser",
     "DataFit": "recon.solver.data_fit",
     "ElementalImages": "recon.likelihood.images",
     "Grid": "rig.plan",
@@ -29,6 +30,7 @@ _MODULES = {
     "PlaneOptions": "pipelines.notebook.light_field",
     "Planes": "pipelines.notebook.results",
     "Point": "rig.stages.protocol",
+    "ProximalPenalty": "recon.solver.custom_penalty",
     "ReconstructionError": "recon.errors",
     "RigError": "rig.errors",
     "RigSettings": "rig.settings",
@@ -92,6 +94,8 @@ if TYPE_CHECKING:  # type checkers and editors read these lines; a test compares
     from faintfield.recon.likelihood.images import ElementalImages as ElementalImages
     from faintfield.recon.operator.grid import PlaneGrid as PlaneGrid
     from faintfield.recon.operator.single_plane import PlaneOperator as PlaneOperator
+    from faintfield.recon.prior.denoiser import Denoiser as Denoiser
+    from faintfield.recon.solver.custom_penalty import ProximalPenalty as ProximalPenalty
     from faintfield.recon.solver.data_fit import DataFit as DataFit
     from faintfield.recon.solver.initialization import back_projection as back_projection
     from faintfield.recon.solver.initialization import smooth_start as smooth_start

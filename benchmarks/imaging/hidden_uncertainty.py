@@ -1,7 +1,7 @@
 """Coverage where one object hides another: `python -m benchmarks.imaging.hidden_uncertainty`.
 
-The whole scene of the demo, truck before airplane, at four signal-to-noise ratios. For each method and prior one line of
-JSON: the share of the samples that the reference view sees of each object whose interval f ± 1.645 σ holds the truth.
+The whole scene of the demo, truck before airplane, at four signal-to-noise ratios. One line of JSON for each method and
+prior: the share of the samples that the reference view sees of each object whose interval f ± 1.645 σ holds the truth.
 """
 
 import argparse
