@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal, Self, TypedDict, Unpack
+from typing import Any, Literal, Self, TypedDict, Unpack, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -39,6 +39,15 @@ from faintfield.recon.operator.single_plane import PlaneOperator
 from faintfield.recon.prior.denoiser import Denoiser
 from faintfield.recon.solver.custom_penalty import ProximalPenalty
 
+# Words that options can be, and least numbers.
+_WORDS: dict[str, tuple[str, ...]] = {
+    "method": get_args(Method.__value__),
+    "prior": get_args(PriorName.__value__),
+    "penalty": get_args(PenaltyName.__value__),
+    "likelihood": ("auto", *get_args(LikelihoodName.__value__)),
+}
+_LEAST = {"penalty_weight": 0.0, "pitch": 1e-9, "passes": 1}
+
 
 class PlaneOptions(TypedDict, total=False):
     """Options of reconstructed planes; those of `faintfield reconstruct` by the same names.
@@ -68,8 +77,8 @@ class PlaneOptions(TypedDict, total=False):
     method: Method
     prior: PriorName | Denoiser
     penalty: PenaltyName | ProximalPenalty
-    penalty_weight: float
-    likelihood: LikelihoodName
+    penalty_weight: float | Literal["auto"]
+    likelihood: LikelihoodName | Literal["auto"]
     uncertainty: bool
     pitch: float
     passes: int
@@ -277,6 +286,7 @@ class LightField:
         NotConverged
             The penalty weight is too large.
         """
+        _check_options(options)
         method, progress = options.get("method", "pmlem"), options.get("progress")
         with _scratch() as folder:
             elemental_set = keeping_frames(self.elemental_set, folder)
@@ -414,6 +424,25 @@ def reconstruct(
     """
     light_field = LightField.from_arrays(images, poses, lens, noise, reference=reference, exposure_s=exposure_s)
     return light_field.planes(depths, **options)
+
+
+def _check_options(options: PlaneOptions) -> None:
+    """Refuse options that there are not (TypeError), and impossible values (BadValue)."""
+    if unknown := sorted(options.keys() - PlaneOptions.__optional_keys__):
+        known = ", ".join(sorted(PlaneOptions.__optional_keys__))
+        raise TypeError(f"{unknown[0]}: is no option of planes; they are {known}")
+    values: dict[str, Any] = {**options}
+    for name, words in _WORDS.items():
+        if isinstance(value := values.get(name, words[0]), str) and value not in words:
+            raise BadValue(f"{name}: got {value!r}; give one of {', '.join(words)}")
+    for name, least in _LEAST.items():
+        value = values.get(name, "auto")
+        if value != "auto" and not least <= value < np.inf:
+            raise BadValue(f"{name}: got {value}; give a number of at least {least:g}")
+    if not isinstance(penalty := values.get("penalty", "tv"), str) and not {"value", "prox"} <= {*dir(penalty)}:
+        raise BadValue(f"penalty: a {type(penalty).__name__} has no `value` and `prox`; see faintfield.ProximalPenalty")
+    if not isinstance(prior := values.get("prior") or "tv", str) and not callable(prior):
+        raise BadValue(f"prior: a {type(prior).__name__} cannot be called; see faintfield.Denoiser")
 
 
 def _solver(options: PlaneOptions) -> CustomOptions:

@@ -171,6 +171,18 @@ def test_contradictions_are_refused(folder: Path) -> None:
     for options in combinations:
         with pytest.raises(BadValue, match="leave"):
             light_field.plane(1000.0, **options)
+    wrong: list[tuple[dict[str, object], str]] = [
+        ({"prior": "atuo"}, "got 'atuo'; give one of tv, patches"),
+        ({"prior": 5}, "an? int cannot be called"),
+        ({"penalty": 5}, "no `value` and `prox`"),
+        ({"pitch": 0.0}, "pitch: got 0"),
+        ({"penalty_weight": -1.0}, "penalty_weight: got -1"),
+    ]
+    for words, message in wrong:
+        with pytest.raises(BadValue, match=message):
+            light_field.plane(1000.0, **words)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="weight: is no option of planes"):
+        light_field.plane(1000.0, weight=1.0)  # type: ignore[call-arg]
     with pytest.raises(BadValue, match="channel 'infrared'"):
         light_field.operator(800.0, "infrared")
     with pytest.raises(BadValue, match="give both or none"):
