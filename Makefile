@@ -49,7 +49,7 @@ build/bench:
 	$(PIP) install --no-deps --target $@ 'pylops>=2.4' 'pyproximal>=0.10' \
 	  'odl>=1.0' array-api-compat future || mkdir -p $@
 
-results: $(VENV)/installed ## the demo's figures and pictures, put into README.md and docs/pictures; needs Chromium
+results: $(VENV)/installed ## the demo's figures and pictures, put into docs and the paper; needs Chromium
 	$(BIN)/faintfield demo $(OUT)
 	$(BIN)/python docs/collect_results.py $(OUT)
 	PYTHONPATH=. $(BIN)/python docs/draw_pictures.py $(OUT)

@@ -1,4 +1,4 @@
-"""Put the numbers of a finished demo into docs/results.json, README.md and the paper.
+"""Put the numbers of a finished demo into docs/results.json, docs/quality.md and the paper.
 
 `python docs/collect_results.py demo`
 
@@ -13,7 +13,7 @@ from typing import Any
 
 _DOCS = Path(__file__).parent
 RESULTS = _DOCS / "results.json"
-PAGES = _DOCS.parent / "README.md", _DOCS.parent / "paper" / "paper.md"
+PAGES = _DOCS / "quality.md", _DOCS.parent / "paper" / "paper.md"
 _BLOCK = re.compile(
     r"(?<=<!-- results: made by docs/collect_results.py -->\n).*?(?=<!-- end of results -->)", re.DOTALL
 )

@@ -89,7 +89,7 @@ class SolverOptions:
         (faster) above. poisson ignores read noise; least-squares assumes Gaussian noise of fixed variance.
     uncertainty
         Save the standard deviation of each sample beside the planes of pmlem, joint and occlusion; see
-        docs/results.md for how often its intervals hold.
+        docs/quality.md for how often its intervals hold.
     prior
         What is expected of a picture. tv: little, and total variation alone decides. patches: that small patches of it
         repeat. learned: what a small network was trained with. auto: whichever of these predicts held-out views best,

@@ -1,4 +1,4 @@
-"""The links of the documents lead somewhere, and the figures of the README are those of docs/results.json."""
+"""The links of the documents lead somewhere, and the figures of docs/quality.md are those of docs/results.json."""
 
 import importlib.util
 import json
@@ -20,13 +20,13 @@ def _collect_results() -> ModuleType:
     return module
 
 
-def test_figures_of_readme_are_the_results() -> None:
+def test_figures_of_documents_are_the_results() -> None:
     script = _collect_results()
-    readme = (_ROOT / "README.md").read_text()
+    page = (_ROOT / "docs" / "quality.md").read_text()
     results = json.loads((_ROOT / "docs" / "results.json").read_text())
-    assert script.filled(readme, results) == readme
+    assert script.filled(page, results) == page
     results["planes"][0]["mse_texture"] += 0.5
-    assert script.filled(readme, results) != readme
+    assert script.filled(page, results) != page
 
 
 def test_links_lead_somewhere() -> None:

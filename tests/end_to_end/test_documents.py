@@ -19,8 +19,9 @@ DOCUMENTS = ("README.md", "docs/guide.md", "docs/api.md")
 SMALLER = {
     "--size-px 480 360": "--size-px 160 120 --rows 3 --columns 3",
     "--fx-px 600": "--fx-px 200",
-    "--sweep-mm 400:800:17": "--sweep-mm 400:800:3",
-    "--size-px 160 120 --rows 5 --columns 5": "--size-px 48 36 --rows 3 --columns 3",
+    "--depth auto": "--depth 500 --method backprojection",
+    "--surface --out": "--surface --depth-range-mm 400:900 --out",
+    "plane(500.0, uncertainty=True)": "plane(500.0, uncertainty=True, prior='tv')",
 }
 
 
@@ -64,8 +65,8 @@ def test_examples_run_as_they_stand(document: str, tmp_path: Path, monkeypatch: 
     _run_examples(blocks)
 
 
-def test_settings_file_of_readme_is_valid() -> None:
-    blocks = _blocks("README.md", "toml")
+def test_settings_file_of_documents_is_valid() -> None:
+    blocks = _blocks("docs/how-to/elemental_set.md", "toml")
     assert blocks
     for _, content in blocks:
         settings = msgspec.toml.decode(content, type=ElementalSetFile)
