@@ -13,7 +13,7 @@ _MARKER_SHARE = (0.3, 0.95)
 
 @dataclass(frozen=True)
 class Board:
-    """A board to print or to detect.
+    """A ChArUco board to print or to detect: a chessboard with a marker in every white square.
 
     The board's coordinates in mm have their origin at the first inner corner (top left), x along a row, y down, and z
     into the board. Corners are numbered along the rows.
@@ -26,14 +26,26 @@ class Board:
         Numbers of squares across and down.
     square_mm, marker_mm : float
         Edge lengths as measured on the print.
-    dictionary, first_marker_id : str, int
-        One of OpenCV's predefined dictionaries, such as "DICT_5X5_1000", and the number of the first marker; boards
-        that are in view together must not share numbers.
+    dictionary : str
+        One of OpenCV's predefined dictionaries of markers.
+    first_marker_id : int
+        Number of the first marker in the dictionary. Boards that are in view together must not share numbers.
 
     Raises
     ------
     ValueError
         There are fewer than 3 x 3 squares, markers do not fit their squares, or the dictionary is unknown or too small.
+
+    Examples
+    --------
+    >>> from faintfield import Board
+    >>> board = Board("wall", columns=9, rows=7, square_mm=30.0, marker_mm=22.0)
+    >>> board.marker_count, board.corner_shape
+    (31, (6, 8))
+    >>> board.corners_mm()[:3]  # the first corners of the first row
+    array([[ 0.,  0.,  0.],
+           [30.,  0.,  0.],
+           [60.,  0.,  0.]])
     """
 
     name: str

@@ -93,7 +93,35 @@ def detect_boards(image: NDArray[Any], boards: Sequence[Board]) -> list[BoardCor
 def detect_all(
     images: Iterable[NDArray[Any]], boards: Sequence[Board], workers: int = 2
 ) -> Iterator[list[BoardCorners]]:
-    """Yield the result of `detect_boards` for each image, in order; `workers` images are processed at a time."""
+    """Detect boards in a series of images, several at a time.
+
+    Parameters
+    ----------
+    images : iterable of array (row, column)
+        Grey images of any depth and brightness.
+    boards : sequence of Board
+        Boards to detect, which share no marker.
+    workers : int
+        Number of images that are processed at a time.
+
+    Yields
+    ------
+    list of BoardCorners
+        For each image in order, the boards that it shows: `board` is the name, `corners` are the numbers of the
+        corners, `pixels` (corner, 2) their columns and rows, and `sigma_px` the standard deviations of these.
+
+    Examples
+    --------
+    >>> from faintfield import Board, detect_all
+    >>> board = Board("wall", columns=9, rows=7, square_mm=30.0, marker_mm=22.0)
+    >>> image = board.opencv_board().generateImage((450, 350))
+    >>> ((corners,),) = detect_all([image], [board])  # one board in one image
+    >>> corners.board, corners.markers, len(corners.corners)
+    ('wall', 31, 48)
+    >>> corners.pixels[:2].round(1)
+    array([[49.5, 49.5],
+           [99.5, 49.5]])
+    """
     with ThreadPoolExecutor(workers) as pool:
         waiting = []
         for image in images:

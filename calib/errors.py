@@ -15,7 +15,20 @@ CalibrationError
 
 
 class CalibrationError(Exception):
-    """The measurements do not support the requested calibration."""
+    """The measurements do not support the requested calibration.
+
+    All failures of calibration are of this class. Each message says what is wrong, the value and its limit, and after
+    a semicolon what to do.
+
+    Examples
+    --------
+    >>> from faintfield import CalibrationError, calibrate_noise
+    >>> try:
+    ...     calibrate_noise([])
+    ... except CalibrationError as failure:
+    ...     print(failure)
+    no dark frames: the offset cannot be told from the light; record darks, lens covered
+    """
 
 
 class LensNotInvertible(CalibrationError):

@@ -21,7 +21,24 @@ def rotation_matrix(rt: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def fronto_parallel_rt_ref_plane(depth_mm: float) -> NDArray[np.float64]:
-    """Return the pose (6,) of the plane at a depth normal to the reference camera's axis, its origin on the axis."""
+    """Return the pose of the plane at a depth normal to the reference camera's axis, its origin on the axis.
+
+    Parameters
+    ----------
+    depth_mm : float
+        Distance of the plane from the reference camera.
+
+    Returns
+    -------
+    float array (6,)
+        rt_ref_plane: Rodrigues rad and mm, from plane to reference.
+
+    Examples
+    --------
+    >>> from faintfield import fronto_parallel_rt_ref_plane
+    >>> fronto_parallel_rt_ref_plane(depth_mm=500.0)
+    array([  0.,   0.,   0.,   0.,   0., 500.])
+    """
     return np.array([0.0, 0.0, 0.0, 0.0, 0.0, depth_mm])
 
 
@@ -50,6 +67,20 @@ def plane_from_ray(
     array (view, 3, 3)
         Scaled so that the third coordinate of a result is positive where the plane is in front of the camera; all zeros
         for a camera that lies in the plane and sees nothing of it.
+
+    Examples
+    --------
+    Two cameras 50 mm apart look in one direction, and see points 50 mm apart on a plane at 500 mm:
+
+    >>> import numpy as np
+    >>> from faintfield import fronto_parallel_rt_ref_plane, plane_from_ray
+    >>> poses_rt_cam_ref = np.zeros((2, 6))
+    >>> poses_rt_cam_ref[1, 3] = -50.0  # to the right of the first
+    >>> homographies = plane_from_ray(poses_rt_cam_ref, fronto_parallel_rt_ref_plane(depth_mm=500.0))
+    >>> points = homographies @ [0.1, 0.2, 1.0]
+    >>> (points[:, :2] / points[:, 2:]).round(6)
+    array([[ 50., 100.],
+           [100., 100.]])
     """
     r_ref_plane = rotation_matrix(rt_ref_plane)
     homographies = np.zeros((len(rt_cam_ref), 3, 3))

@@ -43,12 +43,17 @@ type RaysOfRows = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 class Lens:
     """A pinhole with OpenCV's rational distortion; pixel centres are integers, starting at (0, 0).
 
+    A point (X, Y, Z) in camera coordinates (x right, y down, z forward) has the ray (X/Z, Y/Z), whose distorted place
+    (x, y) is seen at the pixel (fx x + cx, fy y + cy).
+
     Parameters
     ----------
     size_px : (int, int)
         Width and height of the detector.
-    fx_px, fy_px, cx_px, cy_px : float
-        Focal lengths and principal point.
+    fx_px, fy_px : float
+        Focal lengths.
+    cx_px, cy_px : float
+        Column and row of the principal point.
     distortion : tuple of float
         k1, k2, p1, p2, k3, k4, k5, k6 in OpenCV's order; may be shorter.
 
@@ -56,6 +61,17 @@ class Lens:
     ------
     ValueError
         A number is not finite or too large, a focal length is not positive, or there are more than eight coefficients.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from faintfield import Lens
+    >>> lens = Lens((640, 480), fx_px=800.0, fy_px=800.0, cx_px=319.5, cy_px=239.5, distortion=(-0.08, 0.02))
+    >>> lens.project(np.array([[0.0, 0.0, 500.0], [100.0, 0.0, 500.0]])).round(1)  # mm to px
+    array([[319.5, 239.5],
+           [479. , 239.5]])
+    >>> lens.rays().shape  # x, y at unit depth of each pixel
+    (480, 640, 2)
     """
 
     size_px: tuple[int, int]

@@ -87,6 +87,18 @@ class NoiseModel:
     ValueError
         A number is not finite (only `saturation_dn` may be infinite) or too large to compute with, a gain is not
         positive, or a noise is negative.
+
+    Examples
+    --------
+    A pixel of 124 DN, of a camera with an offset of 100 DN and 2 DN per electron:
+
+    >>> import numpy as np
+    >>> from faintfield import NoiseModel
+    >>> noise = NoiseModel(offset_dn=100.0, gain_dn_per_e=2.0, read_noise_e=3.5, dark_current_e_per_s=0.2)
+    >>> noise.electrons(np.array([[124]]))
+    array([[12.]], dtype=float32)
+    >>> noise.background_e(exposure_s=10.0)
+    2.0
     """
 
     offset_dn: Map

@@ -12,7 +12,21 @@ from faintfield.rig.errors import RigError
 
 
 class InputError(Exception):
-    """A command's input, its output or a resource that it needs cannot be used."""
+    """A command's input, its output or a resource that it needs cannot be used.
+
+    All failures of files and folders are of this class. Each message says what is wrong, the value and its limit, and
+    after a semicolon what to do.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from faintfield import InputError, load_set
+    >>> try:
+    ...     load_set(Path("dark_scene"))
+    ... except InputError as failure:
+    ...     print(failure)
+    dark_scene: no such folder; name a session, or a folder with elemental.toml
+    """
 
 
 class MissingFile(InputError):

@@ -8,7 +8,28 @@ ReconstructionError
 
 
 class ReconstructionError(Exception):
-    """The requested plane cannot be reconstructed from the given views."""
+    """The requested plane cannot be reconstructed from the given views.
+
+    All failures of reconstruction are of this class. Each message says what is wrong, the value and its limit, and
+    after a semicolon what to do.
+
+    Examples
+    --------
+    A plane behind the cameras:
+
+    >>> import numpy as np
+    >>> from faintfield import Lens, PlaneGrid, PlaneOperator, ReconstructionError
+    >>> from faintfield import fronto_parallel_rt_ref_plane, plane_from_ray
+    >>> lens = Lens((32, 24), fx_px=40.0, fy_px=40.0, cx_px=15.5, cy_px=11.5)
+    >>> grid = PlaneGrid.covering(-160.0, -120.0, 160.0, 120.0, pitch_mm=10.0)
+    >>> homographies = plane_from_ray(np.zeros((9, 6)), fronto_parallel_rt_ref_plane(depth_mm=-400.0))
+    >>> try:
+    ...     PlaneOperator(homographies, lens.rays(), grid)
+    ... except ReconstructionError as failure:
+    ...     print(failure)  # doctest: +NORMALIZE_WHITESPACE
+    no pixel of any of the 9 views sees the plane of 32 x 24 samples; check its depth, the poses and their signs, and
+    that not all pixels are masked (saturated, hot)
+    """
 
 
 class GeometryMismatch(ReconstructionError):

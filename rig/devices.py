@@ -65,8 +65,42 @@ class Rig:
 def open_rig(settings: RigSettings, traffic: TrafficLog | None = None, decode: Decode = lambda path: None) -> Rig:
     """Construct the stage, the camera and the lights of a rig.toml; none is connected yet.
 
-    `traffic` gets every byte to and from the stage; `decode` reads the pixels of a file, so that a watched folder knows
-    when a file is complete. Raises `PlanRefused` if camera, stage and drift check cannot be used together.
+    Parameters
+    ----------
+    settings : RigSettings
+        Content of the rig.toml.
+    traffic : TrafficLog, optional
+        Log of every byte to and from the stage.
+    decode : callable, optional
+        Reads the pixels of a file, so that a watched folder knows when a file is complete.
+
+    Returns
+    -------
+    Rig
+        `stage`, `camera`, `lights` by name, and their `clock`. Its `arrange` does in a simulated lab what a person does
+        in a real one at the beginning of each step.
+
+    Raises
+    ------
+    PlanRefused
+        Camera, stage, lights and drift check cannot be used together.
+
+    Examples
+    --------
+    >>> import msgspec
+    >>> from faintfield import RigSettings, open_rig
+    >>> rig_toml = '''
+    ... stage = {protocol = "simulated"}
+    ... camera = {backend = "simulated", size_px = [64, 48]}
+    ... grid = {rows = 3, columns = 3, pitch_mm = 50.0, origin_mm = [-250.0, -250.0]}
+    ... step = [{kind = "dark", exposure_s = 0.1}]
+    ... '''
+    >>> rig = open_rig(msgspec.toml.decode(rig_toml, type=RigSettings))
+    >>> rig.camera.open()
+    >>> rig.arrange("dark", 0)
+    >>> rig.camera.expose(0.1, number=0).pixels.shape
+    (48, 64)
+    >>> rig.camera.close()
     """
     if settings.stage.protocol == "micromanager" and settings.drift.check:
         raise PlanRefused("drift.check = true times homing switches, which Micro-Manager lacks; set it to false")
@@ -171,15 +205,37 @@ def open_stage(
 
     Parameters
     ----------
-    settings, traffic : StageSettings, TrafficLog or None
-        The `[stage]` table; log of every byte sent and received over a serial port.
-    bench, core : Bench or None, SharedCore or None
-        Bench of a simulated stage, by default a new one; Micro-Manager's core, if the camera uses it as well.
+    settings : StageSettings
+        The `[stage]` table of rig.toml.
+    traffic : TrafficLog, optional
+        Log of every byte sent and received over a serial port.
+    bench : Bench, optional
+        Bench of a simulated stage, by default a new one.
+    core : SharedCore, optional
+        Micro-Manager's core, if the camera uses it as well.
+
+    Returns
+    -------
+    Gantry
+        The stage, with `connect`, `home`, `move_to` and `close`; docs/stage.md says when a position is trusted.
 
     Raises
     ------
     PlanRefused
         The port names no simulated stage, or a driver cannot be used with these settings.
+
+    Examples
+    --------
+    >>> from faintfield import StageSettings, open_stage
+    >>> stage = open_stage(StageSettings("grbl", port="simulated:grbl"))  # or port="/dev/ttyUSB0"
+    >>> stage.connect()
+    >>> print(stage.travel())
+    [-400, 0] x [-400, 0] mm
+    >>> _ = stage.home()
+    >>> position = stage.move_to(-100.0, -50.0)
+    >>> print(position.point, "trusted" if position.trusted else "not trusted")
+    (-100.000, -50.000) mm trusted
+    >>> stage.close()
     """
     clock = WallClock()
     if settings.simulated:

@@ -8,7 +8,25 @@ one line that says what is wrong, the value found, its limit, and what to do.
 
 
 class RigError(Exception):
-    """The stage, the camera or the session on disk does not work as it must."""
+    """The stage, the camera or the session on disk does not work as it must.
+
+    All failures of the rig are of this class. Each message says what is wrong, the value and its limit, and after a
+    semicolon what to do.
+
+    Examples
+    --------
+    A stage that was not homed is not moved:
+
+    >>> from faintfield import RigError, StageSettings, open_stage
+    >>> stage = open_stage(StageSettings("grbl", port="simulated:grbl"))
+    >>> stage.connect()
+    >>> try:
+    ...     stage.move_to(-100.0, -50.0)
+    ... except RigError as failure:
+    ...     print(failure)
+    the stage's position is not known, so it is not sent to (-100.000, -50.000) mm; home it first
+    >>> stage.close()
+    """
 
 
 class StageError(RigError):
@@ -74,7 +92,21 @@ class PlanRefused(RigError):
 
 
 class OutsideTravel(PlanRefused):
-    """A position, or the path to it, leaves the travel of the stage."""
+    """A position, or the path to it, leaves the travel of the stage; nothing has moved.
+
+    Examples
+    --------
+    >>> from faintfield import OutsideTravel, StageSettings, open_stage
+    >>> stage = open_stage(StageSettings("grbl", port="simulated:grbl"))
+    >>> stage.connect()
+    >>> _ = stage.home()
+    >>> try:
+    ...     stage.move_to(100.0, 0.0)
+    ... except OutsideTravel as failure:
+    ...     print(failure)
+    position (100.000, 0.000) mm is outside the travel [-400, 0] x [-400, 0] mm; choose one inside, or move the grid
+    >>> stage.close()
+    """
 
 
 class KeepOutCrossed(PlanRefused):

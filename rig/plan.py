@@ -57,8 +57,22 @@ class Grid(Struct, frozen=True, forbid_unknown_fields=True):
         Distance of neighbouring nodes along both axes.
     origin_mm : Point
         Position of node (0, 0) in the machine coordinates of the stage.
-    order : str
-        `serpentine` reverses every second row, `raster` begins every row at column 0.
+    order : {"serpentine", "raster"}
+        "serpentine" reverses every second row, "raster" begins every row at column 0.
+
+    Raises
+    ------
+    ValueError
+        There is no row or column, the pitch is not positive, or there are more than 100 000 nodes.
+
+    Examples
+    --------
+    >>> from faintfield import Grid, Point
+    >>> grid = Grid(rows=2, columns=3, pitch_mm=50.0, origin_mm=Point(-250.0, -250.0))
+    >>> [stop.node for stop in grid.stops()]
+    [(0, 0), (0, 1), (0, 2), (1, 2), (1, 1), (1, 0)]
+    >>> print(grid.position(row=1, column=2))
+    (-150.000, -200.000) mm
     """
 
     rows: int
@@ -126,9 +140,37 @@ class Until(Struct, frozen=True, forbid_unknown_fields=True):
 class CaptureStep(Struct, frozen=True, forbid_unknown_fields=True):
     """One step of the experiment: the same exposures at every node, or at the centre node only.
 
-    At each stop there are `frames_per_node` frames of each exposure time, in the order of `exposure_s`. Of the lights
-    that the rig switches, `lights` are on and all others off; None leaves all to a person. With `until`, rounds over
-    the whole grid are repeated.
+    Parameters
+    ----------
+    kind : {"charuco", "bright", "dark_scene", "noise_reference", "dark", "flat"}
+        "charuco" shows boards, "bright" and "dark_scene" the scene in light and in the dark, "noise_reference" no light
+        at all; "dark" and "flat" are for the noise, with the lens covered and evenly lit.
+    exposure_s : tuple of float
+        Exposure times, in the order in which they are taken at each stop.
+    frames_per_node : int
+        Number of frames of each exposure time at each stop.
+    at : {"grid", "centre"}
+        All nodes, or the centre node only.
+    lights : tuple of str, optional
+        Of the lights that the rig switches, the names of those that are on; all others are off. By default a person
+        sees to the light.
+    until : Until, optional
+        End of a step in rounds, which repeat the whole grid; for "dark_scene" at the grid.
+
+    Raises
+    ------
+    ValueError
+        There is no exposure time, one is not above 0 s or longer than 100 000 s, there is no frame, or `until` is
+        given for another kind of step.
+
+    Examples
+    --------
+    Eight dark frames of each of three exposure times, at the centre node:
+
+    >>> from faintfield import CaptureStep
+    >>> step = CaptureStep("dark", exposure_s=(0.1, 1.0, 10.0), frames_per_node=8, at="centre")
+    >>> step.frames_per_stop()
+    24
     """
 
     kind: StepKind
@@ -159,9 +201,41 @@ class CaptureStep(Struct, frozen=True, forbid_unknown_fields=True):
 class CapturePlan(Struct, frozen=True, forbid_unknown_fields=True):
     """A whole capture; it does not change once it is made.
 
-    Every step visits the `stops` in order, or only the `centre`. `approach_mm` is how far below a position an axis
-    turns to arrive upwards, `frame_bytes` the size of a frame on disk, `settle_s` the rest at each stop before the
-    first exposure, and `readout_s` the duration of a frame besides its exposure.
+    `CapturePlan.of` makes it from a `Grid` and its steps.
+
+    Parameters
+    ----------
+    stops : tuple of Stop
+        Nodes and their positions, in the order in which they are visited.
+    centre : Stop
+        The centre node, which is the only stop of some steps.
+    steps : tuple of CaptureStep
+        The steps in order.
+    approach_mm : float
+        Distance below a position at which an axis turns to arrive upwards.
+    frame_bytes : int
+        Size of a frame on disk.
+    settle_s : float
+        Rest at each stop before the first exposure.
+    readout_s : float
+        Duration of a frame besides its exposure.
+
+    Raises
+    ------
+    ValueError
+        A distance, time or size is negative, or there are more than 100 000 frames.
+
+    Examples
+    --------
+    >>> from faintfield import CapturePlan, CaptureStep, Grid, Point
+    >>> grid = Grid(rows=7, columns=7, pitch_mm=50.0, origin_mm=Point(-350.0, -350.0))
+    >>> dark_scene = CaptureStep("dark_scene", exposure_s=(0.1,))
+    >>> darks = CaptureStep("dark", exposure_s=(0.1, 1.0, 10.0), frames_per_node=8, at="centre")
+    >>> plan = CapturePlan.of(grid, [dark_scene, darks], approach_mm=2.0, frame_bytes=48_000_000)
+    >>> plan.frame_count()
+    73
+    >>> round(plan.disk_bytes() / 1e9, 1)  # GB
+    3.5
     """
 
     stops: tuple[Stop, ...]

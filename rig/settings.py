@@ -219,7 +219,50 @@ class SceneSettings(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class RigSettings(Struct, frozen=True, forbid_unknown_fields=True):
-    """Content of a rig.toml."""
+    """Content of a rig.toml, which describes the rig and its capture (docs/capture.md).
+
+    Parameters
+    ----------
+    stage : StageSettings
+        The `[stage]` table.
+    camera : CameraSettings
+        The `[camera]` table, by its `backend`.
+    grid : Grid
+        The `[grid]` table: nodes of the camera.
+    step : tuple of StepSettings
+        The `[[step]]` tables: frames to take, in order.
+    settle : SettleSettings
+        The `[settle]` table: rest at each node before an exposure.
+    checks : CheckSettings
+        The `[checks]` table: limits beyond which a frame gives a warning.
+    drift : DriftSettings
+        The `[drift]` table: checks for lost steps.
+    scene : SceneSettings
+        The `[scene]` table: depths of the objects in mm.
+    board : tuple of BoardSettings
+        The `[[board]]` tables: the printed boards.
+    light : tuple of LightSettings
+        The `[[light]]` tables: lights that the rig switches.
+
+    Raises
+    ------
+    ValueError
+        The tables contradict one another; from a file, it is msgspec.ValidationError, which names the key.
+
+    Examples
+    --------
+    >>> import msgspec
+    >>> from faintfield import RigSettings
+    >>> rig_toml = '''
+    ... stage = {protocol = "grbl", port = "/dev/ttyUSB0"}
+    ... camera = {backend = "gphoto2"}
+    ... grid = {rows = 7, columns = 7, pitch_mm = 50.0, origin_mm = [-350.0, -350.0]}
+    ... step = [{kind = "dark_scene", exposure_s = 0.1}]
+    ... '''
+    >>> settings = msgspec.toml.decode(rig_toml, type=RigSettings)
+    >>> print(settings.grid.centre().target)
+    (-200.000, -200.000) mm
+    """
 
     stage: StageSettings
     camera: CameraSettings

@@ -16,14 +16,27 @@ _MIN_CORNERS = 6
 
 @dataclass(frozen=True)
 class Target:
-    """One board in one sweep, during which it does not move.
+    """One board in one sweep of the camera over the grid, during which the board does not move.
 
     Parameters
     ----------
-    board, sweep : str, int
-        Name of the board and number of the sweep.
+    board : str
+        Name of the board.
+    sweep : int
+        Number of the sweep.
     homing : int
         Number of the stage's homing that the node's position relies on.
+
+    Examples
+    --------
+    A board that is moved between two sweeps makes two targets, each with a pose of its own:
+
+    >>> from faintfield import Target
+    >>> before, after = Target("wall", sweep=0), Target("wall", sweep=1)
+    >>> before == after
+    False
+    >>> after
+    Target(board='wall', sweep=1, homing=0)
     """
 
     board: str
@@ -37,13 +50,30 @@ class BoardObservation:
 
     Parameters
     ----------
-    node, target : (int, int), Target
-        Row and column of the grid; board and sweep.
+    node : (int, int)
+        Row and column of the camera's node in the grid.
+    target : Target
+        Board and sweep.
     corners : int array (corner,)
-        Their numbers on the board.
-    pixels, sigma_px : float array (corner, 2), (corner,)
-        Their column and row in the image, and their standard deviations per axis. Only the ratios of these count; the
-        level follows from the residuals.
+        Numbers of the corners on the board.
+    pixels : float array (corner, 2)
+        Column and row of each corner in the image.
+    sigma_px : float array (corner,)
+        Standard deviation of each corner per axis. Only ratios count; the level follows from the residuals.
+
+    Examples
+    --------
+    >>> from faintfield import Board, BoardObservation, Target, detect_all
+    >>> board = Board("wall", columns=9, rows=7, square_mm=30.0, marker_mm=22.0)
+    >>> image = board.opencv_board().generateImage((450, 350))
+    >>> ((corners,),) = detect_all([image], [board])
+    >>> target = Target("wall", sweep=0)
+    >>> observation = BoardObservation((0, 1), target, corners.corners, corners.pixels, corners.sigma_px)
+    >>> observation.pixels.shape
+    (48, 2)
+    >>> observation.pixels[:2].round(1)
+    array([[49.5, 49.5],
+           [99.5, 49.5]])
     """
 
     node: Node

@@ -31,7 +31,7 @@ SAMPLE_PX = 65_536
 class Conditions:
     """Conditions that the frames of one series share.
 
-    Attributes
+    Parameters
     ----------
     kind : {"dark", "flat"}
         A dark has the lens covered, a flat is evenly lit.
@@ -45,6 +45,15 @@ class Conditions:
         Dark current at the temperature of the frames over that at the temperature of reference.
     temperature_c : float, optional
         Mean temperature of the frames, stated where the temperatures of a set differ.
+
+    Examples
+    --------
+    >>> from faintfield import Conditions
+    >>> print(Conditions("flat", exposure_s=0.1, level=2))
+    flats of 0.1 s at level 2
+    >>> warm = Conditions("dark", exposure_s=10.0, dark_factor=1.5)  # 1.5 times the dark current
+    >>> warm.dark_time_s
+    15.0
     """
 
     kind: Literal["dark", "flat"]

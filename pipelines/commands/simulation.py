@@ -64,10 +64,33 @@ def simulate(out: Path, /, *, options: SyntheticOptions = _SYNTHETIC, overwrite:
 
     Parameters
     ----------
-    out
+    out : Path
         Folder to write.
-    overwrite
+    options : SyntheticOptions
+        Grid, camera, light and errors of the poses.
+    overwrite : bool
         Replace an earlier set in OUT.
+
+    Returns
+    -------
+    Simulated
+        `out`, `views`, the `snr`, and the photons per pixel on the object: `photons_linear` by the paper's linear
+        formula, `photons_from_moments` by the powers of the images, `photons_on_object` as drawn.
+
+    Raises
+    ------
+    OutputExists
+        OUT holds something that may not be replaced.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from faintfield import SyntheticOptions, simulate
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     simulated = simulate(Path(folder, "dark"), options=SyntheticOptions(rows=3, columns=3, size_px=(64, 48)))
+    >>> simulated.views, round(simulated.snr, 2), round(simulated.photons_from_moments, 1)
+    (9, 0.16, 1.9)
     """
     from faintfield.pipelines.simulation.synthetic_set import write_synthetic_set
 

@@ -143,27 +143,46 @@ def read_frame(
     of: str = "the camera",
     page: int | None = None,
 ) -> Frame:
-    """Read one image file, after the size that its header states was compared with what is expected.
+    """Read one image file with the sensor's own values: TIFF, PNG, JPEG and others, or a raw file with its mosaic.
 
     Parameters
     ----------
     path : Path
         The file.
     expected_px : (int, int), optional
-        Width and height that it must have.
+        Width and height that it must have, compared with its header before its pixels are read.
     of : str
-        Whose size that is, for the message.
+        Owner of that size, for the message.
     page : int, optional
-        Which picture of a TIFF that holds several; without it, a file holds one.
+        Index of the picture in a TIFF that holds several; without it, a file holds one.
+
+    Returns
+    -------
+    Frame
+        `pixels_dn` (row, column) or (row, column, RGB); `mosaic`, `black_dn`, `saturation_dn` and `exposure_s` as far
+        as the file states them, else None.
 
     Raises
     ------
     MissingFile, WrongSize
         The file cannot be opened, or does not have the size that is expected.
     UnknownFormat
-        Files of this kind cannot be decoded here; so does a raw file whose beginning is damaged.
+        Files of this kind cannot be decoded here, or the beginning of a raw file is damaged.
     UnreadableImage
         The file cannot be decoded, is truncated, has no pixels, or is larger than any that is read.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import numpy as np
+    >>> import tifffile
+    >>> from faintfield import read_frame
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     tifffile.imwrite(Path(folder, "dark.tiff"), np.full((48, 64), 100, np.uint16))
+    ...     frame = read_frame(Path(folder, "dark.tiff"), expected_px=(64, 48))
+    >>> frame.pixels_dn.shape, frame.pixels_dn.dtype
+    ((48, 64), dtype('uint16'))
     """
     if not is_file(path):
         raise MissingFile(f"{path}: no such image file; put it there or correct the name")

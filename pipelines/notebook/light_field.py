@@ -72,6 +72,15 @@ class PlaneOptions(TypedDict, total=False):
         Largest number of passes over the data.
     progress : callable
         Is called with the number of steps done and that of all.
+
+    Examples
+    --------
+    The same options for several calls:
+
+    >>> from faintfield import PlaneOptions
+    >>> quick = PlaneOptions(prior="tv", passes=10)
+    >>> quick | PlaneOptions(uncertainty=True)
+    {'prior': 'tv', 'passes': 10, 'uncertainty': True}
     """
 
     method: Method

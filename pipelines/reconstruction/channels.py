@@ -31,7 +31,32 @@ _NOISE_MAPS = ("offset_dn", "gain_dn_per_e", "read_noise_e", "dark_current_e_per
 
 
 def channel_layouts(elemental_set: ElementalSet) -> list[ChannelLayout]:
-    """Return the colours of a set, as its first frame has them."""
+    """Return the colours of a set, as its first frame has them.
+
+    Parameters
+    ----------
+    elemental_set : ElementalSet
+        The set, see `load_set`.
+
+    Returns
+    -------
+    list of ChannelLayout
+        Name and pixels of each colour: "grey" alone, or "red", "green" and "blue".
+
+    Examples
+    --------
+    A simulated camera with a Bayer mosaic has two lattices of green pixels:
+
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from faintfield import SyntheticOptions, channel_layouts, load_set, simulate
+    >>> options = SyntheticOptions(rows=2, columns=2, size_px=(64, 48), colour="bayer")
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = simulate(Path(folder, "set"), options=options)
+    ...     layouts = channel_layouts(load_set(Path(folder, "set")))
+    >>> [(layout.name, len(layout.lattices)) for layout in layouts]
+    [('red', 1), ('green', 2), ('blue', 1)]
+    """
     return elemental_set.layouts
 
 
@@ -76,8 +101,39 @@ def keeping_frames(elemental_set: ElementalSet, folder: Path) -> ElementalSet:
 def load_channel(elemental_set: ElementalSet, layout: ChannelLayout, allocate: Allocate = np.empty) -> ElementalImages:
     """Read one colour of all views in electrons, each frame by one thread, directly into the stack.
 
-    `allocate` makes the arrays as large as all views. Raises WrongSize, WrongBitDepth or UnreadableImage for a frame
-    that does not match the set.
+    Parameters
+    ----------
+    elemental_set : ElementalSet
+        The set, see `load_set`.
+    layout : ChannelLayout
+        The colour, see `channel_layouts`.
+    allocate : callable, optional
+        Makes the arrays as large as all views, given shape and type; by default numpy.empty.
+
+    Returns
+    -------
+    ElementalImages
+        Images (view, row, column) in electrons with their noise; of a mosaic, each view once per lattice of the colour.
+
+    Raises
+    ------
+    WrongSize, WrongBitDepth, UnreadableImage
+        A frame does not match the set.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from faintfield import SyntheticOptions, channel_layouts, load_channel, load_set, simulate
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = simulate(Path(folder, "set"), options=SyntheticOptions(rows=3, columns=3, size_px=(64, 48)))
+    ...     elemental_set = load_set(Path(folder, "set"))
+    ...     (grey,) = channel_layouts(elemental_set)
+    ...     images = load_channel(elemental_set, grey)
+    >>> images.electrons.shape
+    (9, 48, 64)
+    >>> round(images.read_variance_e2)  # e²
+    12
     """
     phases = len(layout.lattices)
     views = len(elemental_set.settings.view)

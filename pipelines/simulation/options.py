@@ -15,31 +15,40 @@ class SyntheticOptions:
 
     Parameters
     ----------
-    snr
+    snr : float
         SNR, eq. (4), over the object region of the reference view; it sets the light.
-    seed
+    seed : int
         Seed of the random generator.
-    rows
+    rows : int
         Rows of the grid of nodes.
-    columns
+    columns : int
         Columns of the grid of nodes.
-    pitch_mm
+    pitch_mm : float
         Distance between neighbouring nodes.
-    size_px
+    size_px : (int, int)
         Width and height of the detector.
-    exposure_s
+    exposure_s : float
         Exposure of each view.
-    position_error_mm
+    position_error_mm : float
         Standard deviation of the translation of each node's pose along each axis; the centre node has no error.
-    rotation_error_mrad
+    rotation_error_mrad : float
         Standard deviation of each node's rotation about each axis; the centre node has no error.
-    poses
+    poses : {"true", "nominal"}
         Poses that elemental.toml states: those the camera really had (true), or those it was sent to (nominal).
-    colour
+    colour : {"grey", "bayer"}
         Sensor without colour filters (grey), or with a Bayer mosaic.
-    objects
+    objects : {"toys", "surfaces"}
         The flat toys, or a scene that fills the view: a slanted wall, a rising floor, a ball, a tilted page and a thin
         rod (surfaces), at 517 to 1009 mm.
+
+    Examples
+    --------
+    The defaults are those of the paper; a small set in more light:
+
+    >>> from faintfield import SyntheticOptions
+    >>> options = SyntheticOptions(rows=3, columns=3, size_px=(160, 120), snr=1.0)
+    >>> options.pitch_mm, options.exposure_s
+    (50.0, 0.1)
     """
 
     snr: Positive = 0.16

@@ -62,7 +62,7 @@ class PixelLikelihood:
 
 @dataclass(frozen=True)
 class ElementalImages:
-    """All views of one scene, `g` of eq. (1), with the known part of their statistics.
+    """All views of one scene, g of `g = H f + n`, eq. (1) of the paper (docs/physics.md), with their known statistics.
 
     A view's pixels are `Poisson(H f + b) + N(0, σ²)`. The images of one colour of a mosaic lie on *lattices* (of every
     second pixel, for example); each view then appears once per lattice, and maps are given per lattice.
@@ -71,9 +71,10 @@ class ElementalImages:
     ----------
     electrons : float array (view, row, column)
         Offset removed and divided by the gain; values may be negative, dark current is not subtracted.
-    background_e, read_variance_e2 : float or array broadcastable to (lattice, row, column)
-        b, expected electrons that are not light of the scene (dark current times exposure); σ², the variance without
-        any electron.
+    background_e : float or array broadcastable to (lattice, row, column)
+        b, expected electrons that are not light of the scene: dark current times exposure.
+    read_variance_e2 : float or array broadcastable to (lattice, row, column)
+        σ², the variance without any electron.
     valid : bool array (view, row, column), optional
         False where a pixel has no valid number (is saturated, for example); the operator must be made with the same.
     likelihood : PixelLikelihood
@@ -83,6 +84,19 @@ class ElementalImages:
     ------
     ValueError
         Shapes do not fit, or a valid pixel is not finite.
+
+    Examples
+    --------
+    Nine dark views of half an electron per pixel, with read noise of 3.5 e:
+
+    >>> import numpy as np
+    >>> from faintfield import ElementalImages
+    >>> rng = np.random.default_rng(1)
+    >>> electrons = rng.poisson(0.5, (9, 24, 32)) + rng.normal(0.0, 3.5, (9, 24, 32))
+    >>> images = ElementalImages(electrons, background_e=0.02, read_variance_e2=3.5**2)
+    >>> coarse = images.binned(2)  # as a detector of larger pixels would count
+    >>> coarse.electrons.shape, coarse.read_variance_e2
+    ((9, 12, 16), 49.0)
     """
 
     electrons: Image

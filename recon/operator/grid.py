@@ -12,8 +12,10 @@ class PlaneGrid:
 
     Parameters
     ----------
-    shape, pitch_mm : (int, int), float
-        Rows and columns, and the distance between neighbouring samples.
+    shape : (int, int)
+        Rows and columns.
+    pitch_mm : float
+        Distance between neighbouring samples.
     origin_mm : (float, float)
         x, y of the first sample's centre.
 
@@ -22,6 +24,15 @@ class PlaneGrid:
     ValueError
         Fewer than two samples along an axis (nothing to interpolate between), a pitch that is not positive, or an
         origin that is not finite.
+
+    Examples
+    --------
+    >>> from faintfield import PlaneGrid
+    >>> grid = PlaneGrid(shape=(48, 64), pitch_mm=5.0, origin_mm=(-157.5, -117.5))
+    >>> grid == PlaneGrid.covering(left_mm=-160.0, top_mm=-120.0, right_mm=160.0, bottom_mm=120.0, pitch_mm=5.0)
+    True
+    >>> grid.index_from_plane() @ [0.0, 0.0, 1.0]  # column and row of the middle
+    array([31.5, 23.5,  1. ])
     """
 
     shape: tuple[int, int]

@@ -23,22 +23,48 @@ class OperatorOptions(TypedDict, total=False):
 
 
 class PlaneOperator(SceneOperator):
-    """H of one plane, a scene of one, whose samples have the shape (row, column).
+    """H of one plane in `g = H f + n`, eq. (1) of the paper (docs/physics.md): the plane as the views see it.
+
+    H interpolates the plane bilinearly where the ray of each pixel meets it; Hᵀ spreads each pixel to the same four
+    samples with the same weights. Samples f are an array (row, column), images g an array (view, row, column).
 
     Parameters
     ----------
     plane_from_ray : array (view, 3, 3)
         Homography from a ray (x, y, 1) to plane coordinates (x, y, 1) in mm; the homogeneous scale is positive for
-        points in front of the camera.
+        points in front of the camera. The function of this name makes them from poses.
+    rays : array (row, column, 2) or (lattice, row, column, 2), or DetectorMaps
+        Direction of each detector pixel: x, y at unit depth, lens distortion undone. `Lens.rays` makes them.
     grid : PlaneGrid
         The samples of the plane.
-    rays, surface, **options
-        As for `recon.operator.scene_operator.SceneOperator`.
+    surface : (array (view, 3, 3), Relief), optional
+        Bend of the plane to a surface, for `recon.operator.surface_operator.SurfaceOperator`.
+    **options
+        Options of `recon.operator.scene_operator.SceneOperator`: `flat` (row, column) is the relative response of each
+        pixel, `valid` (view, row, column) is False for pixels that do not count, `lattice_of_view` is for mosaics,
+        `dtype` is float32 or float64, and `workers` is the number of threads.
 
     Raises
     ------
     GeometryMismatch
         Shapes do not fit together, a number is not finite, or no pixel of any view sees the plane.
+
+    Examples
+    --------
+    Three cameras, 20 mm apart in a row, and a plane at 400 mm:
+
+    >>> import numpy as np
+    >>> from faintfield import Lens, PlaneGrid, PlaneOperator
+    >>> from faintfield import fronto_parallel_rt_ref_plane, plane_from_ray
+    >>> lens = Lens((32, 24), fx_px=40.0, fy_px=40.0, cx_px=15.5, cy_px=11.5)
+    >>> poses_rt_cam_ref = np.array([[0.0, 0.0, 0.0, x_mm, 0.0, 0.0] for x_mm in (20.0, 0.0, -20.0)])
+    >>> homographies = plane_from_ray(poses_rt_cam_ref, fronto_parallel_rt_ref_plane(depth_mm=400.0))
+    >>> grid = PlaneGrid.covering(-160.0, -120.0, 160.0, 120.0, pitch_mm=10.0)
+    >>> operator = PlaneOperator(homographies, lens.rays(), grid)
+    >>> operator.forward(np.ones(grid.shape)).shape
+    (3, 24, 32)
+    >>> operator.sensitivity()[12, ::4].round()  # number of views that see a sample
+    array([2., 3., 3., 3., 3., 3., 3., 3.], dtype=float32)
     """
 
     def __init__(

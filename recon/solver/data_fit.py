@@ -30,10 +30,14 @@ _MIN_KNOWN = 0.01
 class DataFit:
     """L(f), the negative log-likelihood of the elemental images of all or some views.
 
+    For shifted Poisson data it is `Σ m − y + y ln(y/m)` with `y = (g + σ²)₊` and `m = H f + b + σ²` (docs/physics.md).
+
     Parameters
     ----------
-    operator, images : SceneOperator, ElementalImages
-        H; g with its likelihood.
+    operator : SceneOperator
+        H, such as a `PlaneOperator`.
+    images : ElementalImages
+        g with its likelihood.
     level_e : float
         Typical light of a pixel in electrons, > 0.
     views : sequence of int, optional
@@ -45,6 +49,27 @@ class DataFit:
         s = Hᵀ 1.
     may_reach_zero : bool
         False where about all electrons of some pixel are light: its samples cannot be zero, where L has no gradient.
+
+    Examples
+    --------
+    Without noise, L is smallest at the true plane, where its gradient is zero:
+
+    >>> import numpy as np
+    >>> from faintfield import DataFit, ElementalImages, Lens, PlaneGrid, PlaneOperator
+    >>> from faintfield import fronto_parallel_rt_ref_plane, plane_from_ray
+    >>> lens = Lens((32, 24), fx_px=40.0, fy_px=40.0, cx_px=15.5, cy_px=11.5)
+    >>> poses_rt_cam_ref = np.array([[0.0, 0.0, 0.0, x_mm, 0.0, 0.0] for x_mm in (20.0, 0.0, -20.0)])
+    >>> homographies = plane_from_ray(poses_rt_cam_ref, fronto_parallel_rt_ref_plane(depth_mm=400.0))
+    >>> grid = PlaneGrid.covering(-160.0, -120.0, 160.0, 120.0, pitch_mm=10.0)
+    >>> operator = PlaneOperator(homographies, lens.rays(), grid)
+    >>> truth_e = np.full(grid.shape, 2.0)
+    >>> fit = DataFit(operator, ElementalImages(operator.forward(truth_e), read_variance_e2=12.0), level_e=2.0)
+    >>> value, gradient = fit.value_and_gradient(truth_e)
+    >>> round(float(abs(gradient).max()), 3)
+    0.0
+    >>> brighter, _ = fit.value_and_gradient(1.5 * truth_e)
+    >>> brighter > value
+    True
     """
 
     def __init__(

@@ -20,10 +20,44 @@ _MIN_LEVEL_E = 1e-6
 def back_projection(
     operator: SceneOperator, images: ElementalImages, views: ViewSelection = None, *, coverage: Image | None = None
 ) -> Image:
-    """Return `Hᵀ(g − b) / Hᵀ H 1` (samples), the mean of the views at each sample; zero where none sees it.
+    """Return the mean of the views at each sample, `Hᵀ(g − b) / Hᵀ H 1`.
 
-    Without flat field the denominator is s, the number of views that contribute, as in the paper. It is computed unless
-    it is given as `coverage`.
+    Without flat field the denominator is s = Hᵀ 1, the number of views that contribute, as in the paper
+    (docs/physics.md).
+
+    Parameters
+    ----------
+    operator : SceneOperator
+        H, such as a `PlaneOperator`.
+    images : ElementalImages
+        g, with the background b.
+    views : sequence of int, optional
+        The views that count; all by default.
+    coverage : float array (samples), optional
+        Hᵀ H 1, if it is known; else it is computed.
+
+    Returns
+    -------
+    float array (samples)
+        Electrons per detector pixel; zero where no view sees a sample.
+
+    Examples
+    --------
+    A bright square, seen by three cameras:
+
+    >>> import numpy as np
+    >>> from faintfield import ElementalImages, Lens, PlaneGrid, PlaneOperator
+    >>> from faintfield import back_projection, fronto_parallel_rt_ref_plane, plane_from_ray
+    >>> lens = Lens((32, 24), fx_px=40.0, fy_px=40.0, cx_px=15.5, cy_px=11.5)
+    >>> poses_rt_cam_ref = np.array([[0.0, 0.0, 0.0, x_mm, 0.0, 0.0] for x_mm in (20.0, 0.0, -20.0)])
+    >>> homographies = plane_from_ray(poses_rt_cam_ref, fronto_parallel_rt_ref_plane(depth_mm=400.0))
+    >>> grid = PlaneGrid.covering(-160.0, -120.0, 160.0, 120.0, pitch_mm=10.0)
+    >>> operator = PlaneOperator(homographies, lens.rays(), grid)
+    >>> plane_e = np.full(grid.shape, 2.0)
+    >>> plane_e[8:16, 12:20] = 6.0
+    >>> images = ElementalImages(operator.forward(plane_e), read_variance_e2=12.0)
+    >>> back_projection(operator, images)[12, 9:15].round(1)
+    array([2., 2., 2., 6., 6., 6.], dtype=float32)
     """
     light = operator.adjoint(images.electrons, views)
     if np.any(images.background_e):
@@ -37,6 +71,38 @@ def smooth_start(operator: SceneOperator, images: ElementalImages, views: ViewSe
 
     The blur weights by coverage, so that samples that no view sees take the level of their neighbours. Several planes
     share the light, since the coverage of each counts what its pixels see of all.
+
+    Parameters
+    ----------
+    operator : SceneOperator
+        H, such as a `PlaneOperator`.
+    images : ElementalImages
+        g, with the background b.
+    views : sequence of int, optional
+        The views that count; all by default.
+
+    Returns
+    -------
+    float array (samples)
+        Electrons per detector pixel, above zero.
+
+    Examples
+    --------
+    The edge of a bright square, blurred by two samples:
+
+    >>> import numpy as np
+    >>> from faintfield import ElementalImages, Lens, PlaneGrid, PlaneOperator
+    >>> from faintfield import fronto_parallel_rt_ref_plane, plane_from_ray, smooth_start
+    >>> lens = Lens((32, 24), fx_px=40.0, fy_px=40.0, cx_px=15.5, cy_px=11.5)
+    >>> poses_rt_cam_ref = np.array([[0.0, 0.0, 0.0, x_mm, 0.0, 0.0] for x_mm in (20.0, 0.0, -20.0)])
+    >>> homographies = plane_from_ray(poses_rt_cam_ref, fronto_parallel_rt_ref_plane(depth_mm=400.0))
+    >>> grid = PlaneGrid.covering(-160.0, -120.0, 160.0, 120.0, pitch_mm=10.0)
+    >>> operator = PlaneOperator(homographies, lens.rays(), grid)
+    >>> plane_e = np.full(grid.shape, 2.0)
+    >>> plane_e[8:16, 12:20] = 6.0
+    >>> images = ElementalImages(operator.forward(plane_e), read_variance_e2=12.0)
+    >>> smooth_start(operator, images)[12, 9:14].round(1)
+    array([2.4, 2.9, 3.5, 4.3, 4.9], dtype=float32)
     """
     coverages = operator.planes_of(operator.coverage(views))
     lights = operator.planes_of(

@@ -69,10 +69,43 @@ class CrossValidatedWeight:
 
 
 def universal_penalty_weight(operator: SceneOperator, images: ElementalImages, samples: Image) -> float:
-    """Return a penalty weight from the noise alone: β = 0.7 √( s / (f + b + σ²) ), from the median of s and means.
+    """Return a penalty weight from the noise alone: β = 0.7 √( s / (f + b + σ²) ).
 
-    The root is the standard deviation of the likelihood's gradient at each sample, and eq. (3) is of the order of one,
-    so this weight removes fluctuations of about that size. It is a starting point, not the best weight for a scene.
+    s is its median over the samples that are seen well, and f, b and σ² are means. The root is the standard deviation
+    of the likelihood's gradient at each sample. Eq. (3) of the paper (docs/physics.md), the gradient of the penalty, is
+    of the order of one, so this weight removes fluctuations of about that size. It is a starting point, not the best
+    weight for a scene.
+
+    Parameters
+    ----------
+    operator : SceneOperator
+        H, such as a `PlaneOperator`.
+    images : ElementalImages
+        The data, of which only the noise counts.
+    samples : float array (samples)
+        The light f in electrons, such as that of `smooth_start`.
+
+    Returns
+    -------
+    float
+        β in the unit of s = Hᵀ 1, for `pmlem`.
+
+    Examples
+    --------
+    Samples of 2 e that three views with read noise of √12 e see:
+
+    >>> import numpy as np
+    >>> from faintfield import ElementalImages, Lens, PlaneGrid, PlaneOperator
+    >>> from faintfield import fronto_parallel_rt_ref_plane, plane_from_ray, universal_penalty_weight
+    >>> lens = Lens((32, 24), fx_px=40.0, fy_px=40.0, cx_px=15.5, cy_px=11.5)
+    >>> poses_rt_cam_ref = np.array([[0.0, 0.0, 0.0, x_mm, 0.0, 0.0] for x_mm in (20.0, 0.0, -20.0)])
+    >>> homographies = plane_from_ray(poses_rt_cam_ref, fronto_parallel_rt_ref_plane(depth_mm=400.0))
+    >>> grid = PlaneGrid.covering(-160.0, -120.0, 160.0, 120.0, pitch_mm=10.0)
+    >>> operator = PlaneOperator(homographies, lens.rays(), grid)
+    >>> plane_e = np.full(grid.shape, 2.0)
+    >>> images = ElementalImages(operator.forward(plane_e), read_variance_e2=12.0)
+    >>> round(universal_penalty_weight(operator, images, plane_e), 3)  # 0.7 * (3 / (2 + 12)) ** 0.5
+    0.324
     """
     sensitivity = operator.sensitivity()
     seen = well_seen_samples(sensitivity)

@@ -107,22 +107,30 @@ def pmlem(
     tolerance: float = 0.01,
     dual: DualField | None = None,
 ) -> Iterator[PmlemIterate]:
-    """Yield planes of decreasing objective, each with its certificate; the caller decides when to stop.
+    """Maximise the penalised likelihood: yield planes of decreasing objective `L(f) + β Σ φ(|∇f|)` over f ≥ 0.
 
-    Proximal gradient in the metric of the data. A step that raised the objective is undone and repeated with twice the
-    metric; the next step needs the pass that gives the objective anyway. Only a plane that is certified within the
-    tolerance may have a larger objective, as after a start that is the optimum.
+    Each plane has a certificate, a bound on its distance from the optimum; the caller decides when to stop.
 
     Parameters
     ----------
-    fit, start : DataFit, float array (samples)
-        L; positive samples to start from.
-    penalty_weight, penalty : float, Penalty or ProximalPenalty
-        β ≥ 0, in the unit of s, and φ, total variation by default, or a penalty of one's own.
+    fit : DataFit
+        L, the negative log-likelihood.
+    start : float array (samples)
+        Positive samples to start from, such as those of `smooth_start`.
+    penalty_weight : float
+        β ≥ 0, in the unit of s = Hᵀ 1.
+    penalty : Penalty or ProximalPenalty, optional
+        φ, by default total variation, or a penalty of one's own.
     tolerance : float
         The distance that the caller wants to reach, which sets the accuracy of inner problems.
     dual : DualField, optional
         That of a similar problem, which is changed; by default that of one constant plane.
+
+    Yields
+    ------
+    PmlemIterate
+        `plane` in electrons per detector pixel, `certificate.distance` from the optimum relative to the plane,
+        `objective`, and `passes` over the data so far.
 
     Raises
     ------
@@ -130,6 +138,40 @@ def pmlem(
         `start` is not positive, or the weight is negative.
     NotConverged
         An iterate is not finite.
+
+    Notes
+    -----
+    Each step is a proximal gradient step in the metric of the data. A step that raised the objective is undone and
+    repeated with twice the metric; the next step needs the pass that gives the objective anyway. Only a plane that is
+    certified within the tolerance may have a larger objective, as after a start that is the optimum.
+
+    Examples
+    --------
+    A bright square in read noise of √12 e, seen by three cameras:
+
+    >>> import numpy as np
+    >>> from faintfield import DataFit, ElementalImages, Lens, PlaneGrid, PlaneOperator
+    >>> from faintfield import back_projection, fronto_parallel_rt_ref_plane, plane_from_ray, pmlem, smooth_start
+    >>> lens = Lens((32, 24), fx_px=40.0, fy_px=40.0, cx_px=15.5, cy_px=11.5)
+    >>> poses_rt_cam_ref = np.array([[0.0, 0.0, 0.0, x_mm, 0.0, 0.0] for x_mm in (20.0, 0.0, -20.0)])
+    >>> homographies = plane_from_ray(poses_rt_cam_ref, fronto_parallel_rt_ref_plane(depth_mm=400.0))
+    >>> grid = PlaneGrid.covering(-160.0, -120.0, 160.0, 120.0, pitch_mm=10.0)
+    >>> operator = PlaneOperator(homographies, lens.rays(), grid)
+    >>> truth_e = np.full(grid.shape, 2.0)
+    >>> truth_e[8:16, 12:20] = 6.0
+    >>> rng = np.random.default_rng(1)
+    >>> counts_e = rng.poisson(operator.forward(truth_e)) + rng.normal(0.0, 12.0**0.5, operator.images_shape)
+    >>> images = ElementalImages(counts_e, read_variance_e2=12.0)
+    >>> fit, start_e = DataFit(operator, images, level_e=2.0), smooth_start(operator, images)
+    >>> for iterate in pmlem(fit, start_e, penalty_weight=0.3):
+    ...     if iterate.certificate.distance < 0.01 or iterate.passes == 50:
+    ...         break  # at most 1 % from the optimum
+
+    The rms error of the mean of the views, and of the optimum, in electrons:
+
+    >>> planes_e = [back_projection(operator, images), iterate.plane]
+    >>> [round(float(np.square(plane_e - truth_e)[4:20, 6:26].mean() ** 0.5), 1) for plane_e in planes_e]
+    [2.3, 0.6]
     """
     if not penalty_weight >= 0:
         raise ValueError(f"need penalty_weight >= 0, got {penalty_weight}")

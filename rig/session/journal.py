@@ -34,7 +34,7 @@ SELECT intent.id, intent.frame, "commit".file, "commit".sha256, "commit".bytes, 
 FROM "commit" JOIN intent ON intent.id = "commit".intent LEFT JOIN void ON void.intent = intent.id ORDER BY intent.id
 """
 _UNCOMMITTED = 'SELECT id, frame FROM intent WHERE id NOT IN (SELECT intent FROM "commit") ORDER BY id'
-_EVENTS = "SELECT id, at, kind, frame, detail FROM event WHERE ?1 IS NULL OR kind = ?1 ORDER BY id"
+_EVENTS = "SELECT id, at, kind, frame, detail FROM event WHERE kind = ifnull(?, kind) ORDER BY id"
 _TO_BE_RETAKEN = """
 SELECT "commit".intent FROM "commit" JOIN intent AS old ON old.id = "commit".intent
 JOIN intent AS new ON new.frame = old.frame WHERE new.id = ? AND "commit".intent NOT IN (SELECT intent FROM void)

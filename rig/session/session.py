@@ -295,7 +295,40 @@ def has_session(folder: Path) -> bool:
 def taken_frames(folder: Path) -> list[tuple[PlannedFrame, CommittedFrame, Path]]:
     """Return the valid frames of a session in the order of the plan, each with its journal entry and its file.
 
-    Raises `SessionCorrupt` or `SessionUnreadable` if plan or journal cannot be read.
+    Parameters
+    ----------
+    folder : Path
+        The folder of the session.
+
+    Returns
+    -------
+    list of (PlannedFrame, CommittedFrame, Path)
+        The frame as planned (step, node, exposure), as taken (position, temperature, warnings), and its file.
+
+    Raises
+    ------
+    SessionCorrupt, SessionUnreadable
+        Plan or journal cannot be read.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from faintfield import taken_frames
+    >>> from faintfield.pipelines.commands.capture import capture
+    >>> rig_toml = '''
+    ... stage = {protocol = "simulated"}
+    ... camera = {backend = "simulated", size_px = [64, 48]}
+    ... grid = {rows = 3, columns = 3, pitch_mm = 50.0, origin_mm = [-250.0, -250.0]}
+    ... step = [{kind = "dark", exposure_s = [0.1, 1.0], frames_per_node = 2}]
+    ... '''
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     rig, session = Path(folder, "rig.toml"), Path(folder, "session")
+    ...     _ = rig.write_text(rig_toml)
+    ...     _ = capture(rig, session, yes=True)  # faintfield capture rig.toml session --yes
+    ...     frames = taken_frames(session)
+    >>> [planned.exposure_s for planned, committed, path in frames]
+    [0.1, 0.1, 1.0, 1.0]
     """
     frozen = read_plan(folder)
     frames = planned_frames(frozen.plan)

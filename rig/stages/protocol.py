@@ -16,7 +16,22 @@ MIN_HOMING_BOUND_S = 240.0
 
 
 class Point(NamedTuple):
-    """A position on the stage, in machine coordinates."""
+    """A position on the stage, in machine coordinates.
+
+    Parameters
+    ----------
+    x_mm, y_mm : float
+        Coordinates along the two axes that carry the camera.
+
+    Examples
+    --------
+    >>> from faintfield import Point
+    >>> corner = Point(x_mm=-250.0, y_mm=-200.0)
+    >>> print(corner)
+    (-250.000, -200.000) mm
+    >>> corner.x_mm + 50.0
+    -200.0
+    """
 
     x_mm: float
     y_mm: float
@@ -52,7 +67,24 @@ class Box(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class MotionLimits(Struct, frozen=True):
-    """Highest rate and acceleration of each axis, as set in the controller."""
+    """Highest rate and acceleration of each axis, as set in the controller.
+
+    Parameters
+    ----------
+    rate_mm_per_s, acceleration_mm_per_s2 : (float, float)
+        Limits of the two axes.
+
+    Examples
+    --------
+    The duration of a capture depends on them:
+
+    >>> from faintfield import CapturePlan, CaptureStep, Grid, MotionLimits, Point
+    >>> limits = MotionLimits(rate_mm_per_s=(100.0, 100.0), acceleration_mm_per_s2=(500.0, 500.0))
+    >>> grid = Grid(rows=7, columns=7, pitch_mm=50.0, origin_mm=Point(-350.0, -350.0))
+    >>> plan = CapturePlan.of(grid, [CaptureStep("bright", (0.1,))], approach_mm=2.0, frame_bytes=48_000_000)
+    >>> round(plan.duration_s(limits, feed_mm_per_s=100.0))
+    48
+    """
 
     rate_mm_per_s: tuple[float, float]
     acceleration_mm_per_s2: tuple[float, float]
@@ -221,15 +253,16 @@ _URL_SCHEMES = ("socket", "rfc2217", "hwgrep", "alt")
 
 
 class StageSettings(Struct, frozen=True, forbid_unknown_fields=True):
-    """Connection and limits of the stage.
+    """Connection and limits of the stage: the `[stage]` table of rig.toml.
 
     Parameters
     ----------
     protocol : str
-        Firmware of the controller: `grbl` or `marlin`; `micromanager`, or the name of a plug-in (docs/plugins.md);
-        `simulated` needs no port and no hardware.
+        Firmware of the controller: "grbl" or "marlin"; "micromanager", or the name of a plug-in (docs/plugins.md);
+        "simulated" needs no port and no hardware.
     port : str
-        Serial device, or a pyserial URL such as `socket://127.0.0.1:7000`.
+        Serial device, or a pyserial URL such as "socket://127.0.0.1:7000"; "simulated:grbl", "simulated:grblhal" or
+        "simulated:marlin" need no hardware.
     baud : int
         Bits per second.
     axes : (str, str)
@@ -245,7 +278,23 @@ class StageSettings(Struct, frozen=True, forbid_unknown_fields=True):
     reconnect_s : float
         How long to wait for a port that was lost, such as one that USB lists anew.
     options : dict
-        The other keys of the table, for `micromanager` and plug-ins, whose settings types check them.
+        The other keys of the table, for "micromanager" and plug-ins, whose settings types check them.
+
+    Raises
+    ------
+    ValueError
+        The port is missing or does not fit the protocol, or a value is impossible; the message names it.
+
+    Examples
+    --------
+    >>> from faintfield import StageSettings
+    >>> settings = StageSettings("grbl", port="/dev/ttyUSB0", feed_mm_per_min=6000.0)
+    >>> settings.axes, settings.approach_mm, settings.simulated
+    (('X', 'Y'), 2.0, False)
+    >>> StageSettings("grbl")
+    Traceback (most recent call last):
+    ...
+    ValueError: stage.port is missing; give the serial device, such as /dev/ttyUSB0
     """
 
     protocol: str

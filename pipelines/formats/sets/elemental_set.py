@@ -234,12 +234,36 @@ class ElementalSet:
 def load_set(folder: Path, *, aligned: bool = True) -> ElementalSet:
     """Read and check `elemental.toml` and the files it names, except the images' pixels.
 
-    If the views were `aligned` by `faintfield align`, they have these poses, unless the stated ones are asked for.
+    Parameters
+    ----------
+    folder : Path
+        The folder of the set, or its `elemental.toml`.
+    aligned : bool
+        Take the poses that `faintfield align` found, if there are any, rather than those that `elemental.toml` states.
+
+    Returns
+    -------
+    ElementalSet
+        `lens`, `poses_rt_cam_ref` (view, 6) as Rodrigues rad and mm, `noise`, `frame_paths` and `settings`, which is
+        the content of `elemental.toml`.
 
     Raises
     ------
     InputError
         A file is missing, a key is unknown, or a value is impossible; the message names it.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from faintfield import SyntheticOptions, load_set, simulate
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = simulate(Path(folder, "set"), options=SyntheticOptions(rows=3, columns=3, size_px=(64, 48)))
+    ...     elemental_set = load_set(Path(folder, "set"))
+    >>> elemental_set.poses_rt_cam_ref.shape, elemental_set.reference_view
+    ((9, 6), 4)
+    >>> round(elemental_set.noise.read_noise_e, 2)
+    3.46
     """
     path = folder if is_file(folder) else folder / FILE_NAME
     if not is_file(path):
