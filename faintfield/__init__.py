@@ -37,6 +37,7 @@ _MODULES = {
     "channel_layouts": "pipelines.reconstruction.channels",
     "detect_all": "calib.detection",
     "fronto_parallel_rt_ref_plane": "calib.homography",
+    "linear_operator": "recon.operator.linear",
     "load_channel": "pipelines.reconstruction.channels",
     "load_set": "pipelines.formats.sets.elemental_set",
     "measure_series": "calib.noise",
@@ -75,6 +76,7 @@ if TYPE_CHECKING:  # type checkers and editors read these lines; a test compares
     from faintfield.recon.errors import ReconstructionError as ReconstructionError
     from faintfield.recon.likelihood.images import ElementalImages as ElementalImages
     from faintfield.recon.operator.grid import PlaneGrid as PlaneGrid
+    from faintfield.recon.operator.linear import linear_operator as linear_operator
     from faintfield.recon.operator.single_plane import PlaneOperator as PlaneOperator
     from faintfield.recon.solver.data_fit import DataFit as DataFit
     from faintfield.recon.solver.initialization import back_projection as back_projection
