@@ -36,7 +36,7 @@ def dark_scene() -> tuple[PlaneOperator, ElementalImages, np.ndarray]:
 
 def show(truth_e: np.ndarray, **planes: np.ndarray) -> None:
     """Draw planes beside the truth, each with its error."""
-    _, axes = plt.subplots(1, 1 + len(planes), figsize=(3 * (1 + len(planes)), 3.6), layout="constrained")
+    _, axes = plt.subplots(1, 1 + len(planes), figsize=(3 * (1 + len(planes)), 3.6), layout="compressed")
     for axis, (title, plane) in zip(axes, {"truth": truth_e, **planes}.items(), strict=True):
         error = np.sqrt(np.mean((plane - truth_e)[MARGIN] ** 2))
         axis.set_title(title.replace("_", " ") + (f"\nerror {error:.2f} e" if error else ""))

@@ -36,11 +36,14 @@ start = torch.from_numpy(mean_e)[None, None]
 print(f"dot test: {float(physics.adjointness_test(start)):.1e}")
 
 # %%
-# A step of 1/‖H‖² at most lets the iteration converge; the largest number of Hᵀ H 1 bounds ‖H‖².
+# A step of 1/‖H‖² at most lets the iteration converge; the largest number of Hᵀ H 1 bounds ‖H‖². The strength of the
+# denoiser is chosen by eye.
 
+denoiser = TGVDenoiser(n_it_max=20)
+denoiser.tau = 0.03  # the step of its iteration, for light of some electrons
 solve = PGD(
     data_fidelity=L2(),
-    prior=PnP(TGVDenoiser(n_it_max=50)),
+    prior=PnP(denoiser),
     stepsize=1 / float(operator.coverage().max()),
     sigma_denoiser=4.0,
     max_iter=15,
