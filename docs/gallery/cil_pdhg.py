@@ -1,5 +1,4 @@
-"""
-Total variation by CIL
+"""Total variation by CIL
 ======================
 
 CIL, the Core Imaging Library, is installed by conda alone, so this page shows the code without its result: it was

@@ -1,5 +1,4 @@
-"""
-The dark scene of the examples
+"""The dark scene of the examples
 ==============================
 
 A picture 400 mm before a camera that takes 49 views from a grid of 7 x 7 positions. A pixel sees about two electrons,

@@ -1,5 +1,4 @@
-"""
-Plug-and-play by deepinv
+"""Plug-and-play by deepinv
 ========================
 
 deepinv takes H as two functions of tensors of the shape (batch, channel, ...); here the views are the channels of the

@@ -1,5 +1,4 @@
-"""
-Least squares by scipy
+"""Least squares by scipy
 ======================
 
 `faintfield.linear_operator` makes a linear operator of scipy from H. Here `scipy.sparse.linalg.lsmr` minimises

@@ -1,5 +1,4 @@
-"""
-Total variation by pyproximal
+"""Total variation by pyproximal
 =============================
 
 pylops takes `faintfield.linear_operator` as it is, with the shapes of plane and images. Here pyproximal's primal-dual
