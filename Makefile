@@ -46,8 +46,8 @@ mutants: $(VENV)/compiled-float64 ## wrong changes of the sources, and how many 
 
 # Packages that only the benchmarks compare with stay out of .venv.
 build/bench:
-	$(PIP) install --no-deps --target $@ 'pylops>=2.4' 'pyproximal>=0.10' \
-	  'odl>=1.0' array-api-compat future || mkdir -p $@
+	$(PIP) install --no-deps --target $@ 'pyproximal>=0.10' 'odl>=1.0' \
+	  array-api-compat future || mkdir -p $@
 
 results: $(VENV)/installed ## the demo's figures and pictures, put into docs and the paper; needs Chromium
 	$(BIN)/faintfield demo $(OUT)

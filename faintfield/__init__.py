@@ -45,6 +45,7 @@ _MODULES = {
     "channel_layouts": "pipelines.reconstruction.channels",
     "detect_all": "calib.detection",
     "fronto_parallel_rt_ref_plane": "calib.homography",
+    "linear_operator": "recon.operator.linear",
     "load_channel": "pipelines.reconstruction.channels",
     "load_set": "pipelines.formats.sets.elemental_set",
     "measure_series": "calib.noise",
@@ -93,6 +94,7 @@ if TYPE_CHECKING:  # type checkers and editors read these lines; a test compares
     from faintfield.recon.errors import ReconstructionError as ReconstructionError
     from faintfield.recon.likelihood.images import ElementalImages as ElementalImages
     from faintfield.recon.operator.grid import PlaneGrid as PlaneGrid
+    from faintfield.recon.operator.linear import linear_operator as linear_operator
     from faintfield.recon.operator.single_plane import PlaneOperator as PlaneOperator
     from faintfield.recon.prior.denoiser import Denoiser as Denoiser
     from faintfield.recon.solver.custom_penalty import ProximalPenalty as ProximalPenalty

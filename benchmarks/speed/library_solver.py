@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.recon.likelihood.images import ElementalImages, Image
+from faintfield.recon.operator.linear import linear_operator
 from faintfield.recon.operator.single_plane import PlaneOperator
 
 _NORM_OF_GRADIENT = 8**0.5
@@ -137,13 +138,7 @@ def solve_by_pyproximal(problem: LibraryProblem, callback: Callable[[Image], Non
     import pyproximal
 
     operator, shape, views = problem.operator, problem.operator.grid.shape, problem.operator.images_shape
-    forward = pylops.FunctionOperator(
-        lambda x: operator.forward(x.reshape(shape).astype(np.float32)).ravel(),
-        lambda y: operator.adjoint(y.reshape(views).astype(np.float32)).ravel(),
-        int(np.prod(views)),
-        int(np.prod(shape)),
-        dtype=np.float32,
-    )
+    forward = pylops.LinearOperator(linear_operator(operator))
     gradient = pylops.Gradient(shape, edge=False, kind="forward", dtype=np.float32)
 
     class ShiftedPoisson(pyproximal.ProxOperator):  # type: ignore[misc]

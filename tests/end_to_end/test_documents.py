@@ -13,7 +13,7 @@ from faintfield.pipelines.formats.sets.elemental_file import ElementalSetFile
 
 _ROOT = Path(__file__).parents[2]
 _SKIPPED = ("make ", "git clone ")
-DOCUMENTS = ("README.md", "docs/guide.md", "docs/api.md")
+DOCUMENTS = ("README.md", "docs/guide.md", "docs/api.md", "docs/how-to/operators.md")
 
 # Smaller numbers for the examples of the README, so that all of them run with the quick tests.
 SMALLER = {
