@@ -117,7 +117,8 @@ if TYPE_CHECKING:  # type checkers and editors read these lines; a test compares
     from faintfield.rig.stages.protocol import StageSettings as StageSettings
 
     __version__: str
-    calibrate_noise, open = calibrate, open_path
+    calibrate_noise = calibrate
+    open = open_path
 else:
 
     def __getattr__(name: str) -> object:
