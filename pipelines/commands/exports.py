@@ -84,8 +84,8 @@ def export_zarr(directory: Path, out: Path, /, *, overwrite: bool = False) -> Pl
 
     Axes are colour, depth, row, column; values are float32, light per detector pixel in the unit of the set.
     Lengths are in mm where all planes have one pitch (reconstruct with --pitch-mm); otherwise rows and columns are in
-    thousandths of x/z, which have no unit in this format. Of a set without a scale, no length has a unit: the attribute
-    `faintfield` says what it is. Depths, or disparities, must be in equal steps.
+    thousandths of x/z, which have no unit in this format. Planes in unequal steps are counted along the axis of depth,
+    and of a set without a scale no length has a unit: the attribute `faintfield` says what each axis is.
 
     Parameters
     ----------

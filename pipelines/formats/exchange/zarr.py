@@ -21,12 +21,23 @@ from faintfield.pipelines.formats.results.surface import planes_below
 from faintfield.pipelines.formats.units import StatedUnits, named_by, units_of
 
 # Planes are halved until no side is longer, px; viewers load the rest only where they look closer.
-_COARSEST_PX = 512
+_COARSEST_PX = 256
 
 _CHUNK_PX = 512
 
+# Units that OME-Zarr has a name for; px, mrad, the index of a plane and relative lengths have none.
+_UNITS = {"mm": "millimeter"}
+
 # Patterns of what the folder of an export holds: its metadata, and one array for each resolution.
 _HELD = ("zarr.json", "[0-9]", "[0-9][0-9]")
+
+
+class Axes(msgspec.Struct, frozen=True):
+    """Units of the axes of an export; "index" if the axis z counts planes, whose steps of depth are not equal."""
+
+    z: str
+    y: str
+    x: str
 
 
 class ZarrExport(msgspec.Struct, frozen=True):
@@ -35,7 +46,7 @@ class ZarrExport(msgspec.Struct, frozen=True):
     out: str
     shape: tuple[int, int, int, int]
     levels: int
-    unit: str
+    axes: Axes
 
 
 @dataclass(frozen=True)
@@ -47,6 +58,17 @@ class _Stack:
     shape: tuple[int, int, int, int]
     scale: Scale
     units: StatedUnits
+
+    @property
+    def axes(self) -> Axes:
+        """Units of the axes."""
+        across = self.scale.unit or "relative"
+        return Axes(self.units.length or "relative" if self.steps_equal else "index", across, across)
+
+    @property
+    def steps_equal(self) -> bool:
+        """Return whether one step leads from each plane to the next, as OME-Zarr requires."""
+        return self.scale.step_mm is not None or len(self.planes) == 1
 
     @property
     def levels(self) -> int:
@@ -67,7 +89,7 @@ def export_planes(directory: Path, out: Path, *, overwrite: bool = False) -> Zar
     Raises
     ------
     BadValue
-        Several calls or methods made the planes, none has a depth, or they differ in size or in the steps of depth.
+        Several calls or methods made the planes, none has a depth, or they differ in size.
     MissingPackage
         zarr or ome-zarr-models is not installed.
     """
@@ -86,7 +108,12 @@ def export_planes(directory: Path, out: Path, *, overwrite: bool = False) -> Zar
                 group[str(level)][:, index] = np.moveaxis(plane, 2, 0)
                 plane = _halve(plane)
     inform(f"{out}: {len(stack.planes)} planes of {stack.shape[3]} x {stack.shape[2]} samples")
-    return ZarrExport(str(out), stack.shape, stack.levels, stack.scale.unit or "relative")
+    if not stack.steps_equal:
+        inform(
+            f"the axis z counts the planes, since OME-Zarr states one step and theirs of {stack.units.quantity} differ; "
+            f"the attribute faintfield holds their {stack.units.quantities}"
+        )
+    return ZarrExport(str(out), stack.shape, stack.levels, stack.axes)
 
 
 def _stack_in(directory: Path) -> _Stack:
@@ -101,14 +128,8 @@ def _stack_in(directory: Path) -> _Stack:
     shapes = sorted({record.shape for record in planes})
     if len(shapes) > 1:
         raise BadValue(f"{folder}: planes are of {len(shapes)} sizes, {shapes[0]} and others; a stack takes one")
-    scale = stack_scale(planes, units)
-    if scale.step_mm is None and len(planes) > 1:
-        raise BadValue(
-            f"{folder}: the {len(planes)} planes are not in equal steps of {units.quantity}, and OME-Zarr states only "
-            f"one; reconstruct with {'--sweep-px' if units.length == 'px' else '--sweep-mm'}"
-        )
     colours = len(at_depths(result.planes)) // len(planes)
-    return _Stack(folder, planes, (colours, len(planes), *shapes[0]), scale, units)
+    return _Stack(folder, planes, (colours, len(planes), *shapes[0]), stack_scale(planes, units), units)
 
 
 def _is_export(folder: Path) -> bool:
@@ -123,21 +144,16 @@ def _is_export(folder: Path) -> bool:
 
 def _write_metadata(models: Any, group: Any, stack: _Stack, name: str) -> None:
     """Make the arrays of all resolutions, and describe their axes."""
-    axis = models.axes.Axis
-    unit = "millimeter" if stack.scale.unit == "mm" else None
-    axes = (
-        axis(name="c", type="channel"),
-        axis(name="z", type="space", unit="millimeter" if stack.units.depth == "mm" else None),
-        axis(name="y", type="space", unit=unit),
-        axis(name="x", type="space", unit=unit),
-    )
+    axis, units = models.axes.Axis, msgspec.to_builtins(stack.axes)
+    space = [axis(name=name, type="space", unit=_UNITS.get(unit)) for name, unit in units.items()]
+    axes = (axis(name="c", type="channel"), *space)
     datasets = tuple(_dataset(models, group, stack, level) for level in range(stack.levels))
     multiscale = models.multiscales.Multiscale(axes=axes, datasets=datasets, name=name)
     attributes = models.image.ImageAttrs(version="0.5", multiscales=[multiscale])
     group.attrs["ome"] = attributes.model_dump(mode="json", exclude_none=True)
     group.attrs["faintfield"] = {
         "value": stack.units.light_description,
-        "row_and_column": stack.scale.unit or "relative",
+        "axes": units,
         "units": msgspec.to_builtins(stack.units),
         "planes": [named_by(msgspec.to_builtins(record), stack.units) for record in stack.planes],
     }
@@ -149,11 +165,12 @@ def _dataset(models: Any, group: Any, stack: _Stack, level: int) -> Any:
     chunks = (1, 1, min(_CHUNK_PX, size[2]), min(_CHUNK_PX, size[3]))
     group.create_array(str(level), shape=size, chunks=chunks, dtype="float32", dimension_names=list("czyx"))
     x, y = scale.origin
+    first, depth_step = (stack.planes[0].depth_mm, scale.step_mm or 1.0) if stack.steps_equal else (0.0, 1.0)
     across, shift = scale.across * step, scale.across * (step - 1) / 2  # to the middle of the samples merged into one
     return models.multiscales.Dataset.build(
         path=str(level),
-        scale=(1.0, scale.step_mm or 1.0, across, across),
-        translation=(0.0, stack.planes[0].depth_mm, y + shift, x + shift),
+        scale=(1.0, depth_step, across, across),
+        translation=(0.0, first, y + shift, x + shift),
     )
 
 
