@@ -13,7 +13,7 @@ from faintfield.pipelines.errors import import_optional
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import white_level
 from faintfield.pipelines.formats.results.records import PlaneRecord, ReconstructionRecord
-from faintfield.pipelines.formats.results.stacks import planes_in_order, stack_scale
+from faintfield.pipelines.formats.results.stacks import Scale, planes_in_order, stack_scale, stacked_plane
 from faintfield.pipelines.formats.results.surface import planes_below
 from faintfield.pipelines.formats.units import StatedUnits, units_of
 from faintfield.pipelines.pages.report_planes import method_title
@@ -62,9 +62,9 @@ def _layers(directory: Path, folder: Path, result: ReconstructionRecord) -> list
     where = folder.relative_to(directory).as_posix()
     name = method_title(result.planes) + (f", {where}" if where not in (".", method) else "")
     units = units_of(result)
-    step_mm = stack_scale(planes, units).step_mm if len(planes) >= _MIN_DEPTHS_OF_A_STACK else None
-    if step_mm is not None and len({record.shape for record in planes}) == 1:
-        layers = [_stack_layer(folder, planes, name, step_mm, units)]
+    scale = stack_scale(planes, units) if len(planes) >= _MIN_DEPTHS_OF_A_STACK else None
+    if scale is not None and scale.step_mm is not None:
+        layers = [_stack_layer(folder, planes, name, scale, scale.step_mm, units)]
     else:
         layers = [
             _plane_layer(folder, plane, f"{name}, {units.depths_text([plane.depth_mm])}", units) for plane in planes
@@ -79,9 +79,10 @@ def _plane_layer(folder: Path, plane: PlaneRecord, name: str, units: StatedUnits
     return _Layer(pixels, name, pixels.ndim == 3, (pitch, pitch), (y, x), (unit, unit), ("y", "x"))
 
 
-def _stack_layer(folder: Path, planes: Sequence[PlaneRecord], name: str, step_mm: float, units: StatedUnits) -> _Layer:
-    pixels = np.stack([_pixels(folder, plane) for plane in planes])
-    scale = stack_scale(planes, units)
+def _stack_layer(
+    folder: Path, planes: Sequence[PlaneRecord], name: str, scale: Scale, step_mm: float, units: StatedUnits
+) -> _Layer:
+    pixels = np.stack([stacked_plane(folder, planes, scale, index) for index in range(len(planes))])
     across = _UNITS.get(scale.unit, scale.unit)
     units_of_axes = (_UNITS[units.length], across, across)
     spacing = (step_mm, scale.across, scale.across)

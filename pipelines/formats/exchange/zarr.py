@@ -13,10 +13,15 @@ from numpy.typing import NDArray
 from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.errors import BadValue, InputError, import_optional
 from faintfield.pipelines.formats.files import check_free, require_room, writing_folder
-from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.reading import read_json
 from faintfield.pipelines.formats.results.records import PlaneRecord
-from faintfield.pipelines.formats.results.stacks import Scale, at_depths, planes_in_order, stack_scale
+from faintfield.pipelines.formats.results.stacks import (
+    Scale,
+    at_depths,
+    planes_in_order,
+    stack_scale,
+    stacked_plane,
+)
 from faintfield.pipelines.formats.results.surface import planes_below
 from faintfield.pipelines.formats.units import StatedUnits, named_by, units_of
 
@@ -89,7 +94,7 @@ def export_planes(directory: Path, out: Path, *, overwrite: bool = False) -> Zar
     Raises
     ------
     BadValue
-        Several calls or methods made the planes, none has a depth, or they differ in size.
+        Several calls or methods made the planes, none has a depth, or no grid holds the samples of all.
     MissingPackage
         zarr or ome-zarr-models is not installed.
     """
@@ -102,15 +107,15 @@ def export_planes(directory: Path, out: Path, *, overwrite: bool = False) -> Zar
     with writing_folder(out, replace_only=held, overwrite=overwrite, reads=[stack.folder]) as building:
         group = zarr.open_group(building, mode="w", zarr_format=3)
         _write_metadata(models, group, stack, directory.resolve().name)
-        for index, record in enumerate(progress(stack.planes, "writing planes")):
-            plane = np.atleast_3d(np.asarray(read_frame(stack.folder / Path(record.file).name).pixels_dn, np.float32))
+        for index in progress(range(len(stack.planes)), "writing planes"):
+            plane = np.atleast_3d(stacked_plane(stack.folder, stack.planes, stack.scale, index))
             for level in range(stack.levels):
                 group[str(level)][:, index] = np.moveaxis(plane, 2, 0)
                 plane = _halve(plane)
     inform(f"{out}: {len(stack.planes)} planes of {stack.shape[3]} x {stack.shape[2]} samples")
     if not stack.steps_equal:
         inform(
-            f"the axis z counts the planes, since OME-Zarr states one step and theirs of {stack.units.quantity} differ; "
+            f"the axis z counts the planes, whose steps of {stack.units.quantity} differ, as OME-Zarr states only one; "
             f"the attribute faintfield holds their {stack.units.quantities}"
         )
     return ZarrExport(str(out), stack.shape, stack.levels, stack.axes)
@@ -125,11 +130,15 @@ def _stack_in(directory: Path) -> _Stack:
     units, planes = units_of(result), planes_in_order(result.planes)
     if not planes:
         raise BadValue(f"{folder}: holds no planes at depths, only planes given by a pose; reconstruct some at depths")
-    shapes = sorted({record.shape for record in planes})
-    if len(shapes) > 1:
-        raise BadValue(f"{folder}: planes are of {len(shapes)} sizes, {shapes[0]} and others; a stack takes one")
+    scale = stack_scale(planes, units)
+    if scale is None:
+        sizes = len({record.shape for record in planes})
+        raise BadValue(
+            f"{folder}: no grid holds the samples of all planes, which are of {sizes} sizes; reconstruct all of them "
+            "again with one --pitch-mm, or without it"
+        )
     colours = len(at_depths(result.planes)) // len(planes)
-    return _Stack(folder, planes, (colours, len(planes), *shapes[0]), stack_scale(planes, units), units)
+    return _Stack(folder, planes, (colours, len(planes), *scale.shape), scale, units)
 
 
 def _is_export(folder: Path) -> bool:
@@ -163,7 +172,9 @@ def _dataset(models: Any, group: Any, stack: _Stack, level: int) -> Any:
     """Make the array of one resolution, and return its entry: where its samples lie."""
     scale, size, step = stack.scale, stack.size(level), 2**level
     chunks = (1, 1, min(_CHUNK_PX, size[2]), min(_CHUNK_PX, size[3]))
-    group.create_array(str(level), shape=size, chunks=chunks, dtype="float32", dimension_names=list("czyx"))
+    group.create_array(
+        str(level), shape=size, chunks=chunks, dtype="float32", fill_value=np.nan, dimension_names=list("czyx")
+    )
     x, y = scale.origin
     first, depth_step = (stack.planes[0].depth_mm, scale.step_mm or 1.0) if stack.steps_equal else (0.0, 1.0)
     across, shift = scale.across * step, scale.across * (step - 1) / 2  # to the middle of the samples merged into one

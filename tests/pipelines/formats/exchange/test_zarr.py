@@ -107,6 +107,4 @@ def test_planes_of_one_pitch_are_in_mm(simulated_scene: Path, tmp_path: Path, do
     assert [axis.unit for axis in multiscale.axes] == [None, "millimeter", "millimeter", "millimeter"]
     ((scale, translation),) = _scales(multiscale)
     assert scale == [1.0, pytest.approx(1.0), 5.0, 5.0]
-    assert translation[2:] == [
-        pytest.approx(value) for value in read_record(out)["planes"][0]["origin_mm"][::-1]
-    ]
+    assert translation[2:] == [pytest.approx(value) for value in read_record(out)["planes"][0]["origin_mm"][::-1]]

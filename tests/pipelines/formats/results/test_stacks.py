@@ -43,12 +43,20 @@ def test_sweep_is_imagej_stack_of_angles(sweep: Path) -> None:
 
 
 def test_planes_of_one_pitch_are_stacked_in_mm(scene: Path, tmp_path: Path, done: Command) -> None:
-    words = ("--sweep-mm", "600:600.4:3", "--pitch-mm", 5, "--method", "backprojection")
+    words = ("--sweep-mm", "600:650:3", "--pitch-mm", 5, "--method", "backprojection")
     done("reconstruct", scene, *words, "--out", tmp_path)
-    description, across, _ = _calibration(tmp_path / "stack.tiff")
+    description, across, pixels = _calibration(tmp_path / "stack.tiff")
     assert description["unit"] == "mm"
     assert across == pytest.approx(5.0)
-    assert description["spacing"] == pytest.approx(0.2)
+    assert description["spacing"] == pytest.approx(25.0)
+    # A sample of a plane lies in the stack where its x and y say, and beyond the smaller planes nothing is known
+    origin = description["xorigin"], description["yorigin"]
+    for stacked, record in zip(pixels, read_record(tmp_path)["planes"], strict=True):
+        plane = tifffile.imread(tmp_path / record["file"])
+        column, row = (round(start / 5 + at) for start, at in zip(record["origin_mm"], origin, strict=True))
+        np.testing.assert_array_equal(stacked[row : row + plane.shape[0], column : column + plane.shape[1]], plane)
+        assert np.isnan(stacked).sum() == stacked.size - plane.size
+    assert np.isnan(pixels[0]).any()
     with tifffile.TiffFile(tmp_path / "plane_00600.0.tiff") as file:
         assert file.pages.first.tags["ResolutionUnit"].value == 3  # per centimetre; ImageJ then shows cm
     done("reconstruct", scene, "--depth-mm", 600, "--method", "backprojection", "--out", tmp_path)
