@@ -303,6 +303,7 @@ def _geometry(solved: _Solved) -> RigGeometry:
         warnings=inconsistent_views(bundle, observations),
         homings=solved.shifts,
         undetermined_homings=solved.undetermined,
+        solution=bundle,
     )
 
 

@@ -42,7 +42,8 @@ def export_colmap(set_path: _Set, out: Path, /, *, binary: bool = False, overwri
 def export_mrcal(set_path: _Set, out: Path, /, *, overwrite: bool = False) -> Result:
     """Write the lens and poses of an elemental set as .cameramodel files, one per view, in metres.
 
-    Of a set without a scale lengths are relative, thousandths of those of its poses, and the result says so.
+    Of a set without a scale lengths are relative, thousandths of those of its poses, and the result says so. mrcal's
+    uncertainty and residuals need the corners of boards: use geometry.cameramodel, which `faintfield geometry` writes.
 
     Parameters
     ----------
