@@ -1,6 +1,8 @@
 """Planes and stacks as ImageJ and napari see them: the right scale, named and labelled."""
 
+import re
 import sys
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import Any, ClassVar
@@ -10,8 +12,11 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
+from faintfield.pipelines import pages
 from tests.pipelines.conftest import Command
 from tests.pipelines.forms import read_record
+
+_PAGES = Path(pages.__file__).parent
 
 
 def _calibration(path: Path) -> tuple[dict[str, Any], float, NDArray[Any]]:
@@ -129,3 +134,20 @@ def test_sweep_opens_as_one_layer(viewers: list[_Viewer], sweep: Path, done: Com
     assert image["scale"] == pytest.approx((50.0, 1000 / 120, 1000 / 120))
     assert image["translate"][0] == 500.0
     assert image["units"] == ("mm", "mrad", "mrad")
+
+
+def test_results_open_when_dropped_into_napari(sweep: Path, scene: Path, tmp_path: Path, done: Command) -> None:
+    (python_name,) = re.findall(r"python_name: (\S+)", (_PAGES / "napari.yaml").read_text())
+    module, _, function = python_name.partition(":")
+    napari_reader = getattr(import_module(module), function)
+    for path in (str(sweep), [str(sweep / "reconstruction.json")]):
+        ((pixels, parameters, kind),) = napari_reader(path)(path)
+        assert (kind, pixels.shape) == ("image", (5, 72, 96))
+        assert parameters["translate"][0] == 500.0
+        assert parameters["units"] == ("mm", "mrad", "mrad")
+    methods = ("--method", "backprojection", "--method", "mlem", "--passes", 2)
+    done("reconstruct", scene, "--depth-mm", 500, *methods, "--out", tmp_path)
+    names = [parameters["name"] for _, parameters, _ in napari_reader(str(tmp_path))(str(tmp_path))]
+    assert names == ["back-projection, 500 mm", "MLEM, 500 mm"]
+    assert napari_reader(str(scene)) is None
+    assert napari_reader([str(sweep), str(scene)]) is None
