@@ -35,7 +35,7 @@ def tool_inputs(bundle: Bundle) -> dict[str, Any]:
     poses, boards = bundle.rt_cam_ref * _METRES, bundle.rt_ref_board * _METRES
     target, _, node = inputs["indices_frame_camintrinsics_camextrinsics"].T
     views = np.column_stack([target, np.full_like(target, LENS), node + 1])
-    board = _most_tilted(boards, np.unique(target[node < 0]))
+    board = _most_tilted_board(boards, np.unique(target[node < 0]))
     place = int(np.flatnonzero(target == board)[0])  # mrcal requires the views of a board in the order of the lenses
     observed = inputs["observations_board"]
     made = {
@@ -69,7 +69,7 @@ def _auxiliary_lens(bundle: Bundle) -> NDArray[np.float64]:
     return lens
 
 
-def _most_tilted(boards: NDArray[np.float64], candidates: NDArray[np.int32]) -> int:
+def _most_tilted_board(boards: NDArray[np.float64], candidates: NDArray[np.int32]) -> int:
     """Return the board that faces the reference least: one that faces it has no focal length of its own."""
     facing = [abs(rotation_matrix(boards[board])[2, 2]) for board in candidates]
     return int(candidates[np.argmin(facing)])

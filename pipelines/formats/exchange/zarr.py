@@ -132,10 +132,9 @@ def _stack_in(directory: Path) -> _Stack:
         raise BadValue(f"{folder}: holds no planes at depths, only planes given by a pose; reconstruct some at depths")
     scale = stack_scale(planes, units)
     if scale is None:
-        sizes = len({record.shape for record in planes})
         raise BadValue(
-            f"{folder}: no grid holds the samples of all planes, which are of {sizes} sizes; reconstruct all of them "
-            "again with one --pitch-mm, or without it"
+            f"{folder}: no grid holds the samples of all planes, which are not whole samples apart, or differ in size "
+            "and pitch; reconstruct all of them again with one --pitch-mm, or without it"
         )
     colours = len(at_depths(result.planes)) // len(planes)
     return _Stack(folder, planes, (colours, len(planes), *scale.shape), scale, units)

@@ -115,8 +115,10 @@ def write_stack(folder: Path, records: Sequence[PlaneRecord], units: StatedUnits
 
 def stacked_plane(folder: Path, planes: Sequence[PlaneRecord], scale: Scale, index: int) -> NDArray[np.float32]:
     """Read a plane (row, column[, colour]) in the grid of its stack, NaN beyond the edges of the plane."""
-    plane = read_frame(folder / Path(planes[index].file).name).pixels_dn
+    plane = np.asarray(read_frame(folder / Path(planes[index].file).name).pixels_dn, np.float32)
     (row, column), (rows, columns) = scale.corners[index], plane.shape[:2]
+    if (rows, columns) == scale.shape:
+        return plane
     stacked = np.full((*scale.shape, *plane.shape[2:]), np.nan, np.float32)
     stacked[row : row + rows, column : column + columns] = plane
     return stacked

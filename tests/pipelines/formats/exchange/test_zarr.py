@@ -1,5 +1,6 @@
 """`export zarr`: what the libraries of OME-Zarr and zarr read is what was reconstructed, where it is."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -98,7 +99,9 @@ def test_unequal_steps_make_an_axis_without_unit(
     assert not (tmp_path / "other").exists()
 
 
-def test_planes_of_one_pitch_are_in_mm(simulated_scene: Path, tmp_path: Path, done: Command) -> None:
+def test_planes_of_one_pitch_are_in_mm(
+    simulated_scene: Path, tmp_path: Path, done: Command, faintfield: Command
+) -> None:
     out, stack = tmp_path / "mm", tmp_path / "stack.zarr"
     words = ("--method", "backprojection", "--sweep-mm", "500:501:2", "--pitch-mm", 5)
     done("reconstruct", simulated_scene, "--out", out, *words)
@@ -108,3 +111,8 @@ def test_planes_of_one_pitch_are_in_mm(simulated_scene: Path, tmp_path: Path, do
     ((scale, translation),) = _scales(multiscale)
     assert scale == [1.0, pytest.approx(1.0), 5.0, 5.0]
     assert translation[2:] == [pytest.approx(value) for value in read_record(out)["planes"][0]["origin_mm"][::-1]]
+    record = read_record(out)
+    del record["record_sha256"]
+    record["planes"][1]["origin_mm"][0] += 2.0
+    (out / "reconstruction.json").write_text(json.dumps(record))
+    assert_refused(faintfield("export", "zarr", out, tmp_path / "other"), "BadValue", "not whole samples apart")
