@@ -46,6 +46,26 @@ type SceneKind = Literal["dark_scene", "bright"]
 type FigureNumber = Literal[2, 3, 4]
 type LensName = Literal["opencv5", "opencv8", "opencv4", "pinhole"]
 type PaperName = Literal["A4", "A3", "A2", "letter"]
+type SchemaKind = Literal[
+    "rig",
+    "elemental",
+    "boards",
+    "noise-frames",
+    "plane-poses",
+    "truth",
+    "true-depth",
+    "plan",
+    "noise",
+    "geometry",
+    "alignment",
+    "reconstruction",
+    "plane",
+    "depth-map",
+    "surface",
+    "overview",
+    "metrics",
+    "depth-errors",
+]
 
 
 @Parameter(name="*")

@@ -59,6 +59,7 @@ COMMANDS: dict[tuple[Group, str], tuple[str, ...]] = {
         "view planes",
         "figures figures --only 4",
     ),
+    (_FILES, "exports"): ("schema geometry",),
 }
 IMPORTS = (
     "import grid pictures bright --pitch-mm 50 --fx-px 600",

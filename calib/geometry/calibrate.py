@@ -335,6 +335,7 @@ def _geometry(solved: _Solved) -> RigGeometry:
         warnings=inconsistent_views(bundle, observations),
         homings=solved.shifts,
         undetermined_homings=solved.undetermined,
+        solution=bundle,
     )
 
 

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from faintfield.calib.estimate import Repeatability
+from faintfield.calib.geometry.bundle import Bundle
 from faintfield.calib.geometry.observations import Node, Target
 from faintfield.calib.homography import rotation_matrix
 from faintfield.calib.lens import Lens
@@ -75,6 +76,8 @@ class RigGeometry:
     homings, undetermined_homings : list of HomingShift, list of int
         Shifts of the stage by homings within sweeps, if they show; sweeps within which the stage homed although no
         other sweep joins the nodes before and after.
+    solution : Bundle, optional
+        Solution of the bundle adjustment; None if poses and lens were stated.
     """
 
     lens: Lens
@@ -95,6 +98,7 @@ class RigGeometry:
     warnings: list[str] = field(default_factory=list)
     homings: list[HomingShift] = field(default_factory=list)
     undetermined_homings: list[int] = field(default_factory=list)
+    solution: Bundle | None = None
 
     def pose_covariance(self, node: int) -> NDArray[np.float64]:
         """Return the covariance (6, 6) of one node's pose, rad² and mm²."""

@@ -1,18 +1,23 @@
-"""`faintfield export`: lens and poses of sets, planes, or dark and flat frames, as files of other programs."""
+"""For other programs: `faintfield export` writes their files, `faintfield schema` describes those of this one."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+from faintfield.pipelines.arguments import SchemaKind
+from faintfield.pipelines.formats.units import DepthUnit, LightUnit, StatedUnits
+
 if TYPE_CHECKING:
     from faintfield.pipelines.formats.exchange.emva1288 import ExportedData
     from faintfield.pipelines.formats.exchange.imported_set import ExportedSet
     from faintfield.pipelines.formats.exchange.zarr import ZarrExport
+    from faintfield.pipelines.workflows.schema import JsonSchema, KindList
 
 type Result = ExportedSet
 type Planes = ZarrExport
 type Frames = ExportedData
+type Description = JsonSchema | KindList
 
 type _Set = Annotated[Path, Parameter(name="SESSION|SET")]
 
@@ -42,7 +47,8 @@ def export_colmap(set_path: _Set, out: Path, /, *, binary: bool = False, overwri
 def export_mrcal(set_path: _Set, out: Path, /, *, overwrite: bool = False) -> Result:
     """Write the lens and poses of an elemental set as .cameramodel files, one per view, in metres.
 
-    Of a set without a scale lengths are relative, thousandths of those of its poses, and the result says so.
+    Of a set without a scale lengths are relative, thousandths of those of its poses, and the result says so. mrcal's
+    uncertainty and residuals need the corners of boards: use geometry.cameramodel, which `faintfield geometry` writes.
 
     Parameters
     ----------
@@ -84,8 +90,8 @@ def export_zarr(directory: Path, out: Path, /, *, overwrite: bool = False) -> Pl
 
     Axes are colour, depth, row, column; values are float32, light per detector pixel in the unit of the set.
     Lengths are in mm where all planes have one pitch (reconstruct with --pitch-mm); otherwise rows and columns are in
-    thousandths of x/z, which have no unit in this format. Of a set without a scale, no length has a unit: the attribute
-    `faintfield` says what it is. Depths, or disparities, must be in equal steps.
+    thousandths of x/z, which have no unit in this format. Planes in unequal steps are counted along the axis of depth,
+    and of a set without a scale no length has a unit: the attribute `faintfield` says what each axis is.
 
     Parameters
     ----------
@@ -119,3 +125,25 @@ def export_emva1288(folder: Annotated[Path, Parameter(name="DIR")], out: Path, /
     from faintfield.pipelines.formats.exchange.emva1288 import export_data
 
     return export_data(folder, out, overwrite=overwrite)
+
+
+def schema(
+    kind: SchemaKind | None = None, /, *, depth_unit: DepthUnit = "mm", light_unit: LightUnit = "electrons"
+) -> Description:
+    """Print the JSON Schema of a file that is read or written, or list the kinds of files.
+
+    A schema of a TOML file is that of its tables as JSON. Results name depths and light by their units: state these for
+    the results of a set without a scale or without photons.
+
+    Parameters
+    ----------
+    kind
+        Kind of file; without it all kinds are listed, with a sentence each.
+    depth_unit
+        Unit of depths in a result.
+    light_unit
+        Unit of light in a result.
+    """
+    from faintfield.pipelines.workflows.schema import describe_kind, list_kinds
+
+    return list_kinds() if kind is None else describe_kind(kind, StatedUnits(depth=depth_unit, light=light_unit))

@@ -60,7 +60,9 @@ class TiltedPlane:
 type Place = float | TiltedPlane
 
 
-class _Pose(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class PlanePose(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A plane, by `rt_ref_plane` (Rodrigues rad and mm, from plane to reference) or by a point and its normal."""
+
     name: str
     rt_ref_plane: _Pose6 | None = None
     point_mm: _Three | None = None
@@ -68,9 +70,11 @@ class _Pose(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     size_mm: tuple[float, float] | None = None
 
 
-class _Poses(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class PlanePoses(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """TOML file of `--plane-pose`: planes at any place and angle, in the reference frame."""
+
     format: Literal[1]
-    plane: list[_Pose]
+    plane: list[PlanePose]
 
 
 def read_plane_poses(paths: Sequence[Path]) -> list[TiltedPlane]:
@@ -81,7 +85,9 @@ def read_plane_poses(paths: Sequence[Path]) -> list[TiltedPlane]:
     """
     planes: dict[str, TiltedPlane] = {}
     for path in paths:
-        poses = read_toml(path, _Poses, remedy="name a TOML file with a [[plane]] for each plane (docs/depth.md)").plane
+        poses = read_toml(
+            path, PlanePoses, remedy="name a TOML file with a [[plane]] for each plane (docs/depth.md)"
+        ).plane
         if not poses:
             raise BadValue(f"{path}: names no [[plane]]; add one")
         for pose in poses:
@@ -91,7 +97,7 @@ def read_plane_poses(paths: Sequence[Path]) -> list[TiltedPlane]:
     return list(planes.values())
 
 
-def _plane(path: Path, pose: _Pose) -> TiltedPlane:
+def _plane(path: Path, pose: PlanePose) -> TiltedPlane:
     where = f"{path}: plane '{pose.name}'"
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9-]{0,39}", pose.name):
         raise BadValue(f"{where}: is no name for files; take a letter and then letters, digits or hyphens, 40 at most")

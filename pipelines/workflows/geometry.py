@@ -28,7 +28,7 @@ from faintfield.calib.geometry.stage import approach_directions, stage_report
 from faintfield.calib.noise.strips import usable_cores
 from faintfield.pipelines.arguments import LensName
 from faintfield.pipelines.console import inform, progress, working
-from faintfield.pipelines.formats.exchange.mrcal import camera_model_text
+from faintfield.pipelines.formats.exchange.mrcal import camera_model_text, solution_text
 from faintfield.pipelines.formats.files import check_results_folder
 from faintfield.pipelines.formats.frames import read_ahead
 from faintfield.pipelines.formats.provenance import provenance
@@ -38,6 +38,7 @@ from faintfield.pipelines.formats.results.geometry import (
     COVARIANCE_FILE,
     DEFAULT_DEPTHS_MM,
     GEOMETRY_PAGE,
+    MODEL_FILE,
     BoardRecord,
     GeometryOptions,
     GeometryRecord,
@@ -185,10 +186,11 @@ def _board_record(board_set: BoardSet, pose: BoardPose, warp_mm: list[float]) ->
 
 
 def _files(rig: RigGeometry, observations: Sequence[BoardObservation]) -> dict[str, bytes | str]:
-    """Return the files beside geometry.json by name: covariance, corners, and a camera model for each node.
+    """Return the files beside geometry.json by name: covariance, corners, and camera models.
 
-    The covariance is of fx, fy, cx, cy, the distortion, then rt_cam_ref of every node. The corners, one row each, are
-    those of the boards whose pose was solved; with the homings of these poses if they are told apart.
+    There is a camera model for each node, and one with all that mrcal's tools need. The covariance is of fx, fy, cx,
+    cy, the distortion, then rt_cam_ref of every node. The corners, one row each, are those of the boards whose pose was
+    solved; with the homings of these poses if they are told apart.
     """
     solved = {(board.target.board, board.target.sweep) for board in rig.boards}
     kept = [seen for seen in observations if (seen.target.board, seen.target.sweep) in solved]
@@ -207,7 +209,8 @@ def _files(rig: RigGeometry, observations: Sequence[BoardObservation]) -> dict[s
         CAMERA_FILE.format(*node): camera_model_text(rig.lens, rig.lens_model, rt_cam_ref)
         for node, rt_cam_ref in zip(rig.nodes, rig.rt_cam_ref, strict=True)
     }
-    return {COVARIANCE_FILE: covariance, CORNERS_FILE: corners, **cameras}
+    model = {} if rig.solution is None else {MODEL_FILE: solution_text(rig.solution)}
+    return {COVARIANCE_FILE: covariance, CORNERS_FILE: corners, **model, **cameras}
 
 
 def _npz(**arrays: Any) -> bytes:

@@ -53,6 +53,11 @@ class PlaneGrid:
         rows, columns = round((bottom_mm - top_mm) / pitch_mm), round((right_mm - left_mm) / pitch_mm)
         return cls((rows, columns), pitch_mm, (left_mm + pitch_mm / 2, top_mm + pitch_mm / 2))
 
+    def on_multiples(self) -> "PlaneGrid":
+        """Return the grid moved by half a sample at most, so that x and y of its samples are multiples of the pitch."""
+        x_mm, y_mm = (self.pitch_mm * round(start / self.pitch_mm) for start in self.origin_mm)
+        return PlaneGrid(self.shape, self.pitch_mm, (x_mm, y_mm))
+
     def binned(self, bins: int) -> "PlaneGrid":
         """Return the grid with samples of `bins` by `bins` of these; incomplete ones at the far edges are dropped."""
         first = tuple(origin + self.pitch_mm * (bins - 1) / 2 for origin in self.origin_mm)

@@ -5,13 +5,14 @@ import io
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from faintfield.calib.geometry.bundle import LENS_MODELS, load_mrcal
+from faintfield.calib.geometry.bundle import LENS_MODELS, Bundle, load_mrcal
+from faintfield.calib.geometry.mrcal_inputs import LENS, REFERENCE_POSE, seen_region_px, tool_inputs
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.exchange.imported_set import (
@@ -71,6 +72,23 @@ def camera_model_text(lens: Lens, lens_model: str, rt_cam_ref: ArrayLike) -> str
         imagersize=np.array(lens.size_px, np.int32),
         rt_cam_ref=np.array(rt_cam_ref, np.float64) * [1, 1, 1, 1e-3, 1e-3, 1e-3],
     )
+    return _text_of(model)
+
+
+def solution_text(bundle: Bundle) -> str:
+    """Return the lens at the reference node as the text of a .cameramodel file, with mrcal's optimization inputs.
+
+    From these mrcal's tools show the uncertainty of projections and the residuals. The valid region of the lens is the
+    hull of all corners that were seen.
+    """
+    model = load_mrcal().cameramodel(
+        optimization_inputs=tool_inputs(bundle), icam_intrinsics=LENS, icam_extrinsics=REFERENCE_POSE
+    )
+    model.valid_intrinsics_region(seen_region_px(bundle))
+    return _text_of(model)
+
+
+def _text_of(model: Any) -> str:
     text = io.StringIO()
     model.write(text)
     return text.getvalue()

@@ -13,20 +13,36 @@ from numpy.typing import NDArray
 from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.errors import BadValue, InputError, import_optional
 from faintfield.pipelines.formats.files import check_free, require_room, writing_folder
-from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.reading import read_json
 from faintfield.pipelines.formats.results.records import PlaneRecord
-from faintfield.pipelines.formats.results.stacks import Scale, at_depths, planes_in_order, stack_scale
+from faintfield.pipelines.formats.results.stacks import (
+    Scale,
+    at_depths,
+    planes_in_order,
+    stack_scale,
+    stacked_plane,
+)
 from faintfield.pipelines.formats.results.surface import planes_below
 from faintfield.pipelines.formats.units import StatedUnits, named_by, units_of
 
 # Planes are halved until no side is longer, px; viewers load the rest only where they look closer.
-_COARSEST_PX = 512
+_COARSEST_PX = 256
 
 _CHUNK_PX = 512
 
+# Units that OME-Zarr has a name for; px, mrad, the index of a plane and relative lengths have none.
+_UNITS = {"mm": "millimeter"}
+
 # Patterns of what the folder of an export holds: its metadata, and one array for each resolution.
 _HELD = ("zarr.json", "[0-9]", "[0-9][0-9]")
+
+
+class Axes(msgspec.Struct, frozen=True):
+    """Units of the axes of an export; "index" if the axis z counts planes, whose steps of depth are not equal."""
+
+    z: str
+    y: str
+    x: str
 
 
 class ZarrExport(msgspec.Struct, frozen=True):
@@ -35,7 +51,7 @@ class ZarrExport(msgspec.Struct, frozen=True):
     out: str
     shape: tuple[int, int, int, int]
     levels: int
-    unit: str
+    axes: Axes
 
 
 @dataclass(frozen=True)
@@ -47,6 +63,17 @@ class _Stack:
     shape: tuple[int, int, int, int]
     scale: Scale
     units: StatedUnits
+
+    @property
+    def axes(self) -> Axes:
+        """Units of the axes."""
+        across = self.scale.unit or "relative"
+        return Axes(self.units.length or "relative" if self.steps_equal else "index", across, across)
+
+    @property
+    def steps_equal(self) -> bool:
+        """Return whether one step leads from each plane to the next, as OME-Zarr requires."""
+        return self.scale.step_mm is not None or len(self.planes) == 1
 
     @property
     def levels(self) -> int:
@@ -67,7 +94,7 @@ def export_planes(directory: Path, out: Path, *, overwrite: bool = False) -> Zar
     Raises
     ------
     BadValue
-        Several calls or methods made the planes, none has a depth, or they differ in size or in the steps of depth.
+        Several calls or methods made the planes, none has a depth, or no grid holds the samples of all.
     MissingPackage
         zarr or ome-zarr-models is not installed.
     """
@@ -80,13 +107,18 @@ def export_planes(directory: Path, out: Path, *, overwrite: bool = False) -> Zar
     with writing_folder(out, replace_only=held, overwrite=overwrite, reads=[stack.folder]) as building:
         group = zarr.open_group(building, mode="w", zarr_format=3)
         _write_metadata(models, group, stack, directory.resolve().name)
-        for index, record in enumerate(progress(stack.planes, "writing planes")):
-            plane = np.atleast_3d(np.asarray(read_frame(stack.folder / Path(record.file).name).pixels_dn, np.float32))
+        for index in progress(range(len(stack.planes)), "writing planes"):
+            plane = np.atleast_3d(stacked_plane(stack.folder, stack.planes, stack.scale, index))
             for level in range(stack.levels):
                 group[str(level)][:, index] = np.moveaxis(plane, 2, 0)
                 plane = _halve(plane)
     inform(f"{out}: {len(stack.planes)} planes of {stack.shape[3]} x {stack.shape[2]} samples")
-    return ZarrExport(str(out), stack.shape, stack.levels, stack.scale.unit or "relative")
+    if not stack.steps_equal:
+        inform(
+            f"the axis z counts the planes, whose steps of {stack.units.quantity} differ, as OME-Zarr states only one; "
+            f"the attribute faintfield holds their {stack.units.quantities}"
+        )
+    return ZarrExport(str(out), stack.shape, stack.levels, stack.axes)
 
 
 def _stack_in(directory: Path) -> _Stack:
@@ -98,17 +130,14 @@ def _stack_in(directory: Path) -> _Stack:
     units, planes = units_of(result), planes_in_order(result.planes)
     if not planes:
         raise BadValue(f"{folder}: holds no planes at depths, only planes given by a pose; reconstruct some at depths")
-    shapes = sorted({record.shape for record in planes})
-    if len(shapes) > 1:
-        raise BadValue(f"{folder}: planes are of {len(shapes)} sizes, {shapes[0]} and others; a stack takes one")
     scale = stack_scale(planes, units)
-    if scale.step_mm is None and len(planes) > 1:
+    if scale is None:
         raise BadValue(
-            f"{folder}: the {len(planes)} planes are not in equal steps of {units.quantity}, and OME-Zarr states only "
-            f"one; reconstruct with {'--sweep-px' if units.length == 'px' else '--sweep-mm'}"
+            f"{folder}: no grid holds the samples of all planes, which are not whole samples apart, or differ in size "
+            "and pitch; reconstruct all of them again with one --pitch-mm, or without it"
         )
     colours = len(at_depths(result.planes)) // len(planes)
-    return _Stack(folder, planes, (colours, len(planes), *shapes[0]), scale, units)
+    return _Stack(folder, planes, (colours, len(planes), *scale.shape), scale, units)
 
 
 def _is_export(folder: Path) -> bool:
@@ -123,21 +152,16 @@ def _is_export(folder: Path) -> bool:
 
 def _write_metadata(models: Any, group: Any, stack: _Stack, name: str) -> None:
     """Make the arrays of all resolutions, and describe their axes."""
-    axis = models.axes.Axis
-    unit = "millimeter" if stack.scale.unit == "mm" else None
-    axes = (
-        axis(name="c", type="channel"),
-        axis(name="z", type="space", unit="millimeter" if stack.units.depth == "mm" else None),
-        axis(name="y", type="space", unit=unit),
-        axis(name="x", type="space", unit=unit),
-    )
+    axis, units = models.axes.Axis, msgspec.to_builtins(stack.axes)
+    space = [axis(name=name, type="space", unit=_UNITS.get(unit)) for name, unit in units.items()]
+    axes = (axis(name="c", type="channel"), *space)
     datasets = tuple(_dataset(models, group, stack, level) for level in range(stack.levels))
     multiscale = models.multiscales.Multiscale(axes=axes, datasets=datasets, name=name)
     attributes = models.image.ImageAttrs(version="0.5", multiscales=[multiscale])
     group.attrs["ome"] = attributes.model_dump(mode="json", exclude_none=True)
     group.attrs["faintfield"] = {
         "value": stack.units.light_description,
-        "row_and_column": stack.scale.unit or "relative",
+        "axes": units,
         "units": msgspec.to_builtins(stack.units),
         "planes": [named_by(msgspec.to_builtins(record), stack.units) for record in stack.planes],
     }
@@ -147,13 +171,16 @@ def _dataset(models: Any, group: Any, stack: _Stack, level: int) -> Any:
     """Make the array of one resolution, and return its entry: where its samples lie."""
     scale, size, step = stack.scale, stack.size(level), 2**level
     chunks = (1, 1, min(_CHUNK_PX, size[2]), min(_CHUNK_PX, size[3]))
-    group.create_array(str(level), shape=size, chunks=chunks, dtype="float32", dimension_names=list("czyx"))
+    group.create_array(
+        str(level), shape=size, chunks=chunks, dtype="float32", fill_value=np.nan, dimension_names=list("czyx")
+    )
     x, y = scale.origin
+    first, depth_step = (stack.planes[0].depth_mm, scale.step_mm or 1.0) if stack.steps_equal else (0.0, 1.0)
     across, shift = scale.across * step, scale.across * (step - 1) / 2  # to the middle of the samples merged into one
     return models.multiscales.Dataset.build(
         path=str(level),
-        scale=(1.0, scale.step_mm or 1.0, across, across),
-        translation=(0.0, stack.planes[0].depth_mm, y + shift, x + shift),
+        scale=(1.0, depth_step, across, across),
+        translation=(0.0, first, y + shift, x + shift),
     )
 
 

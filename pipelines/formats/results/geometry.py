@@ -38,6 +38,7 @@ if TYPE_CHECKING:  # readers of the record need no solver
 GEOMETRY_FILE = "geometry.json"
 COVARIANCE_FILE = "geometry_covariance.npz"
 CORNERS_FILE = "geometry_corners.npz"
+MODEL_FILE = "geometry.cameramodel"
 GEOMETRY_PAGE = "geometry.html"
 
 # Folder in a set or session with the geometry.json that its views were aligned by.

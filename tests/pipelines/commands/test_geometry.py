@@ -1,6 +1,8 @@
 """`faintfield geometry` from images to files, on a small rendered set; boards on paper; other people's formats."""
 
 import json
+import os
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +24,7 @@ from faintfield.pipelines.formats.results.geometry import (
     CORNERS_FILE,
     COVARIANCE_FILE,
     GEOMETRY_FILE,
+    MODEL_FILE,
     GeometryRecord,
     read_geometry,
 )
@@ -88,6 +91,45 @@ def test_files_hold_true_poses(measured: tuple[Path, GeometrySummary], scene: Pa
         point = np.array([[0.1, -0.05, 1.0]])
         pixels = mrcal.project(point, *model.intrinsics())
         np.testing.assert_allclose(pixels, record.camera_lens().project(point), atol=1e-4)
+
+
+def test_mrcal_finds_the_residuals_and_errors_of_the_lens(measured: tuple[Path, GeometrySummary]) -> None:
+    """Sums of squares and covariance are mrcal's own, from the file alone."""
+    folder, _ = measured
+    record = read_geometry(folder, GeometryRecord)
+    model = mrcal.cameramodel(str(folder / MODEL_FILE))
+    inputs = model.optimization_inputs()
+    state, x, _, factor = mrcal.optimizer_callback(**inputs)
+    boards = x[: mrcal.num_measurements_boards(**inputs)]
+    assert boards @ boards == pytest.approx(2 * record.corners * record.rms_inlier_px**2, rel=1e-9)
+    assert mrcal.measurements_board(inputs, x=x, icam_intrinsics=1 - model.icam_intrinsics()).any() == 0
+    scale = np.ones_like(state)
+    mrcal.unpack_state(scale, **inputs)
+    first = mrcal.state_index_intrinsics(model.icam_intrinsics(), **inputs)
+    sigma = np.sqrt(np.diag(factor.solve_xt_JtJ_bt(np.eye(len(state))))) * scale * record.corner_sigma_px
+    np.testing.assert_allclose(sigma[first : first + 4], record.lens.sigma[:4], rtol=0.01)
+    # The regularization, weaker for two lenses, moves what the corners determine by little
+    before = inputs["intrinsics"][model.icam_intrinsics()].copy()
+    mrcal.optimize(**inputs)
+    moved = inputs["intrinsics"][model.icam_intrinsics()] - before
+    assert (np.abs(moved[:4]) < 0.1 * np.array(record.lens.sigma[:4])).all()
+
+
+@pytest.mark.deep
+def test_tools_of_mrcal_draw_the_model(measured: tuple[Path, GeometrySummary], tmp_path: Path) -> None:
+    tools = Path(sys.executable).parent
+    calls = [["projection-uncertainty", "--gridn", "12", "9", "--distance", "0.6"], ["projection-uncertainty"]]
+    calls += [["residuals", f"--{kind}"] for kind in ("vectorfield", "magnitudes", "histogram")]
+    for number, (tool, *words) in enumerate([*calls, ["valid-intrinsics-region"]]):
+        drawing = tmp_path / f"{number}.svg"
+        ended = subprocess.run(
+            [tools / f"mrcal-show-{tool}", *words, "--hardcopy", drawing, measured[0] / MODEL_FILE],
+            env={**os.environ, "PATH": f"{tools}:{os.environ['PATH']}"},  # mrcal brings its own gnuplot
+            capture_output=True,
+            text=True,
+        )
+        assert ended.returncode == 0, ended.stderr
+        assert "</svg>" in drawing.read_text()
 
 
 def test_stored_corners_give_the_same_geometry(measured: tuple[Path, GeometrySummary]) -> None:

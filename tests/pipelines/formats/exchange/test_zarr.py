@@ -1,5 +1,6 @@
 """`export zarr`: what the libraries of OME-Zarr and zarr read is what was reconstructed, where it is."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +47,7 @@ def test_sweep_is_in_mm_and_milliradians(sweep: Path, tmp_path: Path, done: Comm
     for axis, start in ((3, first["origin_mm"][0]), (2, first["origin_mm"][1])):
         assert scale[axis] * first["depth_mm"] / 1e3 == pytest.approx(first["pitch_mm"])
         assert translation[axis] * first["depth_mm"] / 1e3 == pytest.approx(start)
-    assert group.attrs["faintfield"]["row_and_column"] == "mrad"
+    assert group.attrs["faintfield"]["axes"] == {"z": "mm", "y": "mrad", "x": "mrad"}
     pixels = group["0"][:]
     assert pixels.dtype == np.float32
     np.testing.assert_array_equal(
@@ -79,23 +80,39 @@ def test_large_colour_planes_have_several_resolutions(
             assert translation[axis] + scale[axis] * index == pytest.approx(middle)
 
 
-def test_only_planes_in_equal_steps_are_stacked(
+def test_unequal_steps_make_an_axis_without_unit(
     simulated_scene: Path, tmp_path: Path, done: Command, faintfield: Command
 ) -> None:
-    """Planes of one pitch are in mm."""
     out, stack = tmp_path / "out", tmp_path / "stack.zarr"
-    words = ("reconstruct", simulated_scene, "--method", "backprojection", "--out")
-    done(*words, out, "--depth-mm", 500, "--depth-mm", 550, "--depth-mm", 700)
-    assert_refused(faintfield("export", "zarr", out, stack), "BadValue", "not in equal steps")
-    done(*words, out, "--depth-mm", 500, "--method", "mlem")
-    assert_refused(faintfield("export", "zarr", out, stack), "BadValue", "calls or methods; name one")
-    assert not stack.exists()
-    done(*words, tmp_path / "mm", "--sweep-mm", "500:501:2", "--pitch-mm", 5)
-    done("export", "zarr", tmp_path / "mm", stack)
+    words = ("reconstruct", simulated_scene, "--method", "backprojection", "--out", out)
+    done(*words, "--depth-mm", 500, "--depth-mm", 550, "--depth-mm", 700)
+    assert "the axis z counts the planes" in done("export", "zarr", out, stack).stderr
+    group, multiscale = _image(stack)
+    assert [axis.unit for axis in multiscale.axes] == [None] * 4
+    ((scale, translation),) = _scales(multiscale)
+    assert (scale[1], translation[1]) == (1.0, 0.0)
+    stated = group.attrs["faintfield"]
+    assert stated["axes"] == {"z": "index", "y": "mrad", "x": "mrad"}
+    assert [plane["depth_mm"] for plane in stated["planes"]] == [500.0, 550.0, 700.0]
+    done(*words, "--depth-mm", 500, "--method", "mlem")
+    assert_refused(faintfield("export", "zarr", out, tmp_path / "other"), "BadValue", "calls or methods; name one")
+    assert not (tmp_path / "other").exists()
+
+
+def test_planes_of_one_pitch_are_in_mm(
+    simulated_scene: Path, tmp_path: Path, done: Command, faintfield: Command
+) -> None:
+    out, stack = tmp_path / "mm", tmp_path / "stack.zarr"
+    words = ("--method", "backprojection", "--sweep-mm", "500:501:2", "--pitch-mm", 5)
+    done("reconstruct", simulated_scene, "--out", out, *words)
+    done("export", "zarr", out, stack)
     _, multiscale = _image(stack)
     assert [axis.unit for axis in multiscale.axes] == [None, "millimeter", "millimeter", "millimeter"]
     ((scale, translation),) = _scales(multiscale)
     assert scale == [1.0, pytest.approx(1.0), 5.0, 5.0]
-    assert translation[2:] == [
-        pytest.approx(value) for value in read_record(tmp_path / "mm")["planes"][0]["origin_mm"][::-1]
-    ]
+    assert translation[2:] == [pytest.approx(value) for value in read_record(out)["planes"][0]["origin_mm"][::-1]]
+    record = read_record(out)
+    del record["record_sha256"]
+    record["planes"][1]["origin_mm"][0] += 2.0
+    (out / "reconstruction.json").write_text(json.dumps(record))
+    assert_refused(faintfield("export", "zarr", out, tmp_path / "other"), "BadValue", "not whole samples apart")

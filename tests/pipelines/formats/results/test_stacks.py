@@ -1,6 +1,8 @@
 """Planes and stacks as ImageJ and napari see them: the right scale, named and labelled."""
 
+import re
 import sys
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import Any, ClassVar
@@ -10,8 +12,11 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
+from faintfield.pipelines import pages
 from tests.pipelines.conftest import Command
 from tests.pipelines.forms import read_record
+
+_PAGES = Path(pages.__file__).parent
 
 
 def _calibration(path: Path) -> tuple[dict[str, Any], float, NDArray[Any]]:
@@ -43,12 +48,20 @@ def test_sweep_is_imagej_stack_of_angles(sweep: Path) -> None:
 
 
 def test_planes_of_one_pitch_are_stacked_in_mm(scene: Path, tmp_path: Path, done: Command) -> None:
-    words = ("--sweep-mm", "600:600.4:3", "--pitch-mm", 5, "--method", "backprojection")
+    words = ("--sweep-mm", "600:650:3", "--pitch-mm", 5, "--method", "backprojection")
     done("reconstruct", scene, *words, "--out", tmp_path)
-    description, across, _ = _calibration(tmp_path / "stack.tiff")
+    description, across, pixels = _calibration(tmp_path / "stack.tiff")
     assert description["unit"] == "mm"
     assert across == pytest.approx(5.0)
-    assert description["spacing"] == pytest.approx(0.2)
+    assert description["spacing"] == pytest.approx(25.0)
+    # A sample of a plane lies in the stack where its x and y say, and beyond the smaller planes nothing is known
+    origin = description["xorigin"], description["yorigin"]
+    for stacked, record in zip(pixels, read_record(tmp_path)["planes"], strict=True):
+        plane = tifffile.imread(tmp_path / record["file"])
+        column, row = (round(start / 5 + at) for start, at in zip(record["origin_mm"], origin, strict=True))
+        np.testing.assert_array_equal(stacked[row : row + plane.shape[0], column : column + plane.shape[1]], plane)
+        assert np.isnan(stacked).sum() == stacked.size - plane.size
+    assert np.isnan(pixels[0]).any()
     with tifffile.TiffFile(tmp_path / "plane_00600.0.tiff") as file:
         assert file.pages.first.tags["ResolutionUnit"].value == 3  # per centimetre; ImageJ then shows cm
     done("reconstruct", scene, "--depth-mm", 600, "--method", "backprojection", "--out", tmp_path)
@@ -121,3 +134,20 @@ def test_sweep_opens_as_one_layer(viewers: list[_Viewer], sweep: Path, done: Com
     assert image["scale"] == pytest.approx((50.0, 1000 / 120, 1000 / 120))
     assert image["translate"][0] == 500.0
     assert image["units"] == ("mm", "mrad", "mrad")
+
+
+def test_results_open_when_dropped_into_napari(sweep: Path, scene: Path, tmp_path: Path, done: Command) -> None:
+    (python_name,) = re.findall(r"python_name: (\S+)", (_PAGES / "napari.yaml").read_text())
+    module, _, function = python_name.partition(":")
+    napari_reader = getattr(import_module(module), function)
+    for path in (str(sweep), [str(sweep / "reconstruction.json")]):
+        ((pixels, parameters, kind),) = napari_reader(path)(path)
+        assert (kind, pixels.shape) == ("image", (5, 72, 96))
+        assert parameters["translate"][0] == 500.0
+        assert parameters["units"] == ("mm", "mrad", "mrad")
+    methods = ("--method", "backprojection", "--method", "mlem", "--passes", 2)
+    done("reconstruct", scene, "--depth-mm", 500, *methods, "--out", tmp_path)
+    names = [parameters["name"] for _, parameters, _ in napari_reader(str(tmp_path))(str(tmp_path))]
+    assert names == ["back-projection, 500 mm", "MLEM, 500 mm"]
+    assert napari_reader(str(scene)) is None
+    assert napari_reader([str(sweep), str(scene)]) is None
