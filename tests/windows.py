@@ -155,7 +155,7 @@ def _become_windows(folder: Path) -> None:
         for name in names:
             delattr(holder, name)
     sys.modules["msvcrt"] = msvcrt
-    os.rename = _rename
+    vars(os)["rename"] = _rename
     vars(shutil)["_use_fd_functions"] = False  # opens folders
     tempfile.tempdir = str(folder)
     warnings.filterwarnings("ignore", category=EncodingWarning)
