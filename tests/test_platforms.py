@@ -13,22 +13,27 @@ from faintfield.rig import files
 from tests.pipelines.sessions import rig_toml
 from tests.windows import Msvcrt, Sys
 
-_COMMANDS = """
+_OF_A_SET = """
 simulate scene --rows 3 --columns 3 --size-px 96 72
 reconstruct scene --depth-mm 500 --depth-mm 700 --workers 2 --out out
 report out
 verify out
 export nerfstudio scene transforms
 import nerfstudio transforms imported --images scene
+"""
+_OF_A_SESSION = """
 capture rig.toml session --yes
 noise session
 verify session
 """
 
 
-def test_commands_work_without_posix(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "commands", [pytest.param(_OF_A_SET, id="set"), pytest.param(_OF_A_SESSION, id="session", marks=pytest.mark.deep)]
+)
+def test_commands_work_without_posix(commands: str, tmp_path: Path) -> None:
     (tmp_path / "rig.toml").write_text(rig_toml(("dark_scene", "dark", "flat"), rows=2, columns=2))
-    command = [sys.executable, "-X", "warn_default_encoding", "-m", "tests.windows", str(tmp_path), _COMMANDS.strip()]
+    command = [sys.executable, "-X", "warn_default_encoding", "-m", "tests.windows", str(tmp_path), commands.strip()]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stderr
 
