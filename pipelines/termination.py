@@ -1,9 +1,14 @@
 """End by SIGTERM or SIGHUP: interrupt what runs, as Ctrl-C does, so that a stage is brought to rest."""
 
 import signal
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
+
+_ENDINGS = [signal.SIGTERM]
+if sys.platform != "win32":  # which tells a program nothing when its terminal is closed
+    _ENDINGS.append(signal.SIGHUP)
 
 
 class Terminated(KeyboardInterrupt):
@@ -21,7 +26,7 @@ def interrupt_on_termination() -> Iterator[None]:
     A signal that is ignored already, as by `nohup`, stays ignored. Whatever else fails as the block ends, such as a
     message to a terminal that is closed, `Terminated` is what is raised.
     """
-    handled = [number for number in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(number) is signal.SIG_DFL]
+    handled = [number for number in _ENDINGS if signal.getsignal(number) is signal.SIG_DFL]
     received: list[int] = []
 
     def interrupt(number: int, frame: FrameType | None) -> None:

@@ -1,14 +1,31 @@
-"""Files of sessions and results: regular ones of a bounded size, read and hashed; names; folders that last.
+"""Files of sessions and results: regular ones of a bounded size, read and hashed; names; locks; folders that last.
 
 A name in a file may lead to a pipe, which never answers, or to a device, which never ends. Both are refused here.
+The differences between operating systems that concern files are all in this module.
 """
 
 import errno
 import hashlib
 import os
 import stat
+import sys
+import tempfile
 from io import BufferedReader
 from pathlib import Path
+
+if sys.platform == "win32":
+    import msvcrt
+
+    # Links and pipes cannot be refused as a file is opened: that they are looked for before has to do
+    NO_LINK = NO_WAIT = 0
+else:
+    import fcntl
+
+    NO_LINK, NO_WAIT = os.O_NOFOLLOW, os.O_NONBLOCK
+
+# The bytes of a file that stand for its lock on Windows: one for each reader. They lie beyond every content, because
+# locked bytes cannot be read.
+_LOCK_START, _MAX_READERS = 1 << 30, 64
 
 # Leaves room for what is appended to a name: file systems allow 255 bytes.
 MAX_NAME_LENGTH = 200
@@ -17,7 +34,7 @@ MAX_NAME_LENGTH = 200
 def open_regular(path: Path) -> BufferedReader:
     """Open a regular file, or a link to one, for reading; raise OSError for a pipe, a device, a socket or a folder."""
     _require_regular(path, os.stat(path))  # before it is opened, which can already act on a device
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    descriptor = os.open(path, os.O_RDONLY | NO_WAIT)
     try:
         _require_regular(path, os.fstat(descriptor))
         return os.fdopen(descriptor, "rb")
@@ -72,7 +89,9 @@ def is_plain_name(name: str) -> bool:
 
 
 def sync_folder(folder: Path) -> None:
-    """Flush the entries of a folder, so that a rename survives a power cut."""
+    """Flush the entries of a folder, so that a rename survives a power cut; Windows offers no such thing."""
+    if sys.platform == "win32":
+        return
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -86,3 +105,32 @@ def make_folder(folder: Path) -> None:
         make_folder(folder.parent)
         folder.mkdir(exist_ok=True)
     sync_folder(folder.parent)
+
+
+def open_for_lock(folder: Path) -> int:
+    """Return an open file that stands for a folder where it is locked: the folder itself if the system can open it.
+
+    On Windows it is a file in the user's folder for temporary files, which stays there, empty. A file in the folder
+    would be a stranger among the results, and while it is open, the folder could not be renamed or removed.
+    """
+    if sys.platform == "win32":
+        name = hashlib.sha256(os.fsencode(folder.resolve())).hexdigest()
+        return os.open(Path(tempfile.gettempdir(), f"faintfield-{name[:32]}.lock"), os.O_RDWR | os.O_CREAT)
+    return os.open(folder, os.O_RDONLY)
+
+
+def lock(descriptor: int, *, shared: bool) -> None:
+    """Lock an open file, exclusively or shared with other readers, until it is closed or the process ends.
+
+    Raises BlockingIOError if another has locked it, and another OSError if it cannot be locked.
+    """
+    if sys.platform == "win32":
+        for reader in range(_MAX_READERS if shared else 1):
+            os.lseek(descriptor, _LOCK_START + reader, os.SEEK_SET)
+            try:
+                return msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1 if shared else _MAX_READERS)
+            except PermissionError:  # these bytes are locked
+                continue
+        raise BlockingIOError(errno.EAGAIN, "is locked")
+    else:
+        fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)

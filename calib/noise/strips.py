@@ -6,6 +6,7 @@ Maps of large sensors may lie in files, so that memory holds only the strips tha
 import mmap
 import operator
 import os
+import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -70,14 +71,21 @@ def new_map(shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> NDArray[An
 
 
 def release() -> None:
-    """Take out of memory what the files of all maps hold; it is read again when it is needed."""
+    """Take out of memory what the files of all maps hold; it is read again when it is needed.
+
+    On Windows this is left to the system, which takes it when memory is short.
+    """
+    if sys.platform == "win32":
+        return
     for mapping in list(_mapped):
         mapping.madvise(mmap.MADV_DONTNEED)
 
 
 def usable_cores() -> int:
     """Return the number of processor cores that this process may use."""
-    return len(os.sched_getaffinity(0))
+    if sys.platform == "linux":
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def over_strips[T](work: Callable[[slice], T], shape: tuple[int, ...], parts: int | None = None) -> list[T]:

@@ -1,10 +1,10 @@
 """Files and folders written whole or not at all, and the hashes by which results name their inputs."""
 
 import errno
-import fcntl
 import os
 import secrets
 import shutil
+import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
@@ -187,26 +187,27 @@ def exclusive(folder: Path) -> Iterator[None]:
 
     The folder is created if missing, and removed if it stays empty; OutputExists if it is a file, OutputBusy if another
     command is writing there.
-    On a file system without locks, such as some network disks, nothing keeps a second command out.
+    On a file system without locks, such as some network disks, nothing keeps a second command out; on Windows nothing
+    keeps out that of another user or computer.
     """
-    with _locked(folder, fcntl.LOCK_EX):
+    with _locked(folder, shared=False):
         remove_leftovers(folder)
         yield
 
 
 def shared(folder: Path) -> AbstractContextManager[None]:
     """Lock a folder of results as `exclusive` does, but against that only: several blocks can run at a time."""
-    return _locked(folder, fcntl.LOCK_SH)
+    return _locked(folder, shared=True)
 
 
 @contextmanager
-def _locked(folder: Path, how: int) -> Iterator[None]:
+def _locked(folder: Path, *, shared: bool) -> Iterator[None]:
     with translated_write_errors(folder):
         _refuse_file(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(folder, os.O_RDONLY)
+        descriptor = rig_files.open_for_lock(folder)
     try:
-        fcntl.flock(descriptor, how | fcntl.LOCK_NB)
+        rig_files.lock(descriptor, shared=shared)
     except OSError as failure:
         if failure.errno not in _NO_LOCKS:
             os.close(descriptor)
@@ -300,13 +301,16 @@ class _Known(msgspec.Struct, frozen=True):
 class Hashes:
     """SHA-256 of the files of a folder, each computed again only if its size, inode or times of change differ.
 
-    They are stored in a hidden file in the folder, which may be removed at any time.
+    They are stored in a hidden file in the folder, which may be removed at any time. None is read from there on
+    Windows, which does not tell the time of the last status change.
     """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._known: dict[str, _Known] = {}
         self._changed = False
+        if sys.platform == "win32":
+            return
         # Without a whole file everything is hashed
         with suppress(OSError, msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
             content = rig_files.read_regular(folder / CACHE_FILE, MAX_TEXT_BYTES)

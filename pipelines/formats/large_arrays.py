@@ -2,6 +2,7 @@
 
 import os
 import re
+import sys
 import tempfile
 from collections.abc import Callable
 from contextlib import suppress
@@ -10,6 +11,7 @@ from shutil import disk_usage
 from typing import IO, Any
 
 import numpy as np
+import psutil
 from numpy.typing import DTypeLike, NDArray
 
 from faintfield.pipelines.errors import CannotWrite, DiskFull
@@ -23,6 +25,9 @@ SHARE_OF_MEMORY = 0.5
 
 # Arrays below are kept in memory by `maps_in_files`, whose files take at most a share of the free disk: results follow.
 _MIN_FILE_BYTES, _SHARE_OF_DISK = 2_000_000, 0.5
+
+# Bytes written at a time to allocate a file.
+_BLOCK_BYTES = 1 << 22
 
 _PROC, _CGROUPS = Path("/proc"), Path("/sys/fs/cgroup")
 
@@ -73,18 +78,29 @@ def mapped(file: IO[bytes], shape: tuple[int, ...], dtype: DTypeLike) -> NDArray
 
     Its space is allocated at once: if the disk filled up later, the process would be killed without a message.
     """
-    os.posix_fallocate(file.fileno(), 0, _bytes(shape, dtype))
+    _allocate(file, _bytes(shape, dtype))
     return np.asarray(np.memmap(file, dtype, "r+", shape=shape))
 
 
+def _allocate(file: IO[bytes], size: int) -> None:
+    """Allocate the space of a new file; where the system has no call for that, by writing zeros."""
+    if sys.platform == "linux":
+        os.posix_fallocate(file.fileno(), 0, size)
+        return
+    for start in range(0, size, _BLOCK_BYTES):
+        file.write(bytes(min(_BLOCK_BYTES, size - start)))
+    file.flush()
+
+
 def available_bytes() -> int:
-    """Return the memory that this process can take: the free memory, within the limits of its control groups."""
-    free = re.search(r"^MemAvailable:\s+(\d+) kB", (_PROC / "meminfo").read_text(), re.MULTILINE)
-    assert free is not None
+    """Return the memory that this process can take: the free memory, within the limits of its control groups.
+
+    Only Linux has control groups.
+    """
     group = re.search(r"^0::/(.*)$", _read(_PROC / "self" / "cgroup"), re.MULTILINE)
     own = _CGROUPS / (group[1] if group else "")
     groups = [folder for folder in (own, *own.parents) if folder.is_relative_to(_CGROUPS)]
-    return min(int(free[1]) * 1024, *(_left_of_group(folder) for folder in groups))
+    return min(int(psutil.virtual_memory().available), *(_left_of_group(folder) for folder in groups))
 
 
 def _left_of_group(folder: Path) -> int:
@@ -97,7 +113,10 @@ def _left_of_group(folder: Path) -> int:
 
 
 def _read(path: Path) -> str:
-    return path.read_text() if path.is_file() else ""
+    try:
+        return path.read_text("utf-8")
+    except OSError:  # no such file: no such limit
+        return ""
 
 
 def _bytes(shape: tuple[int, ...], dtype: DTypeLike) -> int:

@@ -40,11 +40,15 @@ class SideProcess(ABC):
     cannot be started.
     """
 
+    _process: subprocess.Popen[bytes]
+
     def __init__(self, module: str, name: str, order: object) -> None:
         self._name = name
         self._heard_s = time.monotonic()
         self._changed = threading.Event()
         self._ending = False
+        if sys.platform == "win32":
+            raise OSError("on Windows no process is started beside the capture")
         line, end = Pipe()
         with end:
             self._process = subprocess.Popen(
@@ -173,6 +177,8 @@ def _end_with_capture(line: Connection) -> None:
     """End this process, in the middle of a step, when the capture has hung up, however it ended."""
 
     def watch() -> None:
+        if sys.platform == "win32":
+            return
         hang_up = select.poll()
         hang_up.register(line.fileno(), 0)  # a hang-up is always told
         hang_up.poll()

@@ -4,12 +4,10 @@ import os
 import re
 import select
 import sys
-import termios
 import textwrap
 import threading
-import tty
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 
 import cv2
@@ -25,6 +23,10 @@ from faintfield.pipelines.live.panel import CapturePanel, SessionFrames, sampled
 from faintfield.pipelines.live.view import KEYS, button_label, check_rows, describe_scale, step_rows
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.capture.guide import Answer, OperatorRequest, Prompt, ShownFrame, Status, format_duration
+
+with suppress(ModuleNotFoundError):  # on Windows
+    import termios
+    import tty
 
 # Widths of the frame's picture and histogram in characters.
 _PICTURE_COLUMNS, _MIN_PICTURE_COLUMNS, _HISTOGRAM_COLUMNS = 48, 8, 24
@@ -181,8 +183,8 @@ def _frame_picture(shown: ShownFrame, lines: int) -> Text:
 
 @contextmanager
 def _keys(panel: CapturePanel) -> Iterator[None]:
-    """Let single keys press the panel's buttons while the block runs."""
-    if not sys.stdin.isatty():
+    """Let single keys press the panel's buttons while the block runs; on Windows the page alone has buttons."""
+    if sys.platform == "win32" or not sys.stdin.isatty():
         yield
         return
     before = termios.tcgetattr(sys.stdin)

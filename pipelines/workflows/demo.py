@@ -1,6 +1,7 @@
 """The whole experiment on a simulated rig, from a capture to the report with its errors: `faintfield demo`."""
 
 import shutil
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -59,6 +60,9 @@ _METHODS: list[Method] = ["backprojection", "pmlem-osl", "occlusion"]
 type Node = tuple[int, int]
 
 _EXPOSURE_S = 0.1
+
+# Every byte passes through a pseudo-terminal and pyserial where the system has pseudo-terminals.
+_PORT = "simulated:grbl" if sys.platform == "win32" else "simulated:grbl:pty"
 
 # Depths among which the surface is searched.
 _RANGE_MM = "400:900"
@@ -141,7 +145,7 @@ def demo_rig(size: DemoSize, snr: float, seed: int) -> RigSettings:
         StepSettings("flat", (0.025, 0.05, 0.1), size.frames, photons_per_s=flat_photons_per_s(camera)),
     )
     return RigSettings(
-        stage=StageSettings("simulated", port="simulated:grbl:pty"),
+        stage=StageSettings("simulated", port=_PORT),
         camera=msgspec.structs.replace(camera, unlit_photons_per_s=_photons_per_s(camera, snr)),
         grid=Grid(size.nodes, size.nodes, size.pitch_mm, Point(-350.0, -350.0)),
         step=steps,

@@ -154,9 +154,9 @@ def run_steps(session: Path, steps: Sequence[Step]) -> RunOutcome:
 def _altered_frames(session: Path, hashes: Hashes) -> list[str]:
     """Return the frames that are not as they were captured, and inform the user: results are made from them anyway."""
     altered = [
-        str(path.relative_to(session))
+        path.relative_to(session).as_posix()
         for _, taken, path in taken_frames(session)
-        if path.is_file() and hashes.of(str(path.relative_to(session))) != taken.sha256
+        if path.is_file() and hashes.of(path.relative_to(session).as_posix()) != taken.sha256
     ]
     if altered:
         inform(
@@ -283,4 +283,4 @@ def _step_of_surface(session: Path, opened: Opened, selection: SurfaceRequest) -
 
 
 def _frames(session: Path, *kinds: str) -> list[str]:
-    return [PLAN, *(str(path.relative_to(session)) for it, _, path in taken_frames(session) if it.kind in kinds)]
+    return [PLAN, *(path.relative_to(session).as_posix() for it, _, path in taken_frames(session) if it.kind in kinds)]

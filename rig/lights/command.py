@@ -3,6 +3,7 @@
 import os
 import signal
 import subprocess
+import sys
 from tempfile import TemporaryFile
 
 from faintfield.rig.errors import LightError
@@ -56,7 +57,10 @@ class CommandLight:
             try:
                 code = process.wait(limit_s)
             except BaseException as failure:
-                os.killpg(process.pid, signal.SIGKILL)
+                if sys.platform == "win32":
+                    process.kill()
+                else:
+                    os.killpg(process.pid, signal.SIGKILL)
                 process.wait()
                 if isinstance(failure, subprocess.TimeoutExpired):
                     raise self._failure(f"{program} did not end within {limit_s:g} s; raise limit_s") from failure

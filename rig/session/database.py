@@ -183,9 +183,9 @@ def wal_bytes(path: Path) -> int:
 def _other_user(path: Path) -> str:
     """Return another process that holds a lock on a file, as Linux lists them; the others are not known."""
     with suppress(OSError, ValueError, IndexError):
-        for fields in map(str.split, Path("/proc/locks").read_text().splitlines()):
+        for fields in map(str.split, Path("/proc/locks").read_text("utf-8").splitlines()):
             if fields[1] == "POSIX" and fields[5].endswith(f":{path.stat().st_ino}") and int(fields[4]) != os.getpid():
-                return f"process {fields[4]} ({Path('/proc', fields[4], 'comm').read_text().strip()})"
+                return f"process {fields[4]} ({Path('/proc', fields[4], 'comm').read_text('utf-8').strip()})"
     return "another program"
 
 

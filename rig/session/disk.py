@@ -1,7 +1,6 @@
 """Write the files of a session whole or not at all, never overwrite or delete one, and lock the session's folder."""
 
 import errno
-import fcntl
 import os
 import re
 import stat
@@ -14,7 +13,7 @@ import tifffile
 
 from faintfield.rig.cameras.protocol import Exposure
 from faintfield.rig.errors import SessionBusy, SessionCorrupt, SessionUnreadable, SessionUnwritable
-from faintfield.rig.files import is_plain_name, make_folder, sync_folder
+from faintfield.rig.files import NO_LINK, NO_WAIT, is_plain_name, lock, make_folder, sync_folder
 
 PART = ".part"
 
@@ -112,18 +111,20 @@ def lock_session(folder: Path, *, shared: bool = False) -> Iterator[None]:
     with translate_errors(path, read_only=shared):
         require_kind(path, stat.S_ISREG, "file")
         access = os.O_RDONLY if shared else os.O_RDWR | os.O_CREAT
-        descriptor = os.open(path, access | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
+        descriptor = os.open(path, access | NO_LINK | NO_WAIT, 0o644)
     try:
         with translate_errors(path, read_only=shared):
             try:
-                fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+                lock(descriptor, shared=shared)
             except BlockingIOError as failure:
-                process = re.fullmatch(rb"process \d+", os.pread(descriptor, 100, 0))
+                os.lseek(descriptor, 0, os.SEEK_SET)
+                process = re.fullmatch(rb"process \d+", os.read(descriptor, 100))
                 holder = process[0].decode() if process else "another process"
                 raise SessionBusy(f"{folder}: a capture is under way ({holder}); wait for it or stop it") from failure
             if not shared:
                 os.ftruncate(descriptor, 0)
-                os.pwrite(descriptor, f"process {os.getpid()}".encode(), 0)
+                os.lseek(descriptor, 0, os.SEEK_SET)
+                os.write(descriptor, f"process {os.getpid()}".encode())
         yield
     finally:
         os.close(descriptor)

@@ -102,7 +102,7 @@ class BoardSet:
         """Yield name and SHA-256 of every file that was read."""
         folder = self.source.parent
         for path in (self.source, *(path for view in self.views for path in view.paths)):
-            yield str(path.relative_to(folder)), sha256(path)
+            yield path.relative_to(folder).as_posix(), sha256(path)
 
 
 def load_board_set(folder: Path) -> BoardSet:

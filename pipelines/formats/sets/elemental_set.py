@@ -223,7 +223,7 @@ class ElementalSet:
         if isinstance(self.settings.noise, str):
             maps = (self.folder / self.settings.noise).with_name(NOISE_MAPS)
             if is_file(maps):
-                files[str(maps.relative_to(self.folder))] = maps
+                files[maps.relative_to(self.folder).as_posix()] = maps
         if self.measured_in is not None:
             own = self.measured_in.is_relative_to(self.folder)
             name = self.measured_in.relative_to(self.folder).as_posix() if own else self.measured_in.name

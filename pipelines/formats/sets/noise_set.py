@@ -152,7 +152,7 @@ def _of_session(folder: Path) -> tuple[NoiseSet, list[float]]:
         if planned.kind == "flat" and photons_per_s is None and isinstance(rig.camera, SimulatedSettings):
             photons_per_s = flat_photons_per_s(rig.camera)
         frame = NoiseFrame(
-            file=str(path.relative_to(folder)),
+            file=path.relative_to(folder).as_posix(),
             kind=planned.kind,
             exposure_s=planned.exposure_s,
             temperature_c=temperature_c,

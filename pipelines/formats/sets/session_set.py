@@ -113,7 +113,7 @@ def _frames_of_views(folder: Path, plan: CapturePlan, kind: SceneKind) -> tuple[
             if not is_file(path):
                 raise MissingFile(f"{path}: is in the journal but missing; restore it from a copy")
             stops[frame.stop.node] = frame.stop
-            taken[frame.stop.node][frame.round].append(str(path.relative_to(folder)))
+            taken[frame.stop.node][frame.round].append(path.relative_to(folder).as_posix())
 
     whole_rounds = {
         node: next(number for number in count() if len(names.get(number, ())) != wanted.get(number))
@@ -165,7 +165,7 @@ def _homings_apart(folder: Path, measured_in: Path) -> dict[str, int]:
     own = geometry.inputs.get(PLAN) == sha256(folder / PLAN)
     if homings.repeat() and not (own and geometry.homings):
         return {}
-    frames = [(str(path.relative_to(folder)), taken.intent) for _, taken, path in taken_frames(folder)]
+    frames = [(path.relative_to(folder).as_posix(), taken.intent) for _, taken, path in taken_frames(folder)]
     return {name: (homings.groups.get(intent) or 0) * (1 if own else -1) for name, intent in frames}
 
 

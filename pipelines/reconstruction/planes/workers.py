@@ -3,6 +3,7 @@
 import multiprocessing
 import os
 import signal
+import sys
 import tempfile
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -135,13 +136,18 @@ def in_processes[Job, Result](
 
 @contextmanager
 def _processes(count: int) -> Iterator[tuple[ProcessPoolExecutor, Any]]:
-    """Provide processes, copies of one that has loaded all modules, and a flag that they set when they compile."""
-    context = multiprocessing.get_context("forkserver")
+    """Provide processes, and a flag that they set when they compile.
+
+    On Linux they are copies of one that has loaded all modules. On macOS, whose libraries do not stand copying, and on
+    Windows, which cannot copy processes, each loads them itself.
+    """
+    context = multiprocessing.get_context("forkserver" if sys.platform == "linux" else "spawn")
     before = set(multiprocessing.active_children())
-    forkserver.set_forkserver_preload([__name__])
     with _starting_processes():
         compiles = context.RawValue("b")
-        forkserver.ensure_running()
+        if sys.platform == "linux":
+            forkserver.set_forkserver_preload([__name__])
+            forkserver.ensure_running()
     pool = ProcessPoolExecutor(count, context, _prepare, (compiles,))
     try:
         yield pool, compiles

@@ -2,18 +2,22 @@
 
 import os
 import select
+import sys
 import tempfile
 import time
-import tty
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
-from faintfield.rig.errors import StageLost
+from faintfield.rig.errors import PlanRefused, StageLost
 from faintfield.rig.simulation.controller.firmware import SimulatedFirmware, Wire
 from faintfield.rig.simulation.controller.kinematics import SimulatedClock
 from faintfield.rig.stages.gantry import Gantry, serial_stage
 from faintfield.rig.stages.protocol import Point, StageSettings
 from faintfield.rig.stages.transport import Port, SerialPort, TrafficLog
+
+with suppress(ModuleNotFoundError):  # on Windows
+    import tty
 
 # Longest wait in s between two looks at a served port.
 _MAX_WAIT_S = 0.05
@@ -106,10 +110,9 @@ class PtyLink(Link):
         """Plug the cable in."""
         if self._far >= 0:
             return
-        self._far, near = os.openpty()
-        tty.setraw(near)
+        self._far, near, name = _open_pty()
         Path(self.url).unlink(missing_ok=True)
-        Path(self.url).symlink_to(os.ttyname(near))
+        Path(self.url).symlink_to(name)
         os.close(near)
 
     def unplug(self) -> None:
@@ -219,9 +222,7 @@ class Server:
         self._wire = Wire(self._clock)
         self._firmware = make_firmware(self._clock, self._wire)
         # The near end stays open, so that programs can connect again
-        self._far, self._near = os.openpty()
-        tty.setraw(self._near)
-        self.port = os.ttyname(self._near)
+        self._far, self._near, self.port = _open_pty()
 
     def run(self, speed: float = 1.0) -> None:
         """Serve until interrupted, `speed` simulated seconds per real second."""
@@ -244,3 +245,12 @@ class Server:
         """Remove the port."""
         os.close(self._far)
         os.close(self._near)
+
+
+def _open_pty() -> tuple[int, int, str]:
+    """Open a pseudo-terminal that changes no bytes; return its far and near end, and the name of the near one."""
+    if sys.platform == "win32":
+        raise PlanRefused("Windows has no pseudo-terminals; name a simulated stage without :pty")
+    far, near = os.openpty()
+    tty.setraw(near)
+    return far, near, os.ttyname(near)

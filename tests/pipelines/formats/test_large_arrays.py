@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 from shutil import disk_usage
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -42,7 +43,7 @@ def test_limit_of_control_group_counts(tmp_path: Path, monkeypatch: pytest.Monke
     job = tmp_path / "groups" / "slurm" / "job"
     (tmp_path / "self").mkdir()
     job.mkdir(parents=True)
-    (tmp_path / "meminfo").write_text("MemTotal:  9000 kB\nMemAvailable:    8000 kB\n")
+    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=8000 * 1024))
     (tmp_path / "self" / "cgroup").write_text("0::/slurm/job\n")
     (job.parent / "memory.stat").write_text("anon 1000000\nfile 2500000\n")
     monkeypatch.setattr(large_arrays, "_PROC", tmp_path)

@@ -117,7 +117,7 @@ def test_lock_that_cannot_be_taken_is_named(unsealed: Path) -> None:
         with pytest.raises(SessionUnwritable, match=r"lock: no locks; "):
             capture_small(unsealed)
     with (
-        mock.patch.object(os, "pwrite", side_effect=OSError(errno.ENOSPC, "disk full")),
+        mock.patch.object(os, "write", side_effect=OSError(errno.ENOSPC, "disk full")),
         pytest.raises(SessionUnwritable, match=r"lock: .*: make room"),
     ):
         capture_small(unsealed)
