@@ -36,9 +36,6 @@ lint: $(VENV)/installed ## style, types and import contracts
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	@# names that the package may not use on these without asking for the platform
-	$(BIN)/mypy --platform win32 --cache-dir .mypy_cache/win32 faintfield
-	$(BIN)/mypy --platform darwin --cache-dir .mypy_cache/darwin faintfield
 	$(BIN)/lint-imports
 
 bench: $(VENV)/compiled build/bench ## speed against peers, as ratios; docs/benchmarks.md keeps the last result

@@ -26,7 +26,7 @@ from faintfield.pipelines.notebook.array_set import set_of_arrays
 from faintfield.pipelines.notebook.results import Array, Plane, Planes
 from faintfield.pipelines.reconstruction.channels import keeping_frames, load_channel
 from faintfield.pipelines.reconstruction.depth.autofocus import best_focus
-from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
+from faintfield.pipelines.reconstruction.operators import OperatorFactory, requested_grid
 from faintfield.pipelines.reconstruction.options import Options
 from faintfield.pipelines.reconstruction.planes.custom import CustomOptions
 from faintfield.pipelines.reconstruction.planes.sweep import run_serially
@@ -246,7 +246,7 @@ class LightField:
 
     def grid(self, depth: float, pitch: float | None = None) -> PlaneGrid:
         """Return the samples of a plane at a depth, one per pixel of the reference view by default."""
-        return plane_grid(self.elemental_set, self._depth_mm(depth), pitch)
+        return requested_grid(self.elemental_set, self._depth_mm(depth), pitch)
 
     def operator(self, depth: float, channel: str | None = None, pitch: float | None = None) -> PlaneOperator:
         """Return H of a plane at a depth, for the pixels of `data`."""

@@ -67,6 +67,15 @@ def plane_grid(elemental_set: ElementalSet, place: Place, pitch_mm: float | None
         raise GeometryMismatch(f"plane at {elemental_set.depth_text(depth_mm)}: {failure}") from failure
 
 
+def requested_grid(elemental_set: ElementalSet, place: Place, pitch_mm: float | None) -> PlaneGrid:
+    """Return the samples of a plane; planes of one stated pitch have theirs one behind the other, for a stack."""
+    if pitch_mm is None:
+        mm_per_depth = default_pitch_px(elemental_set) / elemental_set.settings.camera.fx_px
+        return plane_grid(elemental_set, place, depth_of(place) * mm_per_depth)
+    grid = plane_grid(elemental_set, place, pitch_mm)
+    return grid if isinstance(place, TiltedPlane) else grid.on_multiples()
+
+
 def _tilted_grid(elemental_set: ElementalSet, plane: TiltedPlane, pitch_mm: float | None) -> PlaneGrid:
     camera = elemental_set.settings.camera
     width, height = camera.size_px

@@ -12,7 +12,7 @@ from msgspec import UNSET, UnsetType
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue, OutputExists
 from faintfield.pipelines.formats.files import remove, remove_leftovers, require_room, write_record
-from faintfield.pipelines.formats.plane_poses import Place, TiltedPlane, depth_of
+from faintfield.pipelines.formats.plane_poses import Place
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.results.figures import METRICS_FILE, Metrics
 from faintfield.pipelines.formats.results.plane_files import PARTS, Origin, PlaneFiles
@@ -36,13 +36,11 @@ from faintfield.pipelines.reconstruction.channels import SHARE_OF_DISK
 from faintfield.pipelines.reconstruction.depth.depth_map import kept_depth_map, write_depth_map
 from faintfield.pipelines.reconstruction.depth.scene_structure import Mode, recommendation
 from faintfield.pipelines.reconstruction.depth.search import check_overlap, check_views, depths_of_set
-from faintfield.pipelines.reconstruction.operators import default_pitch_px, plane_grid
 from faintfield.pipelines.reconstruction.overview import inspect_set, write_overview
 from faintfield.pipelines.reconstruction.planes.forecast import Forecast, forecast
 from faintfield.pipelines.reconstruction.planes.saturation import saturation_text
 from faintfield.pipelines.reconstruction.planes.sweep import Part, PlaneTask, Runner, Sweep, run_serially
 from faintfield.pipelines.reconstruction.request import Request, folder_of_method
-from faintfield.recon.operator.grid import PlaneGrid
 
 # Planes whose mean is at most this, in electrons per pixel, count as black.
 _BLACK_E = 1e-5
@@ -199,15 +197,6 @@ def _make_planes(sweep: Sweep, folders: dict[Method, Path], out: Path, runner: R
                 (folder / PARTS).rmdir()  # stays while it holds colours of incomplete planes
 
 
-def _grid(elemental_set: ElementalSet, place: Place, pitch_mm: float | None) -> PlaneGrid:
-    """Return the samples of a plane; planes of one stated pitch have theirs one behind the other, for a stack."""
-    if pitch_mm is None:
-        mm_per_depth = default_pitch_px(elemental_set) / elemental_set.settings.camera.fx_px
-        return plane_grid(elemental_set, place, depth_of(place) * mm_per_depth)
-    grid = plane_grid(elemental_set, place, pitch_mm)
-    return grid if isinstance(place, TiltedPlane) else grid.on_multiples()
-
-
 def plan_sweep(
     elemental_set: ElementalSet,
     folders: dict[Method, Path],
@@ -217,7 +206,7 @@ def plan_sweep(
     """Return the sweep of a request, whose planes are kept in files in the folder of their method, or elsewhere."""
     layouts = elemental_set.layouts
     places: list[Place] = [*request.depths_mm, *request.tilted]
-    grids = {place: _grid(elemental_set, place, request.pitch_mm) for place in places}
+    grids = {place: requested_grid(elemental_set, place, request.pitch_mm) for place in places}
     inputs = elemental_set.input_hashes()
 
     def origin(method: Method, place: Place | None = None) -> Origin:

@@ -259,3 +259,11 @@ def test_xarray_and_plots_have_places_and_units(folder: Path) -> None:
 def test_depths_of_objects_are_found() -> None:
     light_field, _ = smooth_light_field(light_e=30.0, blur=1.5)
     assert light_field.find_depths(300.0, 600.0) == pytest.approx([400.0], rel=0.03)
+
+
+def test_grid_is_that_of_plane(folder: Path) -> None:
+    light_field = open_set(folder)
+    for pitch in (None, 11.0):
+        options = PlaneOptions(method="backprojection") | (PlaneOptions(pitch=pitch) if pitch else PlaneOptions())
+        (record, *_), grid = light_field.plane(800.0, **options).records, light_field.grid(800.0, pitch)
+        assert (record.shape, record.pitch_mm, record.origin_mm) == (grid.shape, grid.pitch_mm, grid.origin_mm)
