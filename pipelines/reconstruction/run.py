@@ -36,6 +36,7 @@ from faintfield.pipelines.reconstruction.channels import SHARE_OF_DISK
 from faintfield.pipelines.reconstruction.depth.depth_map import kept_depth_map, write_depth_map
 from faintfield.pipelines.reconstruction.depth.scene_structure import Mode, recommendation
 from faintfield.pipelines.reconstruction.depth.search import check_overlap, check_views, depths_of_set
+from faintfield.pipelines.reconstruction.operators import requested_grid
 from faintfield.pipelines.reconstruction.overview import inspect_set, write_overview
 from faintfield.pipelines.reconstruction.planes.forecast import Forecast, forecast
 from faintfield.pipelines.reconstruction.planes.saturation import saturation_text
