@@ -7,7 +7,11 @@ from types import FrameType
 
 
 class Terminated(KeyboardInterrupt):
-    """A command was ended by a signal of this number."""
+    """A command was ended by a signal of this number.
+
+    The system or another program ended the command, or its terminal was closed; the stage was told to stop. The same
+    command resumes; let `nohup` or `tmux` run a capture whose terminal may be closed.
+    """
 
     def __init__(self, number: int) -> None:
         super().__init__(signal.Signals(number).name)
