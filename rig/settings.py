@@ -219,7 +219,21 @@ class SceneSettings(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class RigSettings(Struct, frozen=True, forbid_unknown_fields=True):
-    """Content of a rig.toml."""
+    """Content of a rig.toml.
+
+    Parameters
+    ----------
+    stage, camera, grid : StageSettings, CameraSettings, Grid
+        Stage, camera and nodes of the capture.
+    step : tuple of StepSettings
+        Steps of the capture, in order.
+    settle, checks, drift : SettleSettings, CheckSettings, DriftSettings
+        Rest at a node; limits of the checks; checks for lost steps.
+    scene : SceneSettings
+        Depths of the objects.
+    board, light : tuple of BoardSettings, tuple of LightSettings
+        Printed boards; lights that the rig switches.
+    """
 
     stage: StageSettings
     camera: CameraSettings

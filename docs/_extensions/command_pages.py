@@ -29,16 +29,12 @@ def command_list() -> str:
 
 def command_group(page: str) -> str:
     """Return the help of all commands of one page."""
-    names = [name for name in app.resolved_commands() if not name.startswith("-") and _page(_group(name)) == page]
+    names = [name for name in app.resolved_commands() if not name.startswith("-") and PAGES[_group(name)] == page]
     return "\n".join(text for name in _in_order(app, names) for text in _help(app[name], (name,)))
 
 
 def _group(name: str) -> str:
     return str(app[name].group[0].name)
-
-
-def _page(group: str) -> str:
-    return PAGES.get(group, "index")
 
 
 def _in_order(parent: App, names: list[str]) -> list[str]:

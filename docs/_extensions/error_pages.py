@@ -8,9 +8,12 @@ from faintfield.rig.stages.grbl_alarms import ALARMS, ERRORS
 
 
 def error_table(root: type[BaseException]) -> str:
-    """Return an exception and all derived ones: the first line of a docstring is the cause, the text below the remedy."""
-    rows = ((f"{{index}}`{kind.__name__}`", linked(summary(kind)), body(kind)) for kind in _tree(root))
-    return table(("name", "cause", "remedy"), "20 35 45", rows)
+    """Return an exception and all derived ones: the first line of a docstring is the cause, the text below the remedy.
+
+    The root of a tree has no remedy, and no row.
+    """
+    rows = ((f"{{index}}`{kind.__name__}`", linked(summary(kind)), body(kind)) for kind in _tree(root) if body(kind))
+    return table(("name", "cause", "remedy"), "18 32 50", rows)
 
 
 def grbl_table(word: str) -> str:

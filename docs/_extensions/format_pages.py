@@ -91,18 +91,23 @@ def _section(part: _Part, *, toml: bool) -> str:
         (
             f"## {part.title(toml=toml)}\n",
             f"{linked(summary(kind))}\n\n{body(kind)}\n",
-            table(("key", "value", "default", "meaning"), "20 25 15 40", rows),
+            table(("key", "value", "default", "meaning"), "20 22 13 45", rows),
         )
     )
 
 
 def _meaning(kind: type, name: str) -> str:
-    """Return what the docstring of a type, or of one that it is derived from, says of a field."""
+    """Return what the docstring of a type, or of one that it is derived from, says of a field.
+
+    Several fields described together have a part each, or the whole in common.
+    """
     for parent in (parent for parent in kind.__mro__ if parent.__module__.startswith("faintfield")):
         sections = parse_docstring(parent)
         for entry in (*sections["Parameters"], *sections["Attributes"]):
-            if name in entry.name.split(", "):
-                return linked("\n".join(entry.desc))
+            if name in (names := entry.name.split(", ")):
+                parts = "\n".join(entry.desc).removesuffix(".").split("; ")
+                text = parts[names.index(name)] if len(parts) == len(names) else "; ".join(parts)
+                return linked(f"{text[:1].upper()}{text[1:]}.")
     return ""
 
 
