@@ -71,7 +71,7 @@ lock: ## renew requirements.lock and docs.lock from pyproject.toml; they leave o
 clean: ## remove what the tasks made
 	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +
 	rm -rf $(VENV) $(DOCS) .uv build dist demo *.egg-info .ruff_cache .mypy_cache .pytest_cache .hypothesis .import_linter_cache
-	rm -rf docs/reference/names docs/tutorials/gallery docs/sg_execution_times.rst
+	rm -rf docs/reference/names docs/tutorials/gallery
 
 # uv installs the same packages four times faster than pip; where it cannot reach pip's index, pip does it.
 # $(call install,LOCK,ENVIRONMENT)

@@ -13,7 +13,6 @@ version = release = installed_version("faintfield")
 
 extensions = [
     "sphinx.ext.autodoc",
-    "sphinx.ext.autosummary",
     "numpydoc",
     "myst_parser",
     "sphinx_design",
@@ -22,12 +21,11 @@ extensions = [
     "reference_pages",
     "repository_links",
 ]
-exclude_patterns = ["gallery", "_extensions", "_templates", "sg_execution_times.rst"]
+exclude_patterns = ["gallery", "_extensions"]
 default_role = "code"
 smartquotes = False  # two hyphens are an option
 nitpicky = True
 
-autosummary_generate = False
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 python_maximum_signature_line_length = 88
@@ -45,7 +43,7 @@ sphinx_gallery_conf = {
     "download_all_examples": False,
     "remove_config_comments": True,
     "show_signature": False,
-    "min_reported_time": 1,
+    "write_computation_times": False,  # its page loads scripts from other hosts
 }
 
 html_theme = "pydata_sphinx_theme"

@@ -1,4 +1,4 @@
-"""Every named failure says what to do: its message has a remedy after a semicolon, its docstring one below its cause."""
+"""Every named failure says what to do: in its message after a semicolon, and in its docstring below the cause."""
 
 import ast
 import inspect

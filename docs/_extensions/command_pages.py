@@ -34,7 +34,9 @@ def command_group(page: str) -> str:
 
 
 def _group(name: str) -> str:
-    return str(app[name].group[0].name)
+    groups = app[name].group
+    group = groups[0] if isinstance(groups, tuple) else groups
+    return group if isinstance(group, str) else group.name
 
 
 def _in_order(parent: App, names: list[str]) -> list[str]:
@@ -62,5 +64,9 @@ def _help(command: App, chain: tuple[str, ...]) -> Iterator[str]:
 
 def _edited(text: str) -> str:
     """Return help with options as terms and their descriptions, without what goes without saying."""
-    text = text.replace(" *[default: False]*", "").replace("**Parameters**", "**Options**").split("\n**Every command**:")[0]
+    text = (
+        text.replace(" *[default: False]*", "")
+        .replace("**Parameters**", "**Options**")
+        .split("\n**Every command**:")[0]
+    )
     return linked(re.sub(r"^\* (`[^`\]]+`): ", r"\n\1\n: ", text, flags=re.MULTILINE))

@@ -17,6 +17,8 @@ _UNITS = {
     **{"c": "°C", "um": "µm", "rad": "rad", "mm2": "mm²", "s2": "s²", "min": "min", "photons": "photons"},
 }
 _WORDS = {types.IntType: "whole number", types.FloatType: "number", types.BoolType: "true or false"}
+# Largest number of tables of one type whose names are in a heading.
+_MOST_NAMES = 3
 _LIMITS = {"ge": "at least {}", "gt": "more than {}", "le": "at most {}", "lt": "less than {}"}
 
 
@@ -28,37 +30,40 @@ class _Part:
     record: _Record
     repeated: bool = False
 
-    def title(self, *, toml: bool) -> str:
-        """Return the heading: `[table]` or `[[table]]` in TOML, `object` or `object[]` in JSON."""
-        if not self.path:
-            return "Top level"
-        name = f"[{self.path}]" if toml else f"{self.path}{'[]' * self.repeated}"
-        tag = getattr(self.record, "tag", None)
-        suffix = f' with {self.record.tag_field} = "{tag}"' if isinstance(self.record, types.StructType) and tag else ""
-        return f"`{f'[{name}]' if toml and self.repeated else name}`{suffix}"
+    def name(self, *, toml: bool) -> str:
+        """Return the name: `[table]` or `[[table]]` in TOML, `object` or `object[]` in JSON."""
+        if toml:
+            return f"`[[{self.path}]]`" if self.repeated else f"`[{self.path}]`"
+        return f"`{self.path}[]`" if self.repeated else f"`{self.path}`"
 
 
 def file_format(kind: type, *, toml: bool) -> str:
     """Return the keys of a file that holds a record of this type."""
     root = types.type_info(kind)
     assert isinstance(root, types.StructType | types.DataclassType)
-    return "\n".join(_section(part, toml=toml) for part in _parts(_Part("", root)))
+    parts: dict[type, list[_Part]] = {}
+    for part in _parts(_Part("", root)):
+        parts.setdefault(part.record.cls, []).append(part)
+    return "\n".join(f"## {_title(same, toml=toml)}\n\n{_keys(same[0].record)}" for same in parts.values())
 
 
-def _parts(root: _Part) -> Iterator[_Part]:
-    """Yield a record and the records in its fields, each type once, in the order of the keys."""
-    known, waiting = {root.record.cls}, [root]
-    while waiting:
-        part = waiting.pop(0)
-        yield part
-        inner = [
-            _Part(f"{part.path}.{field.encode_name}".lstrip("."), record, repeated)
-            for field in part.record.fields
-            for record, repeated in _records(field.type)
-            if record.cls not in known
-        ]
-        known.update(child.record.cls for child in inner)
-        waiting = inner + waiting
+def _title(parts: list[_Part], *, toml: bool) -> str:
+    """Return the names of the parts of one type, and the key that chooses this type."""
+    if not parts[0].path:
+        return "Top level"
+    names = ", ".join(part.name(toml=toml) for part in parts[:_MOST_NAMES])
+    more = f" and {len(parts) - _MOST_NAMES} more" if len(parts) > _MOST_NAMES else ""
+    record = parts[0].record
+    tag = f' with {record.tag_field} = "{record.tag}"' if isinstance(record, types.StructType) and record.tag else ""
+    return f"{names}{more}{tag}"
+
+
+def _parts(part: _Part) -> Iterator[_Part]:
+    """Yield a record and those in its fields, in the order of the keys; no type has itself in its fields."""
+    yield part
+    for field in part.record.fields:
+        for record, repeated in _records(field.type):
+            yield from _parts(_Part(f"{part.path}.{field.encode_name}".lstrip("."), record, repeated))
 
 
 def _records(kind: types.Type, repeated: bool = False) -> Iterator[tuple[_Record, bool]]:
@@ -76,24 +81,23 @@ def _records(kind: types.Type, repeated: bool = False) -> Iterator[tuple[_Record
             yield from _records(inner, repeated)
 
 
-def _section(part: _Part, *, toml: bool) -> str:
-    kind = get_origin(part.record.cls) or part.record.cls
+def _keys(record: _Record) -> str:
+    """Return the docstring of a type and a table of its fields."""
+    kind = get_origin(record.cls) or record.cls
 
-    def cells(field: types.Field) -> tuple[str, str, str]:
+    def cells(field: types.Field) -> tuple[str, ...]:
         return _value(field), _default(field), _meaning(kind, field.name)
 
     # Keys that share a meaning, such as fx_px and fy_px, share a row.
-    rows = (
-        (", ".join(f"`{field.encode_name}`" for field in fields), *row)
-        for row, fields in groupby(part.record.fields, cells)
-    )
-    return "\n".join(
-        (
-            f"## {part.title(toml=toml)}\n",
-            f"{linked(summary(kind))}\n\n{body(kind)}\n",
-            table(("key", "value", "default", "meaning"), "20 22 13 45", rows),
-        )
-    )
+    rows: list[tuple[str, ...]] = [
+        (", ".join(f"`{field.encode_name}`" for field in fields), *shared)
+        for shared, fields in groupby(record.fields, cells)
+    ]
+    if any(row[-1] for row in rows):
+        text = table(("key", "value", "default", "meaning"), "20 22 13 45", rows)
+    else:
+        text = table(("key", "value", "default"), "40 40 20", [row[:-1] for row in rows])
+    return f"{linked(summary(kind))}\n\n{body(kind)}\n\n{text}"
 
 
 def _meaning(kind: type, name: str) -> str:
@@ -136,11 +140,17 @@ def _words(kind: types.Type) -> str:
         case types.Metadata(type=inner):
             return _words(inner)
         case types.UnionType(types=choices):
-            return " or ".join(dict.fromkeys(_words(choice) for choice in choices if type(choice) is not types.NoneType))
+            return " or ".join(
+                dict.fromkeys(_words(choice) for choice in choices if type(choice) is not types.NoneType)
+            )
         case types.LiteralType(values=values):
             return ", ".join(f"`{msgspec.json.encode(value).decode()}`" for value in values)
         case types.IntType() | types.FloatType():
-            limits = [words.format(f"{limit:g}") for key, words in _LIMITS.items() if (limit := getattr(kind, key)) is not None]
+            limits = [
+                words.format(f"{limit:g}")
+                for key, words in _LIMITS.items()
+                if (limit := getattr(kind, key)) is not None
+            ]
             return ", ".join((_WORDS[type(kind)], *limits))
         case types.BoolType():
             return _WORDS[types.BoolType]
@@ -152,11 +162,11 @@ def _words(kind: types.Type) -> str:
         case types.NamedTupleType(fields=fields):
             return f"[{', '.join(field.name for field in fields)}]"
         case types.ListType(item_type=inner) | types.VarTupleType(item_type=inner):
-            words = _words(inner)
-            return f"list of {'tables' if words == 'table' else words.replace('number', 'numbers', 1)}"
+            item = _words(inner)
+            return f"list of {'records' if item == 'record' else item.replace('number', 'numbers', 1)}"
         case types.DictType(value_type=inner):
             return f"by name: {_words(inner)}"
         case types.StructType() | types.DataclassType():
-            return "table"
+            return "record"
         case _:
             return "any value"

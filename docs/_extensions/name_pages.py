@@ -3,6 +3,8 @@
 import inspect
 from pathlib import Path
 
+from docstrings import summary, table
+
 import faintfield
 
 _GROUPS = {
@@ -26,15 +28,13 @@ def grouped_names() -> dict[str, list[str]]:
 
 def name_tables(folder: str) -> str:
     """Return a table of each group; the pages of the names are in a folder."""
-    parts = []
-    for group, names in grouped_names().items():
-        entries = "\n".join(f"   {name}" for name in names)
-        pages = "\n".join(f"{folder}/{name}" for name in names)
-        parts.append(
-            f"## {group}\n\n```{{eval-rst}}\n.. currentmodule:: faintfield\n.. autosummary::\n\n{entries}\n```\n"
-            f"```{{toctree}}\n:hidden:\n\n{pages}\n```\n"
-        )
-    return "\n".join(parts)
+    return "\n".join(_group(group, names, folder) for group, names in grouped_names().items())
+
+
+def _group(group: str, names: list[str], folder: str) -> str:
+    rows = ((f"{{py:obj}}`{name} <faintfield.{name}>`", summary(getattr(faintfield, name))) for name in names)
+    pages = "\n".join(f"{folder}/{name}" for name in names)
+    return f"## {group}\n\n{table(('name', 'meaning'), '30 70', rows)}\n```{{toctree}}\n:hidden:\n\n{pages}\n```\n"
 
 
 def write_name_pages(folder: Path) -> None:

@@ -35,7 +35,8 @@ class MadeFromCode(SphinxDirective):
     def run(self) -> list[nodes.Node]:
         """Parse the Markdown at this place."""
         text = _MAKERS[self.name](" ".join(self.arguments))
-        return self.parse_text_to_nodes(text, allow_section_headings=True)
+        content: list[nodes.Node] = self.parse_text_to_nodes(text, allow_section_headings=True)
+        return content
 
 
 def setup(app: Sphinx) -> dict[str, bool]:

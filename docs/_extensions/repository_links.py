@@ -86,7 +86,8 @@ def _code(file: Path) -> str:
         lexer = get_lexer_for_filename(file.name)
     except ClassNotFound:
         lexer = TextLexer()
-    return highlight(file.read_text("utf-8"), lexer, HtmlFormatter())
+    page: str = highlight(file.read_text("utf-8"), lexer, HtmlFormatter())
+    return page
 
 
 def _listing(folder: Path) -> str:
