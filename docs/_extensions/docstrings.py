@@ -22,14 +22,18 @@ def body(value: object) -> str:
     return linked("\n".join(parse_docstring(value)["Extended Summary"]).strip())
 
 
+# Name of a page in a text, such as docs/noise.md.
+PAGE_NAME = re.compile(r"`?docs/([\w/-]+)\.md`?")
+
+
 def linked(text: str) -> str:
-    """Return Markdown with links to the pages that it names, such as docs/noise.md."""
-    return re.sub(r"`?docs/([\w/-]+)\.md`?", r"[\1](/\1.md)", text)
+    """Return Markdown with links to the pages that it names."""
+    return PAGE_NAME.sub(r"[\1](/\1.md)", text)
 
 
 def table(head: Sequence[str], widths: str, rows: Iterable[Sequence[str]]) -> str:
     """Return a table in Markdown whose cells may have several paragraphs."""
-    lines = ["```{list-table}", ":header-rows: 1", f":widths: {widths}", ""]
+    lines = ["```{list-table}", ":header-rows: 1", ":class: stacked", f":widths: {widths}", ""]
     for row in (head, *rows):
         for place, cell in enumerate(row):
             first, *others = cell.split("\n") or [""]

@@ -163,7 +163,7 @@ def _words(kind: types.Type) -> str:
             return f"[{', '.join(field.name for field in fields)}]"
         case types.ListType(item_type=inner) | types.VarTupleType(item_type=inner):
             item = _words(inner)
-            return f"list of {'records' if item == 'record' else item.replace('number', 'numbers', 1)}"
+            return "list of records" if item == "record" else f"list of {item.replace('number', 'numbers', 1)}"
         case types.DictType(value_type=inner):
             return f"by name: {_words(inner)}"
         case types.StructType() | types.DataclassType():

@@ -5,6 +5,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 
 from command_pages import command_group, command_list
+from docstrings import PAGE_NAME
 from docutils import nodes
 from error_pages import error_table, grbl_table
 from format_pages import file_format
@@ -39,9 +40,15 @@ class MadeFromCode(SphinxDirective):
         return content
 
 
+def _link_pages(app: Sphinx, what: str, name: str, value: object, options: object, lines: list[str]) -> None:
+    """Link the pages that a docstring names."""
+    lines[:] = [PAGE_NAME.sub(r":doc:`\1 </\1>`", line) for line in lines]
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     """Add the directives, and write the pages of the public names."""
     for name in _MAKERS:
         app.add_directive(name, MadeFromCode)
+    app.connect("autodoc-process-docstring", _link_pages)
     write_name_pages(Path(app.srcdir) / "reference" / NAMES)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
