@@ -23,7 +23,7 @@ _MAKERS: dict[str, Callable[[str], str]] = {
     "grbl-codes": grbl_table,
     "toml-format": lambda name: file_format(resolve_name(name), toml=True),
     "json-format": lambda name: file_format(resolve_name(name), toml=False),
-    "public-names": name_tables,
+    "public-names": lambda _: name_tables(NAMES),
 }
 
 
