@@ -61,6 +61,20 @@ type Place = float | TiltedPlane
 
 
 class _Pose(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One `[[plane]]`, with either a pose, or a point and a normal.
+
+    Parameters
+    ----------
+    name : str
+        Name in results and messages.
+    rt_ref_plane : 6 floats, optional
+        Rodrigues vector in rad, then translation in mm, from plane to reference.
+    point_mm, normal : 3 floats, optional
+        Point of the plane in the reference frame; direction normal to it.
+    size_mm : (float, float), optional
+        Width and height around the point or the origin; by default all that the reference view sees.
+    """
+
     name: str
     rt_ref_plane: _Pose6 | None = None
     point_mm: _Three | None = None
@@ -69,6 +83,16 @@ class _Pose(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class _Poses(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Planes at poses of their own.
+
+    Parameters
+    ----------
+    format : 1
+        Version of the format.
+    plane : list of _Pose
+        Planes to reconstruct.
+    """
+
     format: Literal[1]
     plane: list[_Pose]
 
