@@ -32,40 +32,70 @@ class CalibrationError(Exception):
 
 
 class LensNotInvertible(CalibrationError):
-    """The distortion folds the image onto itself within the detector."""
+    """The distortion folds the image onto itself within the detector.
+
+    Move boards into the corners of the image, or use a simpler `--lens`.
+    """
 
 
 class MissingMrcal(CalibrationError):
-    """mrcal, which solves for the geometry and reads camera models, is not installed."""
+    """mrcal, which solves for the geometry and reads camera models, is not installed.
+
+    The message gives the `pip install` command.
+    """
 
 
 class NotIdentifiable(CalibrationError):
-    """The measurements do not determine a quantity, and more of the same kind would not either."""
+    """The measurements do not determine a quantity, and more of the same kind would not either.
+
+    The message says what to add: flats, longer darks; boards, tilts, distances.
+    """
 
 
 class TooFewFrames(NotIdentifiable):
-    """Too few frames share the same conditions to separate noise from fixed pattern."""
+    """Too few frames share the same conditions to separate noise from fixed pattern.
+
+    Record two of each kind at least; ten are better.
+    """
 
 
 class BadFrame(CalibrationError):
-    """One frame differs from the others; the message names it."""
+    """One frame differs from the others; the message names it.
+
+    Look at it; leave it out or take it again.
+    """
 
 
 class CopiedFrame(BadFrame):
-    """Two frames are identical in every pixel, which noise rules out."""
+    """Two frames are identical in every pixel, which noise rules out.
+
+    The program saved one frame twice; take it again.
+    """
 
 
 class LightLeak(BadFrame):
-    """One dark frame is brighter than the others of its exposure."""
+    """One dark frame is brighter than the others of its exposure.
+
+    Cover lens and viewfinder, record again.
+    """
 
 
 class SaturatedFlat(BadFrame):
-    """All flats reach the end of the sensor's range, which clips their noise."""
+    """All flats reach the end of the sensor's range, which clips their noise.
+
+    Expose shorter, or dim the light.
+    """
 
 
 class PoorFit(CalibrationError):
-    """The measurements contradict the fitted model."""
+    """The measurements contradict the fitted model.
+
+    Check the lens cap, node numbers, flatness, and whether a board moved within a sweep; try `--lens opencv8`.
+    """
 
 
 class TooFewViews(CalibrationError):
-    """Too few images show a target to determine the camera."""
+    """Too few images show a target to determine the camera.
+
+    Compare `[[board]]` with the print; check exposure and view.
+    """

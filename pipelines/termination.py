@@ -12,7 +12,11 @@ if sys.platform != "win32":  # which tells a program nothing when its terminal i
 
 
 class Terminated(KeyboardInterrupt):
-    """A command was ended by a signal of this number."""
+    """A command was ended by a signal of this number.
+
+    The system or another program ended the command, or its terminal was closed; the stage was told to stop. The same
+    command resumes; let `nohup` or `tmux` run a capture whose terminal may be closed.
+    """
 
     def __init__(self, number: int) -> None:
         super().__init__(signal.Signals(number).name)

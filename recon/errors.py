@@ -33,12 +33,31 @@ class ReconstructionError(Exception):
 
 
 class GeometryMismatch(ReconstructionError):
-    """Poses, lens, images and plane do not fit together (the plane is behind the camera, for example)."""
+    """Poses, lens, images and plane do not fit together (the plane is behind the camera, for example).
+
+    Check that the depth is positive and in mm, the signs of the poses, and the set.
+
+    A message that names a range: `--depth-range-mm` lies where the views share nothing, or is too wide to be compared
+    in 128 depths. Give the range of the scene; its near end matters most.
+    """
 
 
 class NotConverged(ReconstructionError):
-    """An iteration left the range in which it is defined."""
+    """An iteration left the range in which it is defined.
+
+    The penalty weight is too large for these views: give a smaller `--penalty-weight`, or none.
+    """
 
 
 class NothingInFocus(ReconstructionError):
-    """The views agree at no depth on anything that stands out of the noise."""
+    """The views agree at no depth on anything that stands out of the noise.
+
+    Give a range by `--sweep-mm`, or by `--depth-range-mm` for a surface; use more light; check the poses.
+
+    A message that names shuffled views: the views agree no better than in random places (docs/depth.md), because of
+    noise, copies, different scenes, or a wrong order. Check order and places of the pictures; use more light; or make
+    planes at depths given by `--depth`.
+
+    A message that names an option of `import grid`: rows or columns run the other way, or are exchanged. Import again
+    with that option.
+    """

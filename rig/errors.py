@@ -32,6 +32,8 @@ class RigError(Exception):
 class StageError(RigError):
     """The stage did not obey a command.
 
+    The group of the failures below, each of which has its remedy.
+
     Attributes
     ----------
     position_kept : bool
@@ -50,49 +52,83 @@ class StageError(RigError):
 
 
 class StageAlarm(StageError):
-    """The controller has stopped and reported why."""
+    """The controller has stopped and reported why.
+
+    Read the number of the alarm: ALARM:1 is a switch or interference; 8 and 9 are homing: check wiring, `$23`, `$27`,
+    no Z axis; 10 is the emergency stop of grblHAL: release it. Then `faintfield stage home`.
+    """
 
 
 class StageTimeout(StageError):
-    """A wait has timed out: no answer, or a motion that does not end."""
+    """A wait has timed out: no answer, or a motion that does not end.
+
+    Check cable, power, `baud`, `protocol`, whether something is in the way, and whether Marlin waits for its button.
+    """
 
 
 class StageLost(StageError):
-    """The connection is lost, or the controller has restarted."""
+    """The connection is lost, or the controller has restarted.
+
+    The port is gone for longer than `reconnect_s`. Check USB cable, hub, supply, and other programs on the port; home
+    again.
+    """
 
 
 class StageRejected(StageError):
-    """The controller refused a command, and nothing moved."""
+    """The controller refused a command, and nothing moved.
+
+    The message says which command and why.
+    """
 
     position_kept = True
 
 
 class StageUnfit(StageError):
-    """The stage obeys, but not well enough for a capture."""
+    """The stage obeys, but not well enough for a capture.
+
+    `faintfield stage test` found a fault: correct what its table shows; for lost steps lower `$120` and `$121`.
+    """
 
     position_kept = True
 
 
 class PositionLost(StageError):
-    """The stage is not at its target."""
+    """The stage is not at its target.
+
+    Reported position and target differ. Look for an obstacle or a pulling cable; home.
+    """
 
 
 class PositionDrifted(PositionLost):
-    """Homing again showed lost steps: positions since the last passed check are suspect."""
+    """Homing again showed lost steps: positions since the last passed check are suspect.
+
+    Lower the acceleration, look for friction; let the capture take the doubtful frames again.
+    """
 
 
 class DriftUnknown(StageError):
-    """Homing could not be timed, as answers were delayed: nothing is known about lost steps."""
+    """Homing could not be timed, as answers were delayed: nothing is known about lost steps.
+
+    Nothing is known to be wrong with the stage. Let nothing else run on this computer; let the capture take the frames
+    again.
+    """
 
     position_kept = True
 
 
 class PlanRefused(RigError):
-    """A request is refused before anything moves."""
+    """A request is refused before anything moves.
+
+    rig.toml has impossible values, or differs from that of the session: the message names key and values. A session
+    that has begun keeps its plan; `faintfield check rig.toml --session SESSION` lists what may change
+    (docs/capture.md).
+    """
 
 
 class OutsideTravel(PlanRefused):
-    """A position, or the path to it, leaves the travel of the stage; nothing has moved.
+    """A position, or the path to it, leaves the travel of the stage.
+
+    Nothing moved. Correct `origin_mm`, `pitch_mm` or `[stage.travel_mm]`.
 
     Examples
     --------
@@ -110,63 +146,139 @@ class OutsideTravel(PlanRefused):
 
 
 class KeepOutCrossed(PlanRefused):
-    """A position, or the path to it, enters a keep-out box."""
+    """A position, or the path to it, enters a keep-out box.
+
+    Nothing moved. Correct `origin_mm`, `pitch_mm` or the keep-out boxes.
+    """
 
 
 class NotHomed(PlanRefused):
-    """The stage has not been homed since its position was lost."""
+    """The stage has not been homed since its position was lost.
+
+    Use `--home`, or answer yes to homing.
+    """
 
 
 class WrongFirmware(PlanRefused):
-    """The firmware, or one of its settings, cannot be used safely."""
+    """The firmware, or one of its settings, cannot be used safely.
+
+    Set the `$…` that the message names.
+    """
 
 
 class UnknownPlugin(PlanRefused):
-    """No driver of this name is built in or installed, or it does not have these settings."""
+    """No driver of this name is built in or installed, or it does not have these settings.
+
+    Choose a `backend` or `protocol` that the message lists, or install its package (docs/plugins.md).
+    """
 
 
 class PluginFailed(PlanRefused):
-    """A driver that another package brings cannot be imported or used."""
+    """A driver that another package brings cannot be imported or used.
+
+    The message gives the driver's own failure; install what it needs.
+    """
 
 
 class CameraError(RigError):
-    """The camera did not take the requested frame."""
+    """The camera did not take the requested frame.
+
+    The camera refused, or its file is no image. Check M mode, raw, card, battery; close the vendor's program and the
+    desktop's photo importer.
+
+    A message that names two times: the file in the watched folder was begun before the frame was asked for, when the
+    stage perhaps moved. Start no exposure by hand; state the shutter's true time (a nominal 13 s lasts 12.7 s).
+
+    Came without a request: the program that saves into the watched folder takes frames by itself, or was triggered
+    before the capture was "exposing". Set it to take one frame each time it is triggered; or state `delay_s`
+    (docs/capture.md).
+
+    A message that names two sizes: the camera's region, binning, image size or bit depth was changed. Set it as it was;
+    to go on with the new one, begin a new session. If the only frame so far is the odd one, take this one again: the
+    first is then taken again, too.
+
+    The folder is gone: a disk or a network folder is not mounted any more. Mount it, answer `again`.
+
+    A message that names a setting: the camera does not offer this name or value. Choose one of those that the message
+    lists.
+    """
 
 
 class CameraTimeout(CameraError):
-    """The camera did not answer, or no file arrived, in time."""
+    """The camera did not answer, or no file arrived, in time.
+
+    Set the camera's auto-off to never; raise `answer_s`, `arrival_s`.
+
+    A message that names a temperature: the sensor did not reach `settle_temperature_c`. Switch the cooler on, compare
+    its set point; raise `settle_limit_s`.
+    """
 
 
 class MissingExtra(CameraError):
-    """The package for this kind of camera or stage is not installed."""
+    """The package for this kind of camera or stage is not installed.
+
+    The message gives the `pip install` command.
+    """
 
 
 class LightError(RigError):
-    """A light was not switched, or is not in the state that it was switched to."""
+    """A light was not switched, or is not in the state that it was switched to.
+
+    A light reports another state than the step wants: something else switches it, or a relay is stuck. Look for its
+    switch, its cable; `faintfield check rig.toml` tries it.
+
+    A mean above or below a frame without light: a lamp has burnt out, the lens is covered, or another light is on. Look
+    at the lamps; `set_aside/` has the frame.
+    """
 
 
 class SessionError(RigError):
-    """The folder of the session cannot be used."""
+    """The folder of the session cannot be used.
+
+    The group of the failures below, each of which has its remedy.
+    """
 
 
 class SessionCorrupt(SessionError):
-    """Plan, journal and frames disagree, and nothing shows which is right."""
+    """Plan, journal and frames disagree, and nothing shows which is right.
+
+    Edit nothing; restore from a copy; `faintfield verify` lists the files. An interrupted exposure is no damage: run
+    `capture` again.
+
+    A message that names journal.sqlite-wal: version 0.2.0 sealed the session while another program read its journal.
+    Use `faintfield verify SESSION --repair` (docs/sessions.md).
+    """
 
 
 class SessionBusy(SessionError):
-    """Another capture uses the session."""
+    """Another capture uses the session.
+
+    Stop the other one.
+    """
 
 
 class SessionUnreadable(SessionError):
-    """A file or folder of the session exists and cannot be read; nothing is known to be wrong with it."""
+    """A file or folder of the session exists and cannot be read; nothing is known to be wrong with it.
+
+    Allow it to be read, check the disk; for an interrupted session on a write-protected medium, copy it first.
+    """
 
 
 class SessionUnwritable(SessionError):
-    """A frame or a journal entry could not be written; what was committed before is safe."""
+    """A frame or a journal entry could not be written; what was committed before is safe.
+
+    The disk is full or read-only. Make room; the same command resumes.
+
+    Cannot be sealed: all frames are there, but another program has the journal open. Close it in the program that the
+    message names; the same command seals the session.
+    """
 
 
 class CaptureStopped(RigError):
-    """The operator has stopped the capture; running it again resumes it."""
+    """The operator has stopped the capture; running it again resumes it.
+
+    Run the same command to resume.
+    """
 
 
 def in_one_line(failure: BaseException) -> str:

@@ -1,6 +1,7 @@
-"""Every named failure says what to do: its message has a remedy after a semicolon."""
+"""Every named failure says what to do: in its message after a semicolon, and in its docstring below the cause."""
 
 import ast
+import inspect
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -46,3 +47,13 @@ def test_messages_of_failures_end_with_a_remedy() -> None:
             what, _, remedy = text.rpartition("; ")
             assert what.strip(), place
             assert len(remedy.split()) >= 2, place
+
+
+def test_docstrings_of_failures_have_a_remedy() -> None:
+    failures = {kind for tree in _TREES for kind in vars(tree).values() if isinstance(kind, type)}
+    assert len(failures) > 60
+    for kind in failures.difference(faintfield.pipelines.errors.NAMED_FAILURES):
+        cause, _, remedy = inspect.cleandoc(kind.__doc__ or "").partition("\n\n")
+        assert cause.endswith("."), kind
+        assert len(remedy.partition("\n\n")[0].split()) >= 2, kind
+        assert not remedy.startswith("Attributes"), kind

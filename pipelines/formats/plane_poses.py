@@ -61,7 +61,19 @@ type Place = float | TiltedPlane
 
 
 class PlanePose(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A plane, by `rt_ref_plane` (Rodrigues rad and mm, from plane to reference) or by a point and its normal."""
+    """A plane, by `rt_ref_plane` or by a point and its normal.
+
+    Parameters
+    ----------
+    name : str
+        Name in results and messages.
+    rt_ref_plane : 6 floats, optional
+        Rodrigues vector in rad, then translation in mm, from plane to reference.
+    point_mm, normal : 3 floats, optional
+        Point of the plane in the reference frame; direction normal to it.
+    size_mm : (float, float), optional
+        Width and height around the point or the origin; by default all that the reference view sees.
+    """
 
     name: str
     rt_ref_plane: _Pose6 | None = None
@@ -71,7 +83,15 @@ class PlanePose(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PlanePoses(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """TOML file of `--plane-pose`: planes at any place and angle, in the reference frame."""
+    """TOML file of `--plane-pose`: planes at any place and angle, in the reference frame.
+
+    Parameters
+    ----------
+    format : 1
+        Version of the format.
+    plane : list of PlanePose
+        Planes to reconstruct.
+    """
 
     format: Literal[1]
     plane: list[PlanePose]

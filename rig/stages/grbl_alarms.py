@@ -12,7 +12,7 @@ LOCKED_ERRORS = (9, 45, 46, 50, 51, 79)
 _LOOK = "look for the cause, then recover and home it"
 
 # ALARM:N → meaning, remedy; those from 10 on are grblHAL's, and GRBL has another 10. Probes and spindles have others.
-_ALARMS = {
+ALARMS = {
     1: ("a limit switch was hit; the position is lost", _LOOK),
     2: ("a target was outside the soft limits; the position is kept", "recover it"),
     3: ("reset while moving; the position is lost", _LOOK),
@@ -38,7 +38,7 @@ _ALARMS = {
 _DAMAGED = "the command was damaged on its way: try again, with a shorter or shielded cable"
 
 # error:N → meaning, remedy
-_ERRORS = {
+ERRORS = {
     1: ("a letter was expected", _DAMAGED),
     2: ("bad number format", _DAMAGED),
     3: ("unknown $ command", "flash GRBL 1.1 or grblHAL"),
@@ -84,13 +84,13 @@ _STATES = {
 
 def alarm_failure(code: int) -> StageAlarm:
     """Return the exception for an alarm."""
-    meaning, remedy = _ALARMS.get(code, ("see the firmware's list of alarms", _LOOK))
+    meaning, remedy = ALARMS.get(code, ("see the firmware's list of alarms", _LOOK))
     return StageAlarm(f"ALARM:{code}: {meaning}; {remedy}", position_kept=code == SOFT_LIMIT_ALARM)
 
 
 def error_failure(command: str, code: int) -> StageRejected:
     """Return the exception for an error in answer to `command`."""
-    meaning, remedy = _ERRORS.get(code, ("unknown here", "look it up in the firmware's list of errors"))
+    meaning, remedy = ERRORS.get(code, ("unknown here", "look it up in the firmware's list of errors"))
     return StageRejected(f"the controller refused {command!r}: error:{code}, {meaning}; nothing moved by it; {remedy}")
 
 

@@ -116,7 +116,23 @@ class EmvaRecord(Struct, frozen=True):
 
 
 class NoiseFrame(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """One frame, as noise.toml and noise.json name it; a raw file's exposure may come from its EXIF instead."""
+    """One frame, as noise.toml and noise.json name it.
+
+    Parameters
+    ----------
+    file : str
+        Name of the image.
+    kind : {"dark", "flat"}
+        A dark has the lens covered, a flat is evenly lit.
+    exposure_s : float, optional
+        Exposure time; that of a raw file may come from its EXIF.
+    temperature_c : float, optional
+        Temperature of the sensor.
+    level : int
+        Index of the light level of a flat.
+    photons : float, optional
+        Mean photons per pixel and exposure, if measured by a radiometer.
+    """
 
     file: str
     kind: Literal["dark", "flat"]

@@ -40,7 +40,16 @@ class BoardEntry(BoardSettings, frozen=True, kw_only=True):
 class ImageEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One `[[image]]`; images of the same node and sweep are repeated frames, which are averaged.
 
-    `homing` counts the homings of the stage: frames before and after one may be shifted.
+    Parameters
+    ----------
+    file : str
+        Name of the image.
+    node : (int, int)
+        Row and column in the grid.
+    sweep : int
+        Number of the sweep, during which no board moves.
+    homing : int
+        Number of homings of the stage before; frames before and after one may be shifted.
     """
 
     file: str
@@ -50,7 +59,19 @@ class ImageEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class BoardSetFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """`charuco.toml`; `pitch_mm`, the commanded distance of nodes, is needed for the scale of the stage only."""
+    """`charuco.toml`.
+
+    Parameters
+    ----------
+    format : 1
+        Version of the format.
+    board : list of BoardEntry
+        Printed boards.
+    image : list of ImageEntry
+        Images of the boards.
+    pitch_mm : float, optional
+        Commanded distance of nodes, for the scale of the stage only.
+    """
 
     format: Literal[1]
     board: list[BoardEntry]

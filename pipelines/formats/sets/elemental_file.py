@@ -20,7 +20,21 @@ _ZERO_POSE = np.array([1e-6] * 3 + [1e-3] * 3)
 
 
 class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """The `[camera]` table. `mosaic` and `flat` extend the format for colour filters and vignetting."""
+    """The `[camera]` table: lens and detector of all views.
+
+    Parameters
+    ----------
+    size_px : (int, int)
+        Width and height of the detector.
+    fx_px, fy_px, cx_px, cy_px : float
+        Focal lengths and principal point; the centre of the first pixel is (0, 0).
+    distortion : tuple of float
+        k1, k2, p1, p2, k3, k4, k5, k6 in OpenCV's order; may be shorter.
+    mosaic : tuple of str, optional
+        Colour filters, row by row, such as ["RG", "GB"]; raw files state their own.
+    flat : str, optional
+        Image of the relative response of each pixel, a file in the folder.
+    """
 
     size_px: tuple[int, int]
     fx_px: float
@@ -43,9 +57,22 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defau
 
 
 class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """The `[noise]` table; a raw file's own masked pixels give the offset where it is not stated.
+    """The `[noise]` table: noise of the sensor. In its place may stand the name of a `noise.json`.
 
-    `estimated` says that nobody measured gain or read noise: an import estimated them from the views, or assumed them.
+    Parameters
+    ----------
+    gain_dn_per_e, read_noise_e : float
+        System gain; standard deviation of the read noise of a pixel.
+    offset_dn : float, optional
+        Dark level; by default that of the masked pixels of a raw file.
+    dark_current_e_per_s : float
+        Dark electrons of a pixel and second.
+    quantum_efficiency : float, optional
+        Electrons per photon; without it no result is given in photons.
+    saturation_dn : float, optional
+        Value from which a pixel is saturated; by default that of a raw file, and none for other images.
+    estimated : bool
+        Nobody measured gain or read noise: an import estimated them from the views, or assumed them.
     """
 
     gain_dn_per_e: float
@@ -58,9 +85,22 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
 
 
 class View(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """One `[[view]]`: an image and the pose it was taken from; `repeats` are further frames, added to the first.
+    """One `[[view]]`: an image and the pose it was taken from.
 
-    `homing` counts the homings of the stage; measured poses are shifted by what `faintfield geometry` found of them.
+    Parameters
+    ----------
+    image : str
+        File in the folder of the set.
+    rt_cam_ref : 6 floats
+        Rodrigues vector in rad, then translation in mm, from the reference to the camera; zero for the reference view.
+    node : (int, int), optional
+        Row and column in the grid.
+    cx_px, cy_px : float, optional
+        Principal point of this view, where it differs from that of the camera.
+    repeats : tuple of str
+        Further frames of the view, added to the first.
+    homing : int
+        Number of homings of the stage before; measured poses are shifted by what `faintfield geometry` found of each.
     """
 
     image: str
@@ -116,7 +156,21 @@ class Arrangement(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
 
 
 class ElementalSetFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """The whole of `elemental.toml`; `exposure_s` is that of all frames of a view together, None if it is not known."""
+    """The whole of `elemental.toml`.
+
+    Parameters
+    ----------
+    format : 1
+        Version of the format.
+    exposure_s : float, optional
+        Exposure of all frames of a view together; left out if it is not known.
+    reference_view : int
+        Number of the view whose camera is the reference frame, from 0.
+    units, arrangement, camera, view : Units, Arrangement, Camera, list of View
+        Their own tables.
+    noise : Noise or str
+        A table, or the name of a `noise.json` in the folder.
+    """
 
     format: Literal[1]
     exposure_s: float | None = None

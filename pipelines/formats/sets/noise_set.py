@@ -41,7 +41,13 @@ _NEAR_SCENE_K, _MAX_NAMED = 2.0, 3
 
 
 class Region(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The `[region]` table: pixels that see light and dark alike, as [first, end) of rows and columns."""
+    """The `[region]` table: pixels that see light and dark alike.
+
+    Parameters
+    ----------
+    rows, columns : (int, int)
+        First number and end, which is not part of it.
+    """
 
     rows: tuple[int, int]
     columns: tuple[int, int]
@@ -50,8 +56,20 @@ class Region(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class NoiseSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """`noise.toml`; what follows the frames states what the image files do not.
 
-    With `dark_current_doubling_k`, the kelvins over which dark current doubles, the dark current is that at the mean
-    temperature of the frames.
+    Parameters
+    ----------
+    format : 1
+        Version of the format.
+    frame : list of NoiseFrame
+        Dark and flat frames.
+    saturation_dn : float, optional
+        Value from which a pixel is saturated.
+    mosaic : tuple of str, optional
+        Colour filters, row by row, such as ["RG", "GB"].
+    region : Region, optional
+        Part of the image that is measured; all of it by default.
+    dark_current_doubling_k : float, optional
+        Kelvins over which dark current doubles; the dark current is then that at the mean temperature of the frames.
     """
 
     format: Literal[1]

@@ -1,0 +1,54 @@
+"""Sphinx directives for the pages of the reference, which are made from the code."""
+
+from collections.abc import Callable
+from pathlib import Path
+from pkgutil import resolve_name
+
+from command_pages import command_group, command_list
+from docstrings import PAGE_NAME
+from docutils import nodes
+from error_pages import error_table, grbl_table
+from format_pages import file_format
+from name_pages import name_tables, write_name_pages
+from sphinx.application import Sphinx
+from sphinx.util.docutils import SphinxDirective
+
+# Folder of the pages of public names, in the folder of the page that lists them.
+NAMES = "names"
+
+_MAKERS: dict[str, Callable[[str], str]] = {
+    "command-list": lambda _: command_list(),
+    "commands": command_group,
+    "errors": lambda name: error_table(resolve_name(name)),
+    "grbl-codes": grbl_table,
+    "toml-format": lambda name: file_format(resolve_name(name), toml=True),
+    "json-format": lambda name: file_format(resolve_name(name), toml=False),
+    "public-names": lambda _: name_tables(NAMES),
+}
+
+
+class MadeFromCode(SphinxDirective):
+    """A part of a page, in Markdown made from the code."""
+
+    optional_arguments = 1
+    final_argument_whitespace = True
+
+    def run(self) -> list[nodes.Node]:
+        """Parse the Markdown at this place."""
+        text = _MAKERS[self.name](" ".join(self.arguments))
+        content: list[nodes.Node] = self.parse_text_to_nodes(text, allow_section_headings=True)
+        return content
+
+
+def _link_pages(app: Sphinx, what: str, name: str, value: object, options: object, lines: list[str]) -> None:
+    """Link the pages that a docstring names."""
+    lines[:] = [PAGE_NAME.sub(r":doc:`\1 </\1>`", line) for line in lines]
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Add the directives, and write the pages of the public names."""
+    for name in _MAKERS:
+        app.add_directive(name, MadeFromCode)
+    app.connect("autodoc-process-docstring", _link_pages)
+    write_name_pages(Path(app.srcdir) / "reference" / NAMES)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,0 +1,62 @@
+"""Configuration of the documentation: `make docs` builds it into build/docs."""
+
+import sys
+from importlib.metadata import version as installed_version
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent / "_extensions"))
+
+project = "faintfield"
+author = "The faintfield developers"
+copyright = author
+version = release = installed_version("faintfield")
+
+extensions = [
+    "sphinx.ext.autodoc",
+    "numpydoc",
+    "myst_parser",
+    "sphinx_design",
+    "sphinx_gallery.gen_gallery",
+    "sphinx_codeautolink",
+    "reference_pages",
+    "repository_links",
+]
+exclude_patterns = ["gallery", "_extensions"]
+default_role = "code"
+smartquotes = False  # two hyphens are an option
+nitpicky = True
+
+autodoc_member_order = "bysource"
+autodoc_typehints_format = "short"
+python_maximum_signature_line_length = 88
+numpydoc_show_class_members = False
+# Types in signatures that are no public names have no page.
+nitpick_ignore_regex = [("py:class", r"(collections|numpy|pathlib|faintfield\.\w+)\..*|\w+\[.*")]
+suppress_warnings = ["codeautolink.match_name"]  # sphinx-gallery has linked the names of its examples already
+
+myst_enable_extensions = ["colon_fence", "deflist"]
+myst_heading_anchors = 4
+
+sphinx_gallery_conf = {
+    "examples_dirs": "gallery",
+    "gallery_dirs": "tutorials/gallery",
+    "download_all_examples": False,
+    "remove_config_comments": True,
+    "show_signature": False,
+    "write_computation_times": False,  # its page loads scripts from other hosts
+}
+
+html_theme = "pydata_sphinx_theme"
+html_title = "faintfield"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_show_sourcelink = False
+html_theme_options = {
+    "logo": {"text": "faintfield"},
+    "navbar_align": "left",
+    "show_prev_next": False,
+    "secondary_sidebar_items": ["page-toc"],
+    "footer_start": ["copyright"],
+    "footer_end": [],
+}
+html_sidebars = {"index": []}
