@@ -2,6 +2,7 @@
 
 import sys
 from importlib.metadata import version as installed_version
+from importlib.util import find_spec
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent / "_extensions"))
@@ -37,8 +38,13 @@ suppress_warnings = ["codeautolink.match_name"]  # sphinx-gallery has linked the
 myst_enable_extensions = ["colon_fence", "deflist"]
 myst_heading_anchors = 4
 
+# An example whose package is not installed, because it is large, is shown without its picture.
+_run = "plot_" if find_spec("deepinv") else "plot_(?!deepinv)"
+
 sphinx_gallery_conf = {
     "examples_dirs": "gallery",
+    "filename_pattern": _run,
+    "ignore_pattern": "dark_scene",
     "gallery_dirs": "tutorials/gallery",
     "download_all_examples": False,
     "remove_config_comments": True,
