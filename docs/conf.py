@@ -33,7 +33,8 @@ python_maximum_signature_line_length = 88
 numpydoc_show_class_members = False
 # Types in signatures that are no public names have no page.
 nitpick_ignore_regex = [("py:class", r"(collections|numpy|pathlib|faintfield\.\w+)\..*|\w+\[.*")]
-suppress_warnings = ["codeautolink.match_name"]  # sphinx-gallery has linked the names of its examples already
+# sphinx-gallery has linked the names of its examples already, and Sphinx removes the flags of doctests from others.
+suppress_warnings = ["codeautolink.match_name", "codeautolink.match_block"]
 
 myst_enable_extensions = ["colon_fence", "deflist"]
 myst_heading_anchors = 4

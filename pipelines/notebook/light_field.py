@@ -16,14 +16,16 @@ from faintfield.calib.noise_model import NoiseModel
 from faintfield.pipelines.arguments import Method, PriorName
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue, import_optional
+from faintfield.pipelines.formats.files import exclusive, remove
 from faintfield.pipelines.formats.frames import ChannelLayout
 from faintfield.pipelines.formats.results.plane_files import PlaneFiles
 from faintfield.pipelines.formats.results.records import FocusPoint, PlaneRecord
+from faintfield.pipelines.formats.results.surface import SURFACE_FILE
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, light_per_e
 from faintfield.pipelines.formats.units import Node, StatedUnits
 from faintfield.pipelines.notebook import plotting
 from faintfield.pipelines.notebook.array_set import set_of_arrays
-from faintfield.pipelines.notebook.results import Array, Plane, Planes
+from faintfield.pipelines.notebook.results import Array, Plane, Planes, Surface, surface_of_folder
 from faintfield.pipelines.reconstruction.channels import keeping_frames, load_channel
 from faintfield.pipelines.reconstruction.depth.autofocus import best_focus
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, requested_grid
@@ -32,6 +34,8 @@ from faintfield.pipelines.reconstruction.planes.custom import CustomOptions
 from faintfield.pipelines.reconstruction.planes.sweep import run_serially
 from faintfield.pipelines.reconstruction.request import resolve, select_planes
 from faintfield.pipelines.reconstruction.run import check_request, plan_sweep, warn_of
+from faintfield.pipelines.reconstruction.surface.reconstruct import reconstruct_surface
+from faintfield.pipelines.reconstruction.surface.request import SurfaceRequest
 from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.names import LikelihoodName, PenaltyName
 from faintfield.recon.operator.grid import PlaneGrid
@@ -316,6 +320,47 @@ class LightField:
         planes = [files.plane(self.units) for files in kept]
         warn_of(elemental_set, [record for plane in planes for record in plane.records])
         return Planes(tuple(plane.records for plane in planes), self.units, planes.__getitem__)
+
+    def surface(
+        self,
+        out: Path | str,
+        depth_range: tuple[float, float] | None = None,
+        *,
+        prior: PriorName | None = None,
+    ) -> Surface:
+        """Reconstruct one picture that is sharp everywhere, with the depth of each sample, into a folder of files.
+
+        Parameters
+        ----------
+        out : path
+            Folder of the result. A surface of the same files and options that it holds is kept.
+        depth_range : (float, float), optional
+            Nearest and farthest depth, in the unit of the set; by default found by comparing the views.
+        prior : str, optional
+            "tv", "patches", "learned" or "auto"; by default total variation, with detail added by a filter of patches.
+
+        Raises
+        ------
+        BadValue
+            There are too few or too small views, or the range is none.
+        NothingInFocus
+            The views tell no depths, or agree no better than shuffled ones.
+        OutputExists, OutputBusy
+            The folder holds a depth map, or another command is writing into it.
+        """
+        folder, in_px = Path(out), self.units.depth == "disparity_px"
+        ends = None
+        if depth_range is not None:
+            ends = min(depth_range), max(depth_range)
+            if not (ends[0] > 0 or in_px) or ends[0] == ends[1]:
+                raise BadValue(f"depth_range: got {depth_range}; give two different depths in front of the camera")
+        solver = _solver(PlaneOptions() if prior is None else PlaneOptions(prior=prior))
+        with exclusive(folder):
+            if self.elemental_set.in_memory:
+                remove(folder / SURFACE_FILE)  # nothing tells whether it was made of the same arrays
+            request = SurfaceRequest(ends, "px" if in_px and ends else "mm", solver)
+            reconstruct_surface(keeping_frames(self.elemental_set, folder), folder, request)
+            return surface_of_folder(folder)
 
     def plot(self, view: int | None = None, axes: Any = None) -> Any:
         """Draw one view in electrons, by default the reference view, and return the matplotlib axes."""

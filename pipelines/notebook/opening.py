@@ -1,21 +1,20 @@
 """Sessions, sets and results opened by their path."""
 
-from os import PathLike
 from pathlib import Path
 
 from faintfield.pipelines.arguments import SceneKind
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.results.records import RECONSTRUCTION_FILE
-from faintfield.pipelines.formats.results.surface import SURFACE_FILE, results_below, surfaces_below
+from faintfield.pipelines.formats.results.surface import results_below, surfaces_below
 from faintfield.pipelines.formats.sets.elemental_file import FILE_NAME
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.formats.sets.session_set import load_session
 from faintfield.pipelines.notebook.light_field import LightField
-from faintfield.pipelines.notebook.results import Planes, Surface, planes_of_folder
+from faintfield.pipelines.notebook.results import Planes, Surface, planes_of_folder, surface_of_folder
 from faintfield.rig.session.session import has_session
 
 
-def open_path(path: str | PathLike[str], *, scene: SceneKind = "dark_scene") -> LightField | Planes | Surface:
+def open_path(path: Path | str, *, scene: SceneKind = "dark_scene") -> LightField | Planes | Surface:
     """Open a session, an elemental set or a folder of results.
 
     Parameters
@@ -40,14 +39,13 @@ def open_path(path: str | PathLike[str], *, scene: SceneKind = "dark_scene") -> 
 
     Examples
     --------
-    >>> import faintfield
-    >>> light_field = faintfield.open("session")  # doctest: +SKIP
-    >>> light_field.plane(700).plot()  # doctest: +SKIP
-    >>> planes = faintfield.open("session/reconstructions")  # doctest: +SKIP
-    >>> faintfield.open("nowhere")
-    Traceback (most recent call last):
-        ...
-    faintfield.pipelines.errors.MissingFile: nowhere: no such folder; name a session, a set or a folder of results
+    >>> import faintfield, tempfile
+    >>> from pathlib import Path
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     options = faintfield.SyntheticOptions(rows=3, columns=3, size_px=(64, 48), snr=1.0)
+    ...     _ = faintfield.simulate(Path(folder) / "set", options=options)
+    ...     faintfield.open(Path(folder) / "set")
+    <light field of 9 views of 64 x 48 px, grey, poses stated, depths in mm>
     """
     folder = Path(path)
     if not folder.exists():
@@ -68,5 +66,4 @@ def open_path(path: str | PathLike[str], *, scene: SceneKind = "dark_scene") -> 
 def _open_result(folder: Path) -> Planes | Surface:
     if (folder / RECONSTRUCTION_FILE).is_file():
         return planes_of_folder(folder, results_below(folder)[folder])
-    assert (folder / SURFACE_FILE).is_file()
-    return Surface(folder, surfaces_below(folder)[folder])
+    return surface_of_folder(folder)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from faintfield.pipelines.errors import BadValue, import_optional
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.results.records import FocusCurve, PlaneRecord, ReconstructionRecord
-from faintfield.pipelines.formats.results.surface import SurfaceFileRecord
+from faintfield.pipelines.formats.results.surface import SurfaceFileRecord, surfaces_below
 from faintfield.pipelines.formats.units import StatedUnits, units_of
 from faintfield.pipelines.notebook import plotting
 
@@ -213,10 +213,15 @@ class Surface:
 
     Examples
     --------
-    >>> import faintfield
-    >>> surface = faintfield.open("planes/surface")  # doctest: +SKIP
-    >>> surface.sure.mean()  # share of the samples whose depth is sure  # doctest: +SKIP
-    0.62
+    >>> import faintfield, tempfile
+    >>> from pathlib import Path
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     options = faintfield.SyntheticOptions(rows=3, columns=3, size_px=(48, 36), snr=20.0, objects="surfaces")
+    ...     _ = faintfield.simulate(Path(folder) / "set", options=options)
+    ...     surface = faintfield.open(Path(folder) / "set").surface(Path(folder) / "surface", (400, 1500))
+    ...     depth = surface.depth
+    >>> depth.shape, surface.result.surface.unit
+    ((36, 48), 'mm')
     """
 
     folder: Path
@@ -281,6 +286,11 @@ def planes_of_folder(folder: Path, result: ReconstructionRecord) -> Planes:
         return Plane(_read(folder / first.file), of_plane, units, maps)
 
     return Planes(records, units, load, result)
+
+
+def surface_of_folder(folder: Path) -> Surface:
+    """Return the surface of a folder that `faintfield reconstruct --surface` wrote."""
+    return Surface(folder, surfaces_below(folder)[folder])
 
 
 def _read(path: Path) -> Array:

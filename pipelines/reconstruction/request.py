@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from msgspec import UNSET, UnsetType
 
@@ -38,9 +38,6 @@ _MIN_DEPTHS_OF_A_MAP = 5
 
 # Methods whose planes a prior can improve.
 _WITH_PRIOR: frozenset[Method] = frozenset({"pmlem", *JOINT_METHODS})
-
-# Names of the options of solvers that are recorded.
-_SOLVER_OPTIONS = [option.name for option in fields(SolverOptions)]
 
 # Units in which planes are asked for: mm, px of disparity, or that of the set.
 type _Unit = Literal["mm", "px", "own"]
@@ -79,7 +76,7 @@ class Request:
         return ReconstructionOptions(
             method=method,
             depth_mm=depths_mm,
-            **{name: getattr(solver, name) for name in _SOLVER_OPTIONS} | effective,
+            **recorded_options(solver) | effective,
             pitch_mm=self.pitch_mm,
             focus=self.with_focus,
             auto_sweep=self.auto_sweep if place is None else UNSET,
@@ -87,6 +84,11 @@ class Request:
             plane_pose={plane.name: [*plane.rt_ref_plane, *(plane.size_mm or ())] for plane in tilted},
             poses=poses,
         )
+
+
+def recorded_options(solver: SolverOptions) -> dict[str, Any]:
+    """Return the options of solvers that results record, without those that only Python knows."""
+    return {option.name: getattr(solver, option.name) for option in fields(SolverOptions)}
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from faintfield.pipelines.errors import WrongUsage
 from faintfield.pipelines.formats.results.surface import SurfaceOptions
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.options import Options
-from faintfield.pipelines.reconstruction.request import check_prior
+from faintfield.pipelines.reconstruction.request import check_prior, recorded_options
 
 # Folder of the surface among the results of a session.
 SURFACE_FOLDER = "surface"
@@ -50,7 +50,7 @@ class SurfaceRequest:
         return SurfaceOptions(
             depth_range_mm=self.range_mm(elemental_set),
             unit=self.unit,
-            **vars(self.solver) | effective,
+            **recorded_options(self.solver) | effective,
             poses=elemental_set.poses,
         )
 

@@ -267,3 +267,19 @@ def test_grid_is_that_of_plane(folder: Path) -> None:
         options = PlaneOptions(method="backprojection") | (PlaneOptions(pitch=pitch) if pitch else PlaneOptions())
         (record, *_), grid = light_field.plane(800.0, **options).records, light_field.grid(800.0, pitch)
         assert (record.shape, record.pitch_mm, record.origin_mm) == (grid.shape, grid.pitch_mm, grid.origin_mm)
+
+
+def test_surface_is_reconstructed_and_opened(tmp_path: Path) -> None:
+    light_field, _ = smooth_light_field(light_e=30.0, blur=1.5)
+    surface = light_field.surface(tmp_path / "surface", (300.0, 600.0))
+    assert np.median(surface.depth[surface.sure]) == pytest.approx(400.0, rel=0.03)
+    assert surface.sure.any()
+    assert len(surface.plot().axes) == 3
+    opened = faintfield.open(tmp_path)
+    assert isinstance(opened, faintfield.Surface)
+    assert np.array_equal(opened.picture, surface.picture)
+    with pytest.raises(BadValue, match="two different depths"):
+        light_field.surface(tmp_path / "other", (400.0, 400.0))
+    # Other arrays have another surface, also in the folder of the first
+    brighter, _ = smooth_light_field(light_e=60.0, blur=1.5)
+    assert brighter.surface(tmp_path / "surface", (300.0, 600.0)).picture.mean() > 1.5 * surface.picture.mean()
