@@ -12,9 +12,8 @@ from faintfield.calib.noise_model import NoiseModel
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.exchange.imported_set import relative
 from faintfield.pipelines.formats.frames import Frame
-from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSetFile, View
-from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
-from faintfield.pipelines.formats.units import sound_mosaic
+from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSetFile, View, check_settings
+from faintfield.pipelines.formats.sets.elemental_set import MAX_RESPONSE, ElementalSet
 
 # Stands for the folder of the set in messages, and for the file of its noise.
 _PLACE, _NOISE = Path("arrays"), "noise"
@@ -43,9 +42,13 @@ def set_of_arrays(
         )
     if exposure_s is None and np.any(noise.dark_current_e_per_s):
         raise BadValue("noise: a dark current means nothing without an exposure; give exposure_s in seconds")
-    if mosaic is not None and not sound_mosaic(mosaic, "RGB"):
-        raise BadValue(f'mosaic: got {list(mosaic)}; give rows of the letters R, G and B, such as ["RG", "GB"]')
-    reference = _reference(rt) if reference is None else range(len(stack))[reference]
+    if mosaic is not None and stack.ndim == 4:
+        raise BadValue("mosaic: images in colour have none; leave it out, or give raw images")
+    if nodes is not None and len(nodes) != len(stack):
+        raise BadValue(f"nodes: got {len(nodes)} for {len(stack)} views; give row and column of each")
+    if reference is not None and not 0 <= reference < len(stack):
+        raise BadValue(f"reference: got {reference} for {len(stack)} views; give 0 to {len(stack) - 1}")
+    reference = _reference(rt) if reference is None else reference
     views = [
         View(f"view {number}", _pose(relative(pose, rt[reference])), None if nodes is None else nodes[number])
         for number, pose in enumerate(rt)
@@ -55,6 +58,8 @@ def set_of_arrays(
     settings = ElementalSetFile(
         format=1, exposure_s=exposure_s, reference_view=reference, camera=camera, noise=_NOISE, view=views
     )
+    check_settings(_PLACE, settings)
+    _check_maps(noise, size_px)
     frames = {_PLACE / view.image: image for view, image in zip(views, stack, strict=True)}
     return ElementalSet(
         _PLACE,
@@ -78,6 +83,13 @@ def _check_images(images: NDArray[Any], lens: Lens) -> None:
         raise BadValue(f"images: got {images.dtype}; give whole or real numbers, in DN as the noise model counts")
 
 
+def _check_maps(noise: NoiseModel, size_px: tuple[int, int]) -> None:
+    for name in ("offset_dn", "gain_dn_per_e", "read_noise_e", "dark_current_e_per_s"):
+        shape = np.shape(getattr(noise, name))
+        if shape not in ((), size_px[::-1]):
+            raise BadValue(f"noise: {name} has shape {shape}; give one number, or a map of shape {size_px[::-1]}")
+
+
 def _reference(poses: NDArray[np.float64]) -> int:
     """Return the view whose pose is zero."""
     zero = np.flatnonzero((poses == 0).all(axis=1))
@@ -90,9 +102,9 @@ def _map(name: str, values: ArrayLike | None, size_px: tuple[int, int], dtype: A
     if values is None:
         return None
     array = np.asarray(values, dtype)
-    if array.shape != size_px[::-1] or not (np.isfinite(array) & (array >= 0)).all():
+    if array.shape != size_px[::-1] or not ((array >= 0) & (array <= MAX_RESPONSE)).all():
         raise BadValue(
-            f"{name}: got an array of shape {array.shape}; give finite numbers that are not negative, of shape "
+            f"{name}: got an array of shape {array.shape}; give numbers from 0 to {MAX_RESPONSE:g}, of shape "
             f"{size_px[::-1]}, for each pixel of the detector"
         )
     return array

@@ -1,12 +1,14 @@
 """A light field: the views of a scene with their poses, lens and noise, and the planes reconstructed from them."""
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
+from numbers import Integral, Real
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal, Self, TypedDict, Unpack, get_args
+from typing import Any, Literal, Self, TypedDict, Unpack, cast, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,7 +17,7 @@ from faintfield.calib.lens import Lens
 from faintfield.calib.noise_model import NoiseModel
 from faintfield.pipelines.arguments import Method, PriorName
 from faintfield.pipelines.console import inform
-from faintfield.pipelines.errors import BadValue, import_optional
+from faintfield.pipelines.errors import BadValue, WrongUsage, import_optional
 from faintfield.pipelines.formats.files import exclusive, remove
 from faintfield.pipelines.formats.frames import ChannelLayout
 from faintfield.pipelines.formats.results.plane_files import PlaneFiles
@@ -26,13 +28,13 @@ from faintfield.pipelines.formats.units import Node, StatedUnits
 from faintfield.pipelines.notebook import plotting
 from faintfield.pipelines.notebook.array_set import set_of_arrays
 from faintfield.pipelines.notebook.results import Array, Plane, Planes, Surface, surface_of_folder
-from faintfield.pipelines.reconstruction.channels import keeping_frames, load_channel
+from faintfield.pipelines.reconstruction.channels import keeping_frames, load_channel, view_electrons
 from faintfield.pipelines.reconstruction.depth.autofocus import best_focus
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, requested_grid
 from faintfield.pipelines.reconstruction.options import Options
 from faintfield.pipelines.reconstruction.planes.custom import CustomOptions
 from faintfield.pipelines.reconstruction.planes.sweep import run_serially
-from faintfield.pipelines.reconstruction.request import resolve, select_planes
+from faintfield.pipelines.reconstruction.request import WITH_PRIOR, Request, resolve, select_planes
 from faintfield.pipelines.reconstruction.run import check_request, plan_sweep, warn_of
 from faintfield.pipelines.reconstruction.surface.reconstruct import reconstruct_surface
 from faintfield.pipelines.reconstruction.surface.request import SurfaceRequest
@@ -42,6 +44,7 @@ from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.single_plane import PlaneOperator
 from faintfield.recon.prior.denoiser import Denoiser
 from faintfield.recon.solver.custom_penalty import ProximalPenalty
+from faintfield.recon.threads import map_in_threads
 
 # Words that options can be, and least numbers.
 _WORDS: dict[str, tuple[str, ...]] = {
@@ -227,29 +230,46 @@ class LightField:
 
         Read at the first use and kept; `data` has one colour as solvers take it.
         """
+        layouts = self.elemental_set.layouts
+        width, height = self.lens.size_px
+        colours = () if layouts[0].plane_of_colour is None else (len(layouts),)
+        images = np.empty((len(self.poses), height, width, *colours), np.float32)
+
+        def load(view: int) -> None:
+            images[view] = self.view_e(view)
+
+        map_in_threads(load, range(len(images)))
+        return images
+
+    def view_e(self, view: int) -> Array:
+        """Return one view in electrons (row, column[, colour]), as in `images_e`."""
         elemental_set, layouts = self.elemental_set, self.elemental_set.layouts
         width, height = self.lens.size_px
         colours = () if layouts[0].plane_of_colour is None else (len(layouts),)
-        images = np.full((len(self.poses), height, width, *colours), np.nan, np.float32)
+        image = np.full((height, width, *colours), np.nan, np.float32)
         for layout in layouts:
-            data = load_channel(elemental_set, layout)
-            electrons = data.electrons if data.valid is None else np.where(data.valid, data.electrons, np.nan)
-            phases = len(layout.lattices)
-            for phase, lattice in enumerate(layout.lattices):
-                for view, image in enumerate(images):
-                    lattice.of(layout.of(image))[:] = electrons[view * phases + phase]
-        return images
+            parts = view_electrons(elemental_set, layout, elemental_set.frame_paths[view])
+            for lattice, (electrons, over) in zip(layout.lattices, parts, strict=True):
+                electrons[over] = np.nan
+                lattice.of(layout.of(image))[:] = electrons
+        return image
 
     def data(self, channel: str | None = None) -> ElementalImages:
         """Return one colour of all views in electrons, with background and read variance; the last one is kept."""
         layout = self._layout(channel)
-        if layout.name not in self._data:
+        data = self._data.get(layout.name)
+        if data is None:
             self._data.clear()
-            self._data[layout.name] = load_channel(self.elemental_set, layout)
-        return self._data[layout.name]
+            data = self._data[layout.name] = load_channel(self.elemental_set, layout)
+        return data
 
     def grid(self, depth: float, pitch: float | None = None) -> PlaneGrid:
-        """Return the samples of a plane at a depth, one per pixel of the reference view by default."""
+        """Return the samples of a plane at a depth, one per pixel of the reference view by default.
+
+        Its lengths are those of the poses, in mm where these are.
+        """
+        if pitch is not None and self.units.depth == "disparity_px":
+            raise BadValue(f"pitch: got {pitch}, and the set knows disparities, no lengths; leave it out")
         return requested_grid(self.elemental_set, self._depth_mm(depth), pitch)
 
     def operator(self, depth: float, channel: str | None = None, pitch: float | None = None) -> PlaneOperator:
@@ -290,8 +310,10 @@ class LightField:
 
         Raises
         ------
-        BadValue, WrongUsage
-            Options contradict one another.
+        BadValue
+            Options are impossible, or contradict one another.
+        ValueError
+            A penalty or prior of one's own returned something else than samples.
         GeometryMismatch
             No two views see the same part of a plane.
         NothingInFocus
@@ -299,15 +321,11 @@ class LightField:
         NotConverged
             The penalty weight is too large.
         """
-        _check_options(options)
+        options = _checked(options)
         method, progress = options.get("method", "pmlem"), options.get("progress")
         with _scratch() as folder:
             elemental_set = keeping_frames(self.elemental_set, folder)
-            asked: list[float | Literal["auto"]] = ["auto"] if isinstance(depths, str) else [float(d) for d in depths]
-            selection = select_planes(
-                Options(depth=asked, method=[method], solver=_solver(options), pitch_mm=options.get("pitch"))
-            )
-            request = resolve(selection, elemental_set, folder)
+            request = self._request(depths, options, folder)
             check_request(elemental_set, [], request)
             sweep = plan_sweep(elemental_set, {method: folder}, request, KeptPlane)
             tasks = sweep.tasks()
@@ -365,7 +383,7 @@ class LightField:
     def plot(self, view: int | None = None, axes: Any = None) -> Any:
         """Draw one view in electrons, by default the reference view, and return the matplotlib axes."""
         view = self.reference if view is None else view
-        light = self.images_e[view] * np.float32(light_per_e(self.elemental_set))
+        light = self.view_e(view) * np.float32(light_per_e(self.elemental_set))
         return plotting.draw_light(axes, light, self.units, title=f"view {view}")
 
     def to_xarray(self) -> Any:
@@ -378,6 +396,25 @@ class LightField:
             "poses": (("view", "rt_cam_ref"), self.poses, {"units": "rad, mm"}),
         }
         return xarray.Dataset(arrays, {"node_row": ("view", rows), "node_column": ("view", columns)})
+
+    def _request(
+        self, depths: Sequence[float] | NDArray[Any] | Literal["auto"], options: PlaneOptions, folder: Path
+    ) -> Request:
+        """Return the planes to make, with options as commands take them; `folder` is for temporary files."""
+        if isinstance(depths, str) and depths != "auto":
+            raise BadValue(f"depths: got {depths!r}; give numbers, or 'auto'")
+        if not len(depths):
+            raise BadValue("depths: none is given; give some, or 'auto'")
+        asked: list[float | Literal["auto"]] = ["auto"] if isinstance(depths, str) else [float(d) for d in depths]
+        method = options.get("method", "pmlem")
+        try:
+            selection = select_planes(
+                Options(depth=asked, method=[method], solver=_solver(options), pitch_mm=options.get("pitch"))
+            )
+            return resolve(selection, self.elemental_set, folder)
+        except WrongUsage as failure:  # which names options of commands
+            text = re.sub(r"--([a-z-]+)", lambda option: option[1].replace("-", "_"), str(failure))
+            raise BadValue(text) from failure
 
     @cached_property
     def _data(self) -> dict[str, ElementalImages]:
@@ -480,8 +517,9 @@ def reconstruct(
     return light_field.planes(depths, **options)
 
 
-def _check_options(options: PlaneOptions) -> None:
-    """Refuse options that there are not (TypeError), and impossible values (BadValue)."""
+def _checked(options: PlaneOptions) -> PlaneOptions:
+    """Return the options that are given; refuse unknown ones (TypeError), and impossible values (BadValue)."""
+    options = cast(PlaneOptions, {name: value for name, value in options.items() if value is not None})
     if unknown := sorted(options.keys() - PlaneOptions.__optional_keys__):
         known = ", ".join(sorted(PlaneOptions.__optional_keys__))
         raise TypeError(f"{unknown[0]}: is no option of planes; they are {known}")
@@ -490,13 +528,22 @@ def _check_options(options: PlaneOptions) -> None:
         if isinstance(value := values.get(name, words[0]), str) and value not in words:
             raise BadValue(f"{name}: got {value!r}; give one of {', '.join(words)}")
     for name, least in _LEAST.items():
-        value = values.get(name, "auto")
-        if value != "auto" and not least <= value < np.inf:
-            raise BadValue(f"{name}: got {value}; give a number of at least {least:g}")
+        value = values.get(name, least)
+        if not (name == "penalty_weight" and value == "auto") and not _is_number(value, least, whole=name == "passes"):
+            kind = "whole number" if name == "passes" else "number"
+            raise BadValue(f"{name}: got {value!r}; give a {kind} of at least {least:g}")
     if not isinstance(penalty := values.get("penalty", "tv"), str) and not {"value", "prox"} <= {*dir(penalty)}:
         raise BadValue(f"penalty: a {type(penalty).__name__} has no `value` and `prox`; see faintfield.ProximalPenalty")
-    if not isinstance(prior := values.get("prior") or "tv", str) and not callable(prior):
+    if not isinstance(prior := values.get("prior", "tv"), str) and not callable(prior):
         raise BadValue(f"prior: a {type(prior).__name__} cannot be called; see faintfield.Denoiser")
+    own = [name for name in ("penalty", "prior") if not isinstance(values.get(name, ""), str)]
+    if own and values.get("method", "pmlem") not in WITH_PRIOR:
+        raise BadValue(f"{own[0]}: one of your own is for {', '.join(sorted(WITH_PRIOR))}, got {values['method']}")
+    return options
+
+
+def _is_number(value: object, least: float, *, whole: bool) -> bool:
+    return isinstance(value, Integral if whole else Real) and least <= float(value) < np.inf
 
 
 def _solver(options: PlaneOptions) -> CustomOptions:

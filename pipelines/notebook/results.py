@@ -100,7 +100,7 @@ class Plane:
 
 @dataclass(frozen=True, eq=False)
 class Planes(Sequence[Plane]):
-    """A sequence of planes of one method in the order of their depths, read from files when they are asked for.
+    """A sequence of planes of one method in the order of their depths; those in files are read when asked for.
 
     Parameters
     ----------
@@ -148,6 +148,8 @@ class Planes(Sequence[Plane]):
         return len(self.records)
 
     def __repr__(self) -> str:
+        if not self.records:
+            return "<no planes>"
         first = self.records[0][0]
         rows, columns = first.shape
         depths = self.units.depths_text([self.depths[0], self.depths[-1]][: len(self)], " to ")
@@ -164,8 +166,8 @@ class Planes(Sequence[Plane]):
         shapes = sorted({records[0].shape for records in self.records})
         if len(shapes) > 1:
             raise BadValue(
-                f"planes have {shapes[0]} to {shapes[-1]} samples, and a stack needs equal shapes; "
-                "reconstruct them without a pitch"
+                f"planes have {shapes[0]} to {shapes[-1]} samples, and an array needs equal shapes; take one plane "
+                "after the other, or reconstruct them without a pitch"
             )
         return np.stack([plane.image for plane in self])
 

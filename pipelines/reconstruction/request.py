@@ -37,7 +37,7 @@ DEFAULT_METHOD: Method = "pmlem"
 _MIN_DEPTHS_OF_A_MAP = 5
 
 # Methods whose planes a prior can improve.
-_WITH_PRIOR: frozenset[Method] = frozenset({"pmlem", *JOINT_METHODS})
+WITH_PRIOR: frozenset[Method] = frozenset({"pmlem", *JOINT_METHODS})
 
 # Units in which planes are asked for: mm, px of disparity, or that of the set.
 type _Unit = Literal["mm", "px", "own"]
@@ -65,7 +65,7 @@ class Request:
 
     def options(self, method: Method, poses: Poses, place: Place | None = None) -> ReconstructionOptions:
         """Return the options that the results of a method record, or those that one plane of it depends on."""
-        solver, improves = self.solver, method in _WITH_PRIOR
+        solver, improves = self.solver, method in WITH_PRIOR
         depths_mm, tilted = self.depths_mm, self.tilted
         if place is not None and method not in JOINT_METHODS:
             depths_mm, tilted = ([], [place]) if isinstance(place, TiltedPlane) else ([place], [])
@@ -164,7 +164,7 @@ def _methods(options: Options) -> list[Method]:
 
 def _default_prior(selection: Selection) -> PriorName:
     options, solver = selection.options, selection.options.solver
-    helps = solver.penalty == "tv" and solver.penalty_weight != 0 and bool(_WITH_PRIOR & set(selection.methods))
+    helps = solver.penalty == "tv" and solver.penalty_weight != 0 and bool(WITH_PRIOR & set(selection.methods))
     sweeps = bool(options.sweep or options.sweep_mm or options.sweep_px) and not selection.auto
     return "auto" if helps and not sweeps else "tv"
 
@@ -176,7 +176,7 @@ def check_prior(methods: list[Method], solver: SolverOptions) -> None:
             raise WrongUsage("--proposal saves what a prior proposes, and tv proposes nothing; give --prior auto")
         return
     option = f"--prior {solver.prior}"
-    if not _WITH_PRIOR & set(methods):
+    if not WITH_PRIOR & set(methods):
         raise WrongUsage(f"{option} is for pmlem, joint and occlusion, not for {' and '.join(methods)}; leave it out")
     if solver.penalty_weight == 0:
         raise WrongUsage(f"{option} has no effect with --penalty-weight 0; leave one out")
@@ -212,7 +212,7 @@ def _check_methods(selection: Selection) -> None:
         )
     if solver.likelihood == "least-squares" and {"mlem", "pmlem-osl"} & set(methods):
         raise WrongUsage("least squares has ratios below zero, which mlem and pmlem-osl cannot take; use pmlem")
-    if (solver.uncertainty or solver.penalty != "tv") and not _WITH_PRIOR & set(methods):
+    if (solver.uncertainty or solver.penalty != "tv") and not WITH_PRIOR & set(methods):
         option = "--uncertainty" if solver.uncertainty else f"--penalty {solver.penalty}"
         raise WrongUsage(f"{option} is for pmlem, joint and occlusion, not for {' and '.join(methods)}; leave it out")
 

@@ -95,7 +95,8 @@ def reconstruct_set(elemental_set: ElementalSet, out: Path, request: Request, ru
     if depth_map is not None:
         for folder in folders.values():
             write_depth_errors(elemental_set, folder, depth_map.file, depth_map.unit)
-    metrics = assess(elemental_set, sweep.written, sweep.records)
+    # The truth has the default samples
+    metrics = None if request.pitch_mm else assess(elemental_set, sweep.written, sweep.records)
     remove(out / METRICS_FILE)  # of earlier planes
     if metrics:
         write_record(out / METRICS_FILE, metrics)
@@ -242,6 +243,9 @@ def warn_of(elemental_set: ElementalSet, records: list[PlaneRecord]) -> None:
             f"pmlem stopped before its certificate on {len(missed)} of {len(bounds)} planes: up to {max(missed):.1%} "
             f"from the optimum instead of {bounds[0].tolerance:.0%}; allow more --passes"
         )
+    early = [certificate for certificate in certificates if certificate.settled is False and certificate.tolerance]
+    if early:
+        inform(f"pmlem stopped early on {len(early)} of {len(certificates)} planes; allow more passes")
     whys = [(record, record.prior.left_out) for record in records if record.prior and record.prior.left_out]
     if whys:
         without = _planes([record for record, _ in whys])

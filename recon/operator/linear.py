@@ -21,6 +21,8 @@ class FlatOperator(LinearOperator):
 
     def __init__(self, operator: SceneOperator, views: ViewSelection = None) -> None:
         self._operator, self._views = operator, None if views is None else operator.all_views[np.asarray(views)]
+        if self._views is not None and len(np.unique(self._views)) < len(self._views):
+            raise ValueError(f"views {self._views.tolist()}: each must be there once")
         count = operator.images_shape[0] if self._views is None else len(self._views)
         self.dims, self.dimsd = operator.samples_shape, (count, *operator.images_shape[1:])
         initialize: Any = super().__init__  # scipy's stubs do not declare the constructor for subclasses

@@ -16,7 +16,8 @@ _NAME = "denoiser"
 class Denoiser(Protocol):
     """A function that removes noise from a picture: a prior of one's own.
 
-    Held-out views decide how much of its result is believed, and where the views contradict it, they win.
+    Held-out views decide how much of its result is believed, and where the views contradict it, they win. Several
+    threads may call it at a time, for parts of a large plane.
 
     Examples
     --------

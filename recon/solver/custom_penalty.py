@@ -15,7 +15,8 @@ from faintfield.recon.threads import elementwise
 class ProximalPenalty(Protocol):
     """A convex penalty R(f) ≥ 0 on a plane, by its value and its proximal operator.
 
-    Any object with these two methods can be given where a penalty is asked for.
+    Any object with these two methods can be given where a penalty is asked for. Several threads may call them at a
+    time, for parts of a large plane.
 
     Examples
     --------
@@ -41,7 +42,7 @@ class ProximalPenalty(Protocol):
 
 @dataclass
 class ProximalField(DualField):
-    """What PMLEM minimises in each pass with a penalty of one's own, in the place of a dual field.
+    """The inner problem of PMLEM with a penalty of one's own, in the place of a dual field.
 
     It has no dual vectors and proves no distance to the optimum: that the curvature of the likelihood is at least half
     its metric, on which the proof stands, holds only for planes that a penalty makes smooth.
@@ -90,10 +91,10 @@ class ProximalField(DualField):
         minimum = np.empty_like(point)
         for v, w, x in self._planes(point, metric, minimum):
             part = np.asarray(self.penalty.prox(v, w, weight))
-            if part.shape != v.shape or not (part >= 0).all():
+            if part.shape != v.shape or not ((part >= 0) & (part < np.inf)).all():
                 raise ValueError(
                     f"{type(self.penalty).__name__}.prox returned an array of shape {part.shape} with a least value of "
-                    f"{part.min(initial=0.0):g}; it must return samples of shape {v.shape}, none negative or NaN"
+                    f"{part.min(initial=0.0):g}; it must return finite samples of shape {v.shape}, none negative"
                 )
             x[:] = part
         return minimum

@@ -31,6 +31,9 @@ _INNER_NEAR_PROPOSAL = 0.9
 # A certificate's distance that falls less than to this share of the last is slow.
 _SLOW = 0.8
 
+# Largest ratio of a step to the last one that is believed, where no bound is known: it is noisy where both are short.
+_LEAST_SHRINKING = 0.99
+
 # Relative rise of the objective that rounding may cause; a step with a larger rise is undone.
 _ROUNDING = 1e-7
 
@@ -59,19 +62,19 @@ class Certificate:
     distance, stationarity, slack : float
         The bound, zero only at the optimum, and its parts a/‖f‖ and √(2e)/‖f‖. With a penalty of one's own there is no
         bound, NaN, and a is the length of the next step.
+    expected : float
+        The distance to expect where there is no bound: a/(1 − r)‖f‖, if steps go on to shrink by the ratio r of the
+        last two. NaN with a bound.
     """
 
     distance: float
     stationarity: float
     slack: float
+    expected: float = np.nan
 
     def within(self, tolerance: float) -> bool:
-        """Return whether the distance is within a tolerance.
-
-        Without a bound, three times the next step takes its place: the distance is no longer if the curvature is at
-        least half the metric.
-        """
-        return (3 * self.stationarity if np.isnan(self.distance) else self.distance) <= tolerance
+        """Return whether the distance, or without a bound the one to expect, is within a tolerance."""
+        return (self.expected if np.isnan(self.distance) else self.distance) <= tolerance
 
 
 @dataclass(frozen=True)
@@ -177,7 +180,7 @@ def pmlem(
         raise ValueError(f"need penalty_weight >= 0, got {penalty_weight}")
     if not (start > 0).all():
         raise ValueError(f"start must be positive everywhere, its smallest value is {start.min()}")
-    penalty = penalty or Penalty()
+    penalty = Penalty() if penalty is None else penalty
     dual = dual or DualField.zero([(start.shape[0], start.shape[1])], start.dtype)
     if not isinstance(penalty, Penalty):
         dual, penalty = ProximalField.of(penalty, dual), Penalty()  # the field has the penalty
@@ -199,6 +202,7 @@ class _Pmlem:
         self._fit, self._weight, self._penalty, self._tolerance = fit, weight, penalty, tolerance
         self._scale, self._inner_of_tolerance = 1.0, _INNER_OF_TOLERANCE
         self._inner_steps = 0
+        self._last_step = np.inf
 
     def iterates(self, plane: Image, dual: DualField) -> Iterator[PmlemIterate]:
         """Iterate without end; arrays as large as the plane are dropped before the next of their kind is made."""
@@ -265,8 +269,12 @@ class _Pmlem:
         square, excess = dual.distance_from_primal(plane, point, metric, self._weight)
         residual, size = float(np.sqrt(2 * square)), norm(plane, metric)
         slack = self._weight * dual.penalty_and_slack(plane, self._penalty)[1] + excess
-        bound = residual + np.sqrt(residual**2 + 2 * slack) if dual.certifies else np.nan
-        parts = (bound, residual, np.sqrt(2 * slack))
+        bound, expected = residual + np.sqrt(residual**2 + 2 * slack), np.nan
+        if not dual.certifies:
+            shrinks = min(residual / self._last_step, _LEAST_SHRINKING) if self._last_step > 0 else 0.0
+            bound, expected = np.nan, residual / (1 - shrinks) if np.isfinite(self._last_step) else np.inf
+            self._last_step = residual
+        parts = (bound, residual, np.sqrt(2 * slack), expected)
         return Certificate(*(_relative(part, size) for part in parts))
 
 

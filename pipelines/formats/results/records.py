@@ -61,6 +61,7 @@ class Certificate(Struct, frozen=True, kw_only=True):
 
     PMLEM to its optimum: `value` bounds the relative distance to the optimum (`stationarity` and `slack` are its
     parts), and `reached` says whether it is below `tolerance`. One-step-late: `relative_change` of the last pass.
+    With a penalty of one's own: `relative_change` still to expect, and whether it has `settled` below the tolerance.
     """
 
     kind: str = ""

@@ -186,12 +186,17 @@ def read_set_file(path: Path) -> ElementalSetFile:
     """Read and check `elemental.toml`, and that the files it names are there."""
     remedy = f"name a session, or a folder with {FILE_NAME}; `faintfield import` makes one"
     settings = read_toml(path, ElementalSetFile, remedy=remedy)
-    _check_numbers(path, settings)
-    _check_views(path, settings)
+    check_settings(path, settings)
     for name in named_files(settings):
         if not is_file(inside(path.parent, name, f"{path}: file")):
             raise MissingFile(f"{path}: {name} is named but missing in {path.parent}; put it there or remove its entry")
     return settings
+
+
+def check_settings(path: Path, settings: ElementalSetFile) -> None:
+    """Refuse impossible exposures, mosaics, poses and views (BadValue); the path stands in the message."""
+    _check_numbers(path, settings)
+    _check_views(path, settings)
 
 
 def write_set(folder: Path, settings: ElementalSetFile) -> None:

@@ -40,7 +40,7 @@ NOISE_REFERENCE = "noise_reference.tiff"
 _UNIT_KEYS = frozenset({"unit", "depth_map"})
 
 # Largest relative response of a pixel.
-_MAX_RESPONSE = 1e6
+MAX_RESPONSE = 1e6
 
 
 @dataclass(frozen=True)
@@ -319,9 +319,9 @@ def _noise(folder: Path, settings: ElementalSetFile) -> FittedNoise:
 
 def _read_flat(path: Path, size_px: tuple[int, int]) -> NDArray[np.float32]:
     flat = read_frame(path, size_px).pixels_dn
-    if flat.ndim != 2 or not np.isfinite(flat).all() or (flat < 0).any() or (flat > _MAX_RESPONSE).any():
+    if flat.ndim != 2 or not np.isfinite(flat).all() or (flat < 0).any() or (flat > MAX_RESPONSE).any():
         raise BadValue(
-            f"{path}: a flat field is grey, finite, not negative, and at most {_MAX_RESPONSE:g}; got an array of shape "
+            f"{path}: a flat field is grey, finite, not negative, and at most {MAX_RESPONSE:g}; got an array of shape "
             f"{flat.shape} from {flat.min():g} to {flat.max():g}; divide it by its mean"
         )
     return np.asarray(flat, np.float32)

@@ -44,7 +44,9 @@ _PMLEM_CERTIFICATE = (
     "bound on the relative distance to the optimum, from its optimality conditions in the metric of the data; "
     "see docs/physics.md"
 )
-_CUSTOM_CERTIFICATE = "relative length of the next step; with a penalty of one's own, nothing bounds the distance"
+_CUSTOM_CERTIFICATE = (
+    "relative distance to expect from the lengths of the last two steps; with a penalty of one's own, nothing bounds it"
+)
 
 
 @dataclass(frozen=True)
@@ -105,7 +107,7 @@ class Objective:
             return float(1 / np.sqrt(np.median(posed.fit(level_e).metric(start)[posed.well_seen()])))
 
         custom = options.custom_penalty if isinstance(options, CustomOptions) else None
-        penalty = custom or Penalty.for_noise(options.penalty, noise_e)
+        penalty = Penalty.for_noise(options.penalty, noise_e) if custom is None else custom
         return cls(posed, penalty, start, level_e, options, other_colours)
 
     def positive(self, samples: Image) -> Image:
@@ -149,7 +151,7 @@ def with_sigma(
     `responses` are those of each plane, as for `standard_deviation`; of likelihood and penalty by default.
     """
     operator, weight, penalty = objective.posed.operator, solutions[0].record.penalty_weight or 0.0, objective.penalty
-    assert isinstance(penalty, Penalty), "nobody knows the errors under a penalty of one's own"
+    assert isinstance(penalty, Penalty), "the errors under a penalty of one's own are not known"
     samples = operator.samples_of([solution.plane for solution in solutions])
     generator = np.random.default_rng(_SEED)
     fits = local_fits(operator, objective.posed.fit(objective.level_e), samples)
@@ -191,8 +193,13 @@ def certified(
 
 def _certificate(iterate: PmlemIterate, penalty: Penalty | ProximalPenalty, tolerance: float) -> Certificate:
     if not isinstance(penalty, Penalty):
-        change, settled = float(iterate.certificate.stationarity), iterate.certificate.within(tolerance)
-        return Certificate(kind=_CUSTOM_CERTIFICATE, relative_change=change, settled=bool(settled))
+        return Certificate(
+            kind=_CUSTOM_CERTIFICATE,
+            tolerance=tolerance,
+            passes=iterate.passes,
+            relative_change=float(iterate.certificate.expected),
+            settled=bool(iterate.certificate.within(tolerance)),
+        )
     return Certificate(
         kind=_PMLEM_CERTIFICATE,
         value=float(iterate.certificate.distance),
@@ -219,7 +226,7 @@ def solve_then_sigma(objective: Objective) -> tuple[Solution, Callable[[], Image
     (solution,) = solve_pmlem(objective)
     (local,) = local_fits(objective.posed.operator, objective.posed.fit(objective.level_e), solution.plane)
     weight, generator, penalty = solution.record.penalty_weight or 0.0, np.random.default_rng(_SEED), objective.penalty
-    assert isinstance(penalty, Penalty), "nobody knows the errors under a penalty of one's own"
+    assert isinstance(penalty, Penalty), "the errors under a penalty of one's own are not known"
     return solution, partial(standard_deviation, local, weight, penalty, generator)
 
 
@@ -243,8 +250,10 @@ def _choose_weight(objective: Objective) -> tuple[float, Image, DualField, dict[
         chosen = "from the noise level: too few views to hold some out"
         return guess, start, posed.dual(), {"penalty_weight_chosen": chosen}
     found = cross_validated_weight(posed, guess, objective.penalty, objective.level_e)
+    tried = found.candidates
+    best_is_last = min(tried, key=tried.__getitem__) in (min(tried), max(tried))
     how = {
-        "penalty_weight_chosen": "predicts held-out views best",
+        "penalty_weight_chosen": f"predicts held-out views best{', the last one tried' if best_is_last else ''}",
         "passes_before": 1 + found.passes,
         "penalty_weight_curve": [WeightScore(weight, loss) for weight, loss in found.candidates.items()],
     }

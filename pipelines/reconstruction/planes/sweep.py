@@ -224,13 +224,14 @@ class Sweep:
     def needed_bytes(self) -> int:
         """Return about how much is to be written: missing planes, and the stack, previews and report of all."""
         plan, float_bytes, shown_bytes = self.plan, np.dtype(np.float32).itemsize, 3
+        stacked = np.prod(np.max([grid.shape for grid in plan.grids.values()], axis=0)) if plan.with_focus else 0
         total = 0
         for files in plan.files:
             rows, columns = plan.grids[files.place].shape
             arrays = 1 + plan.solver.uncertainty + 2 * plan.solver.proposal + (files.method == "occlusion")
             is_missing = (files.method, files.place) not in self.finished
-            per_sample = arrays * (is_missing * float_bytes + shown_bytes) + plan.with_focus * float_bytes
-            total += rows * columns * len(plan.layouts) * per_sample
+            per_sample = arrays * (is_missing * float_bytes + shown_bytes)
+            total += len(plan.layouts) * (rows * columns * per_sample + int(stacked) * float_bytes)
         return total
 
     def part(self, part: Part) -> "Sweep":
