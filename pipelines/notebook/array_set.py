@@ -33,13 +33,17 @@ def set_of_arrays(
     unusable: ArrayLike | None = None,
 ) -> ElementalSet:
     """Return the elemental set of arrays; see `LightField.from_arrays`."""
+    _check_types(lens, noise)
     stack, rt = np.asarray(images), np.asarray(poses, np.float64)
     _check_images(stack, lens)
-    if rt.shape != (len(stack), 6) or not np.isfinite(rt).all():
+    if rt.shape != (len(stack), 6):
         raise BadValue(
-            f"poses: {len(stack)} views need finite numbers of shape ({len(stack)}, 6), got {rt.shape}; give for each "
+            f"poses: {len(stack)} views need an array of shape ({len(stack)}, 6), got {rt.shape}; give for each "
             "view a Rodrigues vector in rad and a translation in mm, from reference to camera"
         )
+    if not np.isfinite(rt).all():
+        view = int(np.flatnonzero(~np.isfinite(rt).all(axis=1))[0])
+        raise BadValue(f"poses: that of view {view} is {rt[view].tolist()}; give finite numbers, or leave the view out")
     if exposure_s is None and np.any(noise.dark_current_e_per_s):
         raise BadValue("noise: a dark current means nothing without an exposure; give exposure_s in seconds")
     if mosaic is not None and stack.ndim == 4:
@@ -70,6 +74,12 @@ def set_of_arrays(
         read_frame=lambda path, _: Frame(frames[path]),
         in_memory=True,
     )
+
+
+def _check_types(lens: object, noise: object) -> None:
+    for name, value, kind in (("lens", lens, Lens), ("noise", noise, NoiseModel)):
+        if not isinstance(value, kind):
+            raise BadValue(f"{name}: got a {type(value).__name__}; give a faintfield.{kind.__name__}")
 
 
 def _check_images(images: NDArray[Any], lens: Lens) -> None:

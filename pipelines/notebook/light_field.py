@@ -243,6 +243,8 @@ class LightField:
 
     def view_e(self, view: int) -> Array:
         """Return one view in electrons (row, column[, colour]), as in `images_e`."""
+        if not -len(self.poses) <= view < len(self.poses):
+            raise BadValue(f"view: got {view}; give 0 to {len(self.poses) - 1}")
         elemental_set, layouts = self.elemental_set, self.elemental_set.layouts
         width, height = self.lens.size_px
         colours = () if layouts[0].plane_of_colour is None else (len(layouts),)
@@ -272,10 +274,16 @@ class LightField:
             raise BadValue(f"pitch: got {pitch}, and the set knows disparities, no lengths; leave it out")
         return requested_grid(self.elemental_set, self._depth_mm(depth), pitch)
 
-    def operator(self, depth: float, channel: str | None = None, pitch: float | None = None) -> PlaneOperator:
-        """Return H of a plane at a depth, for the pixels of `data`."""
+    def operator(
+        self,
+        depth: float,
+        channel: str | None = None,
+        pitch: float | None = None,
+        dtype: type[np.float32] | type[np.float64] = np.float32,
+    ) -> PlaneOperator:
+        """Return H of a plane at a depth, for the pixels of `data`, with samples of a dtype."""
         factory = OperatorFactory(self.elemental_set, self._layout(channel), self.data(channel))
-        return factory.at(self._depth_mm(depth), self.grid(depth, pitch))
+        return factory.at(self._depth_mm(depth), self.grid(depth, pitch), dtype=dtype)
 
     def find_depths(self, near: float | None = None, far: float | None = None) -> list[float]:
         """Return the depths of objects, found by comparing the views, in a range or at all depths that they share.
@@ -294,6 +302,8 @@ class LightField:
 
     def plane(self, depth: float, **options: Unpack[PlaneOptions]) -> Plane:
         """Reconstruct one plane; the options are those of `PlaneOptions`, and the failures those of `planes`."""
+        if not isinstance(depth, Real):
+            raise BadValue(f"depth: got {depth!r}; give one number, or several to `planes`")
         return self.planes([depth], **options)[0]
 
     def planes(
@@ -403,18 +413,32 @@ class LightField:
         """Return the planes to make, with options as commands take them; `folder` is for temporary files."""
         if isinstance(depths, str) and depths != "auto":
             raise BadValue(f"depths: got {depths!r}; give numbers, or 'auto'")
-        if not len(depths):
+        asked: list[float | Literal["auto"]] = ["auto"]
+        if not isinstance(depths, str):
+            asked = [*np.atleast_1d(np.asarray(depths, float)).tolist()]
+        if not asked:
             raise BadValue("depths: none is given; give some, or 'auto'")
-        asked: list[float | Literal["auto"]] = ["auto"] if isinstance(depths, str) else [float(d) for d in depths]
         method = options.get("method", "pmlem")
         try:
             selection = select_planes(
                 Options(depth=asked, method=[method], solver=_solver(options), pitch_mm=options.get("pitch"))
             )
-            return resolve(selection, self.elemental_set, folder)
+            request = resolve(selection, self.elemental_set, folder)
         except WrongUsage as failure:  # which names options of commands
             text = re.sub(r"--([a-z-]+)", lambda option: option[1].replace("-", "_"), str(failure))
             raise BadValue(text) from failure
+        self._tell_if_still(request.depths_mm)
+        return request
+
+    def _tell_if_still(self, depths_mm: Sequence[float]) -> None:
+        """Say if points hardly move from view to view: lengths may be in another unit, or poses missing."""
+        moved_mm = float(np.linalg.norm(self.poses[:, 3:5], axis=1).max())
+        moved_px = self.lens.fx_px * moved_mm / max(depths_mm)
+        if len(self.poses) > 1 and moved_px < 1:
+            inform(
+                f"poses: points at {self.elemental_set.depth_text(max(depths_mm))} move by {moved_px:.2g} px in all "
+                "views together; poses and depths are in mm, check both"
+            )
 
     @cached_property
     def _data(self) -> dict[str, ElementalImages]:
@@ -532,8 +556,13 @@ def _checked(options: PlaneOptions) -> PlaneOptions:
         if not (name == "penalty_weight" and value == "auto") and not _is_number(value, least, whole=name == "passes"):
             kind = "whole number" if name == "passes" else "number"
             raise BadValue(f"{name}: got {value!r}; give a {kind} of at least {least:g}")
-    if not isinstance(penalty := values.get("penalty", "tv"), str) and not {"value", "prox"} <= {*dir(penalty)}:
+    penalty = values.get("penalty", "tv")
+    if isinstance(penalty, type):
+        raise BadValue(f"penalty: got the class {penalty.__name__}; give an object of it, {penalty.__name__}(…)")
+    if not isinstance(penalty, str) and not {"value", "prox"} <= {*dir(penalty)}:
         raise BadValue(f"penalty: a {type(penalty).__name__} has no `value` and `prox`; see faintfield.ProximalPenalty")
+    if not callable(progress := values.get("progress", print)):
+        raise BadValue(f"progress: a {type(progress).__name__} cannot be called; give a function, such as print")
     if not isinstance(prior := values.get("prior", "tv"), str) and not callable(prior):
         raise BadValue(f"prior: a {type(prior).__name__} cannot be called; see faintfield.Denoiser")
     own = [name for name in ("penalty", "prior") if not isinstance(values.get(name, ""), str)]

@@ -5,7 +5,7 @@ from pathlib import Path
 from faintfield.pipelines.arguments import SceneKind
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.results.records import RECONSTRUCTION_FILE
-from faintfield.pipelines.formats.results.surface import results_below, surfaces_below
+from faintfield.pipelines.formats.results.surface import SURFACE_FILE, results_below, surfaces_below
 from faintfield.pipelines.formats.sets.elemental_file import FILE_NAME
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.formats.sets.session_set import load_session
@@ -47,11 +47,15 @@ def open_path(path: Path | str, *, scene: SceneKind = "dark_scene") -> LightFiel
     ...     faintfield.open(Path(folder) / "set")
     <light field of 9 views of 64 x 48 px, grey, poses stated, depths in mm>
     """
-    folder = Path(path)
+    folder = Path(path).expanduser()
     if not folder.exists():
         raise MissingFile(f"{folder}: no such folder; name a session, a set or a folder of results")
     if has_session(folder):
         return LightField(load_session(folder, scene))
+    if folder.name in (RECONSTRUCTION_FILE, SURFACE_FILE):
+        folder = folder.parent
+    if folder.is_file() and folder.suffix != ".toml":
+        raise MissingFile(f"{folder}: is a file; name its folder, a session, a set or a folder of results")
     if folder.is_file() or (folder / FILE_NAME).is_file():
         return LightField(load_set(folder))
     results: list[Path] = [*results_below(folder, required=False), *surfaces_below(folder)]

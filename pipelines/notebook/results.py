@@ -53,6 +53,11 @@ class Plane:
     units: StatedUnits
     maps: dict[str, Array] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        rows, columns = self.image.shape[:2]
+        maps = "".join(f", {name}" for name in self.maps)
+        return f"<plane of {columns} x {rows} samples, {self.units.depths_text([self.depth])}{maps}>"
+
     @property
     def depth(self) -> float:
         """Depth in mm, or in the unit of the set: relative, or px of disparity."""
@@ -181,7 +186,7 @@ class Planes(Sequence[Plane]):
         return plotting.draw_planes(self, columns)
 
     def to_xarray(self) -> Any:
-        """Return the images as an `xarray.DataArray` with coordinates; MissingPackage without xarray.
+        """Return the images as an `xarray.Dataset` with coordinates; MissingPackage without xarray.
 
         The samples of a plane are a constant angle apart, so that their places x and y depend on the depth, too.
         """
@@ -198,8 +203,7 @@ class Planes(Sequence[Plane]):
         }
         if images.ndim == 4:
             coordinates["colour"] = ("colour", [record.channel for record in self.records[0]], {})
-        attributes = _light(self.units)
-        return xarray.DataArray(images, coordinates, names[: images.ndim], name="light", attrs=attributes)
+        return xarray.Dataset({"light": (names[: images.ndim], images, _light(self.units))}, coordinates)
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,6 +232,10 @@ class Surface:
 
     folder: Path
     result: SurfaceFileRecord
+
+    def __repr__(self) -> str:
+        rows, columns = self.result.surface.shape
+        return f"<surface of {columns} x {rows} samples, {self.result.surface.sure_share:.0%} of the depths sure>"
 
     @cached_property
     def picture(self) -> Array:

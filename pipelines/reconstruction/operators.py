@@ -59,6 +59,12 @@ def plane_grid(
     width, height = camera.size_px
     mm_per_px_x, mm_per_px_y = depth_mm / camera.fx_px, depth_mm / camera.fy_px
     covering = PlaneGrid.covering_on_multiples if on_multiples else PlaneGrid.covering
+    if pitch_mm is not None and mm_per_px_x * mm_per_px_y / pitch_mm**2 > _MAX_SAMPLES_PER_PIXEL:
+        raise GeometryMismatch(
+            f"plane at {elemental_set.depth_text(depth_mm)}: a pitch of {pitch_mm:g} mm makes "
+            f"{mm_per_px_x * mm_per_px_y / pitch_mm**2:.3g} samples per detector pixel, and at most "
+            f"{_MAX_SAMPLES_PER_PIXEL} make sense; give a larger pitch"
+        )
     try:
         return covering(
             left_mm=(-0.5 - cx_px) * mm_per_px_x,
@@ -144,11 +150,16 @@ class OperatorFactory:
         return {"valid": valid, "lattice_of_view": np.tile(np.arange(self._phases), count)}
 
     def at(
-        self, place: Place, grid: PlaneGrid, views: Sequence[int] | None = None, valid: NDArray[np.bool_] | None = None
+        self,
+        place: Place,
+        grid: PlaneGrid,
+        views: Sequence[int] | None = None,
+        valid: NDArray[np.bool_] | None = None,
+        dtype: type[np.float32] | type[np.float64] = np.float32,
     ) -> PlaneOperator:
         """Return H of a plane at a depth, or of a pose; of some views alone with their mask (view, row, column)."""
         shared = self._shared if views is None else self._of_views(len(views), valid)
-        return PlaneOperator(self._homographies(place, views), self._maps, grid, **shared)
+        return PlaneOperator(self._homographies(place, views), self._maps, grid, **shared | {"dtype": dtype})
 
     def of_surface(
         self, inverse_depth: NDArray[np.floating], grid: PlaneGrid, *, masked: bool = True

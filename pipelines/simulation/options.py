@@ -37,6 +37,9 @@ class SyntheticOptions:
         Poses that elemental.toml states: those the camera really had (true), or those it was sent to (nominal).
     colour : {"grey", "bayer"}
         Sensor without colour filters (grey), or with a Bayer mosaic.
+    lens : {"real", "ideal"}
+        The paper's lens, with distortion and a principal point beside the middle (real), or one without (ideal), as
+        `import grid` takes that of pictures to be.
     objects : {"toys", "surfaces"}
         The flat toys, or a scene that fills the view: a slanted wall, a rising floor, a ball, a tilted page and a thin
         rod (surfaces), at 517 to 1009 mm.
@@ -62,6 +65,7 @@ class SyntheticOptions:
     rotation_error_mrad: NotNegative = 3.5
     poses: Literal["true", "nominal"] = "true"
     colour: Literal["grey", "bayer"] = "grey"
+    lens: Literal["real", "ideal"] = "real"
     objects: Literal["toys", "surfaces"] = "toys"
 
 

@@ -35,7 +35,7 @@ from faintfield.recon.metrics import (
 )
 from faintfield.rig.plan import grid_nodes
 from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment, surface_experiment
-from faintfield.rig.simulation.optics import SimulatedSensor, through_mosaic
+from faintfield.rig.simulation.optics import SimulatedOptics, SimulatedSensor, through_mosaic
 from faintfield.rig.simulation.scene import render
 from faintfield.rig.simulation.surfaces import true_depth_mm
 
@@ -71,21 +71,30 @@ def write_synthetic_set(out: Path, options: SyntheticOptions, *, overwrite: bool
         scene.write_settings(folder, stated, stated_noise(sensor))
         truth = write_ground_truth(folder, scene, white_e, options.snr, options.poses)
         recorded = asdict(options)
-        if options.objects == "toys":  # once the only ones
-            del recorded["objects"]
+        for name, once_the_only in (("objects", "toys"), ("lens", "real")):
+            if recorded[name] == once_the_only:
+                del recorded[name]
         write_json(folder / "provenance.json", provenance("simulate", recorded, {}))
     return truth
 
 
 def _experiment(options: SyntheticOptions) -> SimulatedExperiment:
     made = surface_experiment if options.objects == "surfaces" else paper_experiment
+    experiment = made(*options.size_px)
     return replace(
-        made(*options.size_px),
+        experiment,
+        optics=_centred(experiment.optics) if options.lens == "ideal" else experiment.optics,
         rows=options.rows,
         columns=options.columns,
         pitch_mm=options.pitch_mm,
         exposure_s=options.exposure_s,
     )
+
+
+def _centred(optics: SimulatedOptics) -> SimulatedOptics:
+    """Return the optics without distortion and vignetting, their principal point in the middle."""
+    width, height = optics.size_px
+    return replace(optics.ideal(), cx_px=(width - 1) / 2, cy_px=(height - 1) / 2)
 
 
 def stated_noise(sensor: SimulatedSensor) -> Noise:

@@ -247,6 +247,7 @@ def _print_table(grid: ImageGrid, record: Arrangement, inspection: GridInspectio
             lines["pitch"] = f"columns {record.pitch_ratio:.3f} times as far apart as rows"
         if record.relative_light:
             lines["light"] = f"{min(record.relative_light):.2f} … {max(record.relative_light):.2f} of the typical view"
+    lines["lens"] = "taken as ideal: no distortion, centred; undistort pictures before if theirs is not"
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     for heading, text in lines.items():
         table.add_row(heading, text)

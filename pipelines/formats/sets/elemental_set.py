@@ -21,7 +21,7 @@ from faintfield.pipelines.formats.plane_poses import Place, TiltedPlane
 from faintfield.pipelines.formats.reading import is_file, is_folder
 from faintfield.pipelines.formats.results.noise import NOISE_MAPS, FittedNoise, read_fitted_noise
 from faintfield.pipelines.formats.results.plane_files import plane_name
-from faintfield.pipelines.formats.results.records import Poses
+from faintfield.pipelines.formats.results.records import RECONSTRUCTION_FILE, Poses
 from faintfield.pipelines.formats.sets.aligned_poses import with_alignment
 from faintfield.pipelines.formats.sets.elemental_file import (
     FILE_NAME,
@@ -297,6 +297,8 @@ def check_exists(folder: Path) -> None:
 def _refuse_pictures(folder: Path) -> None:
     """Refuse a folder that is not there, and one of pictures that is no set yet (MissingFile)."""
     check_exists(folder)
+    if is_file(folder / RECONSTRUCTION_FILE):
+        raise MissingFile(f"{folder}: holds results, no images; name the set that they were made from")
     pictures = [path.name for path in files_in(folder) if path.suffix.lower() in IMAGE_SUFFIXES]
     if pictures:
         raise MissingFile(

@@ -111,4 +111,4 @@ def test_kinds_are_listed_and_fields_explained(done: Command) -> None:
     assert [line.split()[0] for line in lines] == list(get_args(SchemaKind.__value__))
     stage = json.loads(done("--json", "schema", "rig").stdout)["$defs"]["StageSettings"]
     assert stage["properties"]["baud"]["description"] == "Bits per second."
-    assert stage["description"] == "Connection and limits of the stage."
+    assert stage["description"] == "Connection and limits of the stage: the `[stage]` table of rig.toml."

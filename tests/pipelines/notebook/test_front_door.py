@@ -1,5 +1,6 @@
 """Sessions, sets, results and arrays as objects in Python: the same planes as the commands make, from files or not."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 import faintfield
-from faintfield import InputError, LightField, PlaneOptions, Planes, SyntheticOptions
+from faintfield import InputError, LightField, Plane, PlaneOptions, Planes, ReconstructionError, SyntheticOptions
 from faintfield.calib.homography import rotation_matrix
 from faintfield.pipelines.arguments import SolverOptions
 from faintfield.pipelines.commands.reconstruction import reconstruct as reconstruct_command
@@ -51,12 +52,13 @@ def test_planes_are_those_of_command_whether_just_made_or_read(folder: Path, tmp
     assert steps[-1] == (len(steps), len(steps))
     assert made.depths == read.depths == tuple(DEPTHS)
     assert np.array_equal(made.images, read.images)
-    for one, other in zip(made, read, strict=True):
-        assert one.sigma is not None
-        assert other.sigma is not None
-        assert np.array_equal(one.sigma, other.sigma)
-        assert [record.penalty_weight for record in one.records] == [record.penalty_weight for record in other.records]
-        assert one.channels == other.channels
+    for plane, stored in zip(made, read, strict=True):
+        assert plane.sigma is not None
+        assert stored.sigma is not None
+        assert np.array_equal(plane.sigma, stored.sigma)
+        weights, stored_weights = ([record.penalty_weight for record in each.records] for each in (plane, stored))
+        assert weights == stored_weights
+        assert plane.channels == stored.channels
     assert read.result is not None
     assert read.result.inputs
 
@@ -175,14 +177,23 @@ def test_contradictions_are_refused(folder: Path) -> None:
         ({"prior": "atuo"}, "got 'atuo'; give one of tv, patches"),
         ({"prior": 5}, "an? int cannot be called"),
         ({"penalty": 5}, "no `value` and `prox`"),
+        ({"penalty": Tikhonov}, "got the class Tikhonov"),
+        ({"penalty": Tikhonov(), "method": "mlem"}, "one of your own is for joint, occlusion, pmlem, got mlem"),
+        ({"method": "mlem", "uncertainty": True}, "uncertainty is for pmlem"),
+        ({"passes": 1.5}, "give a whole number"),
         ({"pitch": 0.0}, "pitch: got 0"),
+        ({"pitch": 1e-3}, "samples per detector pixel"),
         ({"penalty_weight": -1.0}, "penalty_weight: got -1"),
     ]
-    for words, message in wrong:
-        with pytest.raises(BadValue, match=message):
-            light_field.plane(1000.0, **words)  # type: ignore[arg-type]
+    plane: Callable[..., Plane] = light_field.plane
+    planes: Callable[..., Planes] = light_field.planes
+    for values, message in wrong:
+        with pytest.raises((BadValue, ReconstructionError), match=message):
+            plane(1000.0, **values)
     with pytest.raises(TypeError, match="weight: is no option of planes"):
-        light_field.plane(1000.0, weight=1.0)  # type: ignore[call-arg]
+        plane(1000.0, weight=1.0)
+    with pytest.raises(BadValue, match="got 'atuo'; give numbers, or 'auto'"):
+        planes("atuo")
     with pytest.raises(BadValue, match="channel 'infrared'"):
         light_field.operator(800.0, "infrared")
     with pytest.raises(BadValue, match="give both or none"):
@@ -212,7 +223,14 @@ def test_penalty_of_ones_own_has_weight_by_held_out_views(folder: Path) -> None:
     [
         ({"images": np.zeros((2, 5, 6))}, "for a lens of 8 x 6 px"),
         ({"images": np.zeros((2, 6, 8), complex)}, "got complex128"),
-        ({"poses": np.zeros((3, 6))}, r"2 views need finite numbers of shape \(2, 6\)"),
+        ({"poses": np.zeros((3, 6))}, r"2 views need an array of shape \(2, 6\), got \(3, 6\)"),
+        ({"poses": [[0] * 6, [np.nan] * 6]}, "that of view 1 is"),
+        ({"lens": None}, "lens: got a NoneType; give a faintfield.Lens"),
+        ({"nodes": [(0, 0)]}, "got 1 for 2 views"),
+        ({"nodes": [(0, 0), (0, 0)]}, "named by more than one view"),
+        ({"reference": 2}, "got 2 for 2 views"),
+        ({"exposure_s": -1.0}, "exposure_s = -1"),
+        ({"noise": faintfield.NoiseModel(np.zeros((2, 2)), 1.0, 3.0)}, "offset_dn has shape"),
         ({"poses": np.ones((2, 6))}, "none is zero"),
         ({"mosaic": ("RG", "XB")}, "letters R, G and B"),
         ({"flat": -np.ones((6, 8))}, "flat: "),
@@ -226,8 +244,9 @@ def test_arrays_that_do_not_fit_are_named(change: dict[str, object], message: st
         "lens": faintfield.Lens((8, 6), 8.0, 8.0, 3.5, 2.5),
         "noise": faintfield.NoiseModel(0.0, 1.0, 3.0),
     }
+    from_arrays: Callable[..., LightField] = LightField.from_arrays
     with pytest.raises(BadValue, match=message):
-        LightField.from_arrays(**(arguments | change))  # type: ignore[arg-type]
+        from_arrays(**(arguments | change))
 
 
 def test_folders_that_cannot_be_opened_are_explained(tmp_path: Path, folder: Path) -> None:
@@ -240,7 +259,7 @@ def test_folders_that_cannot_be_opened_are_explained(tmp_path: Path, folder: Pat
 def test_xarray_and_plots_have_places_and_units(folder: Path) -> None:
     light_field = open_set(folder)
     planes = light_field.planes(DEPTHS, method="backprojection")
-    array = planes.to_xarray()
+    array = planes.to_xarray().light
     pitch_mm = 800.0 / light_field.lens.fx_px
     assert float(array.x[0, 1] - array.x[0, 0]) == pytest.approx(pitch_mm)
     assert array.depth.attrs["units"] == "mm"
