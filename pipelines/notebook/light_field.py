@@ -53,6 +53,7 @@ _WORDS: dict[str, tuple[str, ...]] = {
     "penalty": get_args(PenaltyName.__value__),
     "likelihood": ("auto", *get_args(LikelihoodName.__value__)),
 }
+_MOST_SAMPLES_PER_PX = 4
 _LEAST = {"penalty_weight": 0.0, "pitch": 1e-9, "passes": 1}
 
 
@@ -427,11 +428,17 @@ class LightField:
         except WrongUsage as failure:  # which names options of commands
             text = re.sub(r"--([a-z-]+)", lambda option: option[1].replace("-", "_"), str(failure))
             raise BadValue(text) from failure
-        self._tell_if_still(request.depths_mm)
+        self._check_depths(request.depths_mm, request.pitch_mm)
         return request
 
-    def _tell_if_still(self, depths_mm: Sequence[float]) -> None:
-        """Say if points hardly move from view to view: lengths may be in another unit, or poses missing."""
+    def _check_depths(self, depths_mm: Sequence[float], pitch_mm: float | None) -> None:
+        """Refuse a pitch of many samples per pixel; say if points hardly move: lengths may be in another unit."""
+        per_px = min(depths_mm) / self.lens.fx_px / pitch_mm if pitch_mm else 0.0
+        if per_px > _MOST_SAMPLES_PER_PX:
+            raise BadValue(
+                f"pitch: got {pitch_mm:g}, {per_px:.3g} samples to a pixel; at most {_MOST_SAMPLES_PER_PX} make sense: "
+                "give a larger one"
+            )
         moved_mm = float(np.linalg.norm(self.poses[:, 3:5], axis=1).max())
         moved_px = self.lens.fx_px * moved_mm / max(depths_mm)
         if len(self.poses) > 1 and moved_px < 1:

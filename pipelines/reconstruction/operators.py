@@ -40,15 +40,12 @@ def default_pitch_px(elemental_set: ElementalSet) -> int:
     return 1 if fewest_per_sample >= 1 else max(step)
 
 
-def plane_grid(
-    elemental_set: ElementalSet, place: Place, pitch_mm: float | None = None, *, on_multiples: bool = False
-) -> PlaneGrid:
+def plane_grid(elemental_set: ElementalSet, place: Place, pitch_mm: float | None = None) -> PlaneGrid:
     """Return the samples of a plane, one per pixel of the reference view by default.
 
-    At a depth it has what the reference view sees; a tilted one its stated size, or what that view sees of it. Samples
-    `on_multiples` of the pitch lie one behind the other at all depths. Raises GeometryMismatch if the plane is not in
-    front of the camera, the pitch leaves it without samples, or a part of the view does not meet it, or only very far
-    away.
+    At a depth it has what the reference view sees; a tilted one its stated size, or what that view sees of it. Raises
+    GeometryMismatch if the plane is not in front of the camera, the pitch leaves it without samples, or a part of the
+    view does not meet it, or only very far away.
     """
     if isinstance(place, TiltedPlane):
         return _tilted_grid(elemental_set, place, pitch_mm)
@@ -58,15 +55,8 @@ def plane_grid(
     cx_px, cy_px = elemental_set.principal_points_px[elemental_set.reference_view].tolist()
     width, height = camera.size_px
     mm_per_px_x, mm_per_px_y = depth_mm / camera.fx_px, depth_mm / camera.fy_px
-    covering = PlaneGrid.covering_on_multiples if on_multiples else PlaneGrid.covering
-    if pitch_mm is not None and mm_per_px_x * mm_per_px_y / pitch_mm**2 > _MAX_SAMPLES_PER_PIXEL:
-        raise GeometryMismatch(
-            f"plane at {elemental_set.depth_text(depth_mm)}: a pitch of {pitch_mm:g} mm makes "
-            f"{mm_per_px_x * mm_per_px_y / pitch_mm**2:.3g} samples per detector pixel, and at most "
-            f"{_MAX_SAMPLES_PER_PIXEL} make sense; give a larger pitch"
-        )
     try:
-        return covering(
+        return PlaneGrid.covering(
             left_mm=(-0.5 - cx_px) * mm_per_px_x,
             top_mm=(-0.5 - cy_px) * mm_per_px_y,
             right_mm=(width - 0.5 - cx_px) * mm_per_px_x,
@@ -82,7 +72,8 @@ def requested_grid(elemental_set: ElementalSet, place: Place, pitch_mm: float | 
     if pitch_mm is None:
         mm_per_depth = default_pitch_px(elemental_set) / elemental_set.settings.camera.fx_px
         return plane_grid(elemental_set, place, depth_of(place) * mm_per_depth)
-    return plane_grid(elemental_set, place, pitch_mm, on_multiples=True)
+    grid = plane_grid(elemental_set, place, pitch_mm)
+    return grid if isinstance(place, TiltedPlane) else grid.on_multiples()
 
 
 def _tilted_grid(elemental_set: ElementalSet, plane: TiltedPlane, pitch_mm: float | None) -> PlaneGrid:

@@ -53,16 +53,10 @@ class PlaneGrid:
         rows, columns = round((bottom_mm - top_mm) / pitch_mm), round((right_mm - left_mm) / pitch_mm)
         return cls((rows, columns), pitch_mm, (left_mm + pitch_mm / 2, top_mm + pitch_mm / 2))
 
-    @classmethod
-    def covering_on_multiples(
-        cls, left_mm: float, top_mm: float, right_mm: float, bottom_mm: float, pitch_mm: float
-    ) -> "PlaneGrid":
-        """Return the grid of samples on the rectangle with these edges, at multiples of the pitch.
-
-        Grids of one pitch have samples one behind the other. Those at the edges may reach beyond by less than a pitch.
-        """
-        left, top, right, bottom = (round(edge / pitch_mm) for edge in (left_mm, top_mm, right_mm, bottom_mm))
-        return cls((bottom - top + 1, right - left + 1), pitch_mm, (left * pitch_mm, top * pitch_mm))
+    def on_multiples(self) -> "PlaneGrid":
+        """Return the grid moved by half a sample at most, so that x and y of its samples are multiples of the pitch."""
+        x_mm, y_mm = (self.pitch_mm * round(start / self.pitch_mm) for start in self.origin_mm)
+        return PlaneGrid(self.shape, self.pitch_mm, (x_mm, y_mm))
 
     def binned(self, bins: int) -> "PlaneGrid":
         """Return the grid with samples of `bins` by `bins` of these; incomplete ones at the far edges are dropped."""
