@@ -27,7 +27,7 @@ _MODULES = {
     "Plane": "pipelines.notebook.results",
     "PlaneGrid": "recon.operator.grid",
     "PlaneOperator": "recon.operator.single_plane",
-    "PlaneOptions": "pipelines.notebook.light_field",
+    "PlaneOptions": "pipelines.notebook.options",
     "Planes": "pipelines.notebook.results",
     "Point": "rig.stages.protocol",
     "ProximalPenalty": "recon.solver.custom_penalty",
@@ -82,9 +82,9 @@ if TYPE_CHECKING:  # type checkers and editors read these lines; a test compares
     from faintfield.pipelines.formats.frames import read_frame as read_frame
     from faintfield.pipelines.formats.sets.elemental_set import load_set as load_set
     from faintfield.pipelines.notebook.light_field import LightField as LightField
-    from faintfield.pipelines.notebook.light_field import PlaneOptions as PlaneOptions
     from faintfield.pipelines.notebook.light_field import reconstruct as reconstruct
     from faintfield.pipelines.notebook.opening import open_path
+    from faintfield.pipelines.notebook.options import PlaneOptions as PlaneOptions
     from faintfield.pipelines.notebook.results import Plane as Plane
     from faintfield.pipelines.notebook.results import Planes as Planes
     from faintfield.pipelines.notebook.results import Surface as Surface

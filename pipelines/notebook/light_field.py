@@ -1,105 +1,49 @@
 """A light field: the views of a scene with their poses, lens and noise, and the planes reconstructed from them."""
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
-from numbers import Integral, Real
+from numbers import Real
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal, Self, TypedDict, Unpack, cast, get_args
+from typing import Any, Literal, Self, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintfield.calib.lens import Lens
 from faintfield.calib.noise_model import NoiseModel
-from faintfield.pipelines.arguments import Method, PriorName
+from faintfield.pipelines.arguments import PriorName
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue, WrongUsage, import_optional
 from faintfield.pipelines.formats.files import exclusive, remove
 from faintfield.pipelines.formats.frames import ChannelLayout
-from faintfield.pipelines.formats.results.plane_files import PlaneFiles
-from faintfield.pipelines.formats.results.records import FocusPoint, PlaneRecord
 from faintfield.pipelines.formats.results.surface import SURFACE_FILE
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, light_per_e
 from faintfield.pipelines.formats.units import Node, StatedUnits
 from faintfield.pipelines.notebook import plotting
 from faintfield.pipelines.notebook.array_set import set_of_arrays
+from faintfield.pipelines.notebook.kept_plane import KeptPlane
+from faintfield.pipelines.notebook.options import PlaneOptions, checked_options, solver_options
 from faintfield.pipelines.notebook.results import Array, Plane, Planes, Surface, surface_of_folder
 from faintfield.pipelines.reconstruction.channels import keeping_frames, load_channel, view_electrons
 from faintfield.pipelines.reconstruction.depth.autofocus import best_focus
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, requested_grid
 from faintfield.pipelines.reconstruction.options import Options
-from faintfield.pipelines.reconstruction.planes.custom import CustomOptions
 from faintfield.pipelines.reconstruction.planes.sweep import run_serially
-from faintfield.pipelines.reconstruction.request import WITH_PRIOR, Request, resolve, select_planes
+from faintfield.pipelines.reconstruction.request import Request, resolve, select_planes
 from faintfield.pipelines.reconstruction.run import check_request, plan_sweep, warn_of
 from faintfield.pipelines.reconstruction.surface.reconstruct import reconstruct_surface
 from faintfield.pipelines.reconstruction.surface.request import SurfaceRequest
 from faintfield.recon.likelihood.images import ElementalImages
-from faintfield.recon.names import LikelihoodName, PenaltyName
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.single_plane import PlaneOperator
-from faintfield.recon.prior.denoiser import Denoiser
-from faintfield.recon.solver.custom_penalty import ProximalPenalty
 from faintfield.recon.threads import map_in_threads
 
-# Words that options can be, and least numbers.
-_WORDS: dict[str, tuple[str, ...]] = {
-    "method": get_args(Method.__value__),
-    "prior": get_args(PriorName.__value__),
-    "penalty": get_args(PenaltyName.__value__),
-    "likelihood": ("auto", *get_args(LikelihoodName.__value__)),
-}
+# More samples to a pixel make no sense: a mistake of units.
 _MOST_SAMPLES_PER_PX = 4
-_LEAST = {"penalty_weight": 0.0, "pitch": 1e-9, "passes": 1}
-
-
-class PlaneOptions(TypedDict, total=False):
-    """Options of reconstructed planes; those of `faintfield reconstruct` by the same names.
-
-    Attributes
-    ----------
-    method : str
-        "pmlem" by default; "backprojection", "mlem", "pmlem-osl", or of all planes together "joint" or "occlusion".
-    prior : str or Denoiser
-        "tv", "patches", "learned", "auto" (the default with total variation), or a function that removes noise.
-    penalty : str or ProximalPenalty
-        "tv" by default, "huber-tv", "quadratic", "none", or an object with `value` and `prox`.
-    penalty_weight : float
-        β; by default the one that best predicts held-out views.
-    likelihood : str
-        "poisson-gaussian", "shifted-poisson", "poisson" or "least-squares"; by default the first or second.
-    uncertainty : bool
-        Also return the standard deviation of each sample.
-    pitch : float
-        Distance of samples in mm; by default one pixel of the reference view.
-    passes : int
-        Largest number of passes over the data.
-    progress : callable
-        Is called with the number of steps done and that of all.
-
-    Examples
-    --------
-    The same options for several calls:
-
-    >>> from faintfield import PlaneOptions
-    >>> quick = PlaneOptions(prior="tv", passes=10)
-    >>> quick | PlaneOptions(uncertainty=True)
-    {'prior': 'tv', 'passes': 10, 'uncertainty': True}
-    """
-
-    method: Method
-    prior: PriorName | Denoiser
-    penalty: PenaltyName | ProximalPenalty
-    penalty_weight: float | Literal["auto"]
-    likelihood: LikelihoodName | Literal["auto"]
-    uncertainty: bool
-    pitch: float
-    passes: int
-    progress: Callable[[int, int], object]
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,7 +276,7 @@ class LightField:
         NotConverged
             The penalty weight is too large.
         """
-        options = _checked(options)
+        options = checked_options(options)
         method, progress = options.get("method", "pmlem"), options.get("progress")
         with _scratch() as folder:
             elemental_set = keeping_frames(self.elemental_set, folder)
@@ -383,7 +327,7 @@ class LightField:
             ends = min(depth_range), max(depth_range)
             if not (ends[0] > 0 or in_px) or ends[0] == ends[1]:
                 raise BadValue(f"depth_range: got {depth_range}; give two different depths in front of the camera")
-        solver = _solver(PlaneOptions() if prior is None else PlaneOptions(prior=prior))
+        solver = solver_options(PlaneOptions() if prior is None else PlaneOptions(prior=prior))
         with exclusive(folder):
             if self.elemental_set.in_memory:
                 remove(folder / SURFACE_FILE)  # nothing tells whether it was made of the same arrays
@@ -422,7 +366,7 @@ class LightField:
         method = options.get("method", "pmlem")
         try:
             selection = select_planes(
-                Options(depth=asked, method=[method], solver=_solver(options), pitch_mm=options.get("pitch"))
+                Options(depth=asked, method=[method], solver=solver_options(options), pitch_mm=options.get("pitch"))
             )
             request = resolve(selection, self.elemental_set, folder)
         except WrongUsage as failure:  # which names options of commands
@@ -461,39 +405,6 @@ class LightField:
 
     def _depth_mm(self, depth: float) -> float:
         return self.elemental_set.depth_in_mm(depth)
-
-
-@dataclass(frozen=True)
-class KeptPlane(PlaneFiles):
-    """A plane that is kept in memory."""
-
-    parts: dict[str, tuple[Mapping[str, NDArray[np.floating]], PlaneRecord]] = field(default_factory=dict)
-
-    def missing(self) -> list[str]:
-        """Return the colours that are still to be reconstructed."""
-        return [channel for channel in self.channels if channel not in self.parts]
-
-    def save_part(
-        self, channel: str, arrays: Mapping[str, NDArray[np.floating]], record: PlaneRecord, focus: FocusPoint | None
-    ) -> None:
-        """Keep one colour."""
-        self.parts[channel] = arrays, record
-
-    def depth(self) -> float:
-        """Return the depth in the unit of the set."""
-        return self.parts[self.channels[0]][1].depth_mm
-
-    def plane(self, units: StatedUnits) -> Plane:
-        """Return the plane of all colours."""
-        parts = [self.parts[channel] for channel in self.channels]
-        names = [name for name in parts[0][0] if all(name in arrays for arrays, _ in parts)]
-
-        def joined(name: str) -> Array:
-            colours = [np.asarray(arrays[name], np.float32) for arrays, _ in parts]
-            return colours[0] if len(colours) == 1 else np.stack(colours, axis=-1)
-
-        maps = {name: joined(name) for name in names}
-        return Plane(maps.pop("plane"), tuple(record for _, record in parts), units, maps)
 
 
 def reconstruct(
@@ -546,62 +457,6 @@ def reconstruct(
     """
     light_field = LightField.from_arrays(images, poses, lens, noise, reference=reference, exposure_s=exposure_s)
     return light_field.planes(depths, **options)
-
-
-def _checked(options: PlaneOptions) -> PlaneOptions:
-    """Return the options that are given; refuse unknown ones (TypeError), and impossible values (BadValue)."""
-    options = cast(PlaneOptions, {name: value for name, value in options.items() if value is not None})
-    if unknown := sorted(options.keys() - PlaneOptions.__optional_keys__):
-        known = ", ".join(sorted(PlaneOptions.__optional_keys__))
-        raise TypeError(f"{unknown[0]}: is no option of planes; they are {known}")
-    values: dict[str, Any] = {**options}
-    for name, words in _WORDS.items():
-        if isinstance(value := values.get(name, words[0]), str) and value not in words:
-            raise BadValue(f"{name}: got {value!r}; give one of {', '.join(words)}")
-    for name, least in _LEAST.items():
-        value = values.get(name, least)
-        if not (name == "penalty_weight" and value == "auto") and not _is_number(value, least, whole=name == "passes"):
-            kind = "whole number" if name == "passes" else "number"
-            raise BadValue(f"{name}: got {value!r}; give a {kind} of at least {least:g}")
-    penalty = values.get("penalty", "tv")
-    if isinstance(penalty, type):
-        raise BadValue(f"penalty: got the class {penalty.__name__}; give an object of it, {penalty.__name__}(…)")
-    if not isinstance(penalty, str) and not {"value", "prox"} <= {*dir(penalty)}:
-        raise BadValue(f"penalty: a {type(penalty).__name__} has no `value` and `prox`; see faintfield.ProximalPenalty")
-    if not callable(progress := values.get("progress", print)):
-        raise BadValue(f"progress: a {type(progress).__name__} cannot be called; give a function, such as print")
-    if not isinstance(prior := values.get("prior", "tv"), str) and not callable(prior):
-        raise BadValue(f"prior: a {type(prior).__name__} cannot be called; see faintfield.Denoiser")
-    own = [name for name in ("penalty", "prior") if not isinstance(values.get(name, ""), str)]
-    if own and values.get("method", "pmlem") not in WITH_PRIOR:
-        raise BadValue(f"{own[0]}: one of your own is for {', '.join(sorted(WITH_PRIOR))}, got {values['method']}")
-    return options
-
-
-def _is_number(value: object, least: float, *, whole: bool) -> bool:
-    return isinstance(value, Integral if whole else Real) and least <= float(value) < np.inf
-
-
-def _solver(options: PlaneOptions) -> CustomOptions:
-    """Return the options of solvers; a penalty or prior that is an object goes to a field of its own."""
-    penalty, prior = options.get("penalty", "tv"), options.get("prior")
-    custom_penalty = None if isinstance(penalty, str) else penalty
-    denoiser = None if prior is None or isinstance(prior, str) else prior
-    named_prior = prior if isinstance(prior, str) else None
-    if custom_penalty is not None and (denoiser is not None or named_prior not in (None, "tv")):
-        raise BadValue("prior: it starts from total variation, not from a penalty of one's own; leave one out")
-    if custom_penalty is not None and options.get("uncertainty"):
-        raise BadValue("uncertainty: nobody knows the errors under a penalty of one's own; leave it out")
-    return CustomOptions(
-        penalty=penalty if isinstance(penalty, str) else "tv",
-        prior="tv" if custom_penalty is not None or denoiser is not None else named_prior,
-        penalty_weight=options.get("penalty_weight", "auto"),
-        likelihood=options.get("likelihood", "auto"),
-        uncertainty=options.get("uncertainty", False),
-        passes=options.get("passes"),
-        custom_penalty=custom_penalty,
-        denoiser=denoiser,
-    )
 
 
 @contextmanager
