@@ -15,14 +15,14 @@ version = release = installed_version("faintfield")
 extensions = [
     "sphinx.ext.autodoc",
     "numpydoc",
-    "myst_parser",
+    "myst_nb",  # Markdown by myst_parser, and notebooks
     "sphinx_design",
     "sphinx_gallery.gen_gallery",
     "sphinx_codeautolink",
     "reference_pages",
     "repository_links",
 ]
-exclude_patterns = ["gallery", "_extensions"]
+exclude_patterns = ["gallery", "failures", "_extensions"]
 default_role = "code"
 smartquotes = False  # two hyphens are an option
 nitpicky = True
@@ -43,15 +43,19 @@ myst_heading_anchors = 4
 _run = "plot_" if find_spec("deepinv") else "plot_(?!deepinv)"
 
 sphinx_gallery_conf = {
-    "examples_dirs": "gallery",
+    "examples_dirs": ["gallery", "failures"],
     "filename_pattern": _run,
-    "ignore_pattern": "dark_scene",
-    "gallery_dirs": "tutorials/gallery",
+    "ignore_pattern": "_scene",
+    "gallery_dirs": ["tutorials/gallery", "tutorials/failures"],
     "download_all_examples": False,
     "remove_config_comments": True,
     "show_signature": False,
     "write_computation_times": False,  # its page loads scripts from other hosts
 }
+
+nb_execution_mode = "force"
+nb_execution_raise_on_error = True
+nb_execution_timeout = 300
 
 html_theme = "pydata_sphinx_theme"
 html_title = "faintfield"

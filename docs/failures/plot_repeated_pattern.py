@@ -2,30 +2,34 @@
 Repeated patterns
 =================
 
-A pattern that repeats within the parallax of the views fits itself at several depths. Its depth is that of its
-surroundings, or a wrong one. Little of it is called sure.
+A pattern that repeats within the parallax of the views fits itself at several depths. No comparison of the views can
+tell which of them is the true one.
 """
 
-from tempfile import TemporaryDirectory
-
-import numpy as np
-from light_field_scene import SIZE_PX, Layer, light_field, show
-from skimage.data import brick
+from light_field_scene import FOCAL_PX, STEP_MM, Layer, light_field
+from numpy import indices
 
 import faintfield
 
-pattern = 0.2 + 0.6 * ((np.indices((512, 512)) // 16).sum(axis=0) % 2)  # squares of 4 px in the reference view
-wall = np.where(np.arange(512) < 352, brick() / 255, pattern)
+# %%
+# A wall of squares stands at 700 mm. A square has 4 px in a view, so that the pattern repeats after 8 px.
 
-with TemporaryDirectory() as folder:
-    surface = light_field(Layer(wall, 700.0).seen_from).surface(folder, (350.0, 1000.0))
-    show(surface, np.full(SIZE_PX[::-1], 700.0))
+true_depth_mm = 700.0
+squares = (indices((512, 512)) // 16).sum(axis=0) % 2
+views = light_field(Layer(0.2 + 0.6 * squares, true_depth_mm).seen_from)
 
 # %%
-# A wall of nothing but squares is refused: the views agree as well in random places as in their own.
+# The search for depths is refused: the views agree no better than in shuffled places.
 
-with TemporaryDirectory() as folder:
-    try:
-        light_field(Layer(pattern, 700.0).seen_from).surface(folder, (350.0, 1000.0))
-    except faintfield.ReconstructionError as failure:
-        print(failure)
+try:
+    views.find_depths(300.0, 1000.0)
+except faintfield.ReconstructionError as failure:
+    print(failure)
+
+# %%
+# At the true depth a point moves by 6.9 px from view to view. At the depth where it moves by 8 px more, the plane is as
+# sharp. Only a depth that is known from elsewhere helps.
+
+moved_px = FOCAL_PX * STEP_MM / true_depth_mm
+wrong_depth_mm = round(FOCAL_PX * STEP_MM / (moved_px + 8.0))
+views.planes([wrong_depth_mm, 500.0, true_depth_mm], prior="tv").plot()
