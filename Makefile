@@ -54,7 +54,7 @@ build/bench:
 
 docs: $(DOCS)/installed ## the site of the documentation: build/docs/index.html
 	$(DOCS)/bin/python -c 'from faintfield.recon import compile_kernels; compile_kernels()'
-	$(DOCS)/bin/python -m sphinx -E -W --keep-going -q docs build/docs
+	PATH="$(CURDIR)/$(DOCS)/bin:$$PATH" $(DOCS)/bin/python -m sphinx -E -W --keep-going -q docs build/docs
 
 results: $(VENV)/installed ## the demo's figures and pictures, put into docs and the paper; needs Chromium
 	$(BIN)/faintfield demo $(OUT)

@@ -217,7 +217,7 @@ def open_stage(
     Returns
     -------
     Gantry
-        The stage, with `connect`, `home`, `move_to` and `close`; docs/stage.md says when a position is trusted.
+        The stage, with `connect`, `home`, `move_to` and `close`; see docs/explanation/stage.md on trust in positions.
 
     Raises
     ------

@@ -219,7 +219,7 @@ class SceneSettings(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class RigSettings(Struct, frozen=True, forbid_unknown_fields=True):
-    """Content of a rig.toml, which describes the rig and its capture (docs/capture.md).
+    """Content of a rig.toml, which describes the rig and its capture (docs/how-to/run_a_capture.md).
 
     Parameters
     ----------

@@ -134,7 +134,8 @@ class NoiseCalibration:
 def calibrate(series: Sequence[Series], saturation_dn: float = np.inf) -> NoiseCalibration:
     """Measure the noise of a sensor, or of one of its colour phases, from dark and flat frames.
 
-    The model is `dn = offset + gain · ( Poisson(light + dark current · t) + N(0, read noise²) )`, see docs/noise.md.
+    The model is `dn = offset + gain · ( Poisson(light + dark current · t) + N(0, read noise²) )`
+    (docs/explanation/noise.md).
 
     Parameters
     ----------

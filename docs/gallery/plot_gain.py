@@ -51,5 +51,7 @@ transfer.loglog(signal_dn, variance_dn2, "o")
 transfer.set(xlabel="signal, DN", ylabel="variance, DN²", title="photon transfer")
 residual.axhline(0, color="0.6")
 residual.errorbar(signal_dn, 100 * (variance_dn2 / model_dn2 - 1), 196 * error_dn2 / model_dn2, fmt="o", capsize=3)
-residual.set(xscale="log", xlabel="signal, DN", ylabel="residual, %", title="with 95 % bars: about zero, as it should be")
+residual.set(
+    xscale="log", xlabel="signal, DN", ylabel="residual, %", title="with 95 % bars: about zero, as it should be"
+)
 plt.show()

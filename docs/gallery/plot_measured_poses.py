@@ -34,7 +34,9 @@ print(f"{3.5e-3 * light_field.lens.fx_px:.1f} px")
 
 figure, axes = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
 white = float(np.percentile(planes["true"].image, 99.5))
-for axis, (poses, title) in zip(axes, {"nominal": "poses as commanded", "true": "poses as they were"}.items(), strict=True):
+for axis, (poses, title) in zip(
+    axes, {"nominal": "poses as commanded", "true": "poses as they were"}.items(), strict=True
+):
     planes[poses].plot(axis, white=white)
     axis.set(title=title, xlim=(-170, 50), ylim=(105, -15))
 plt.show()

@@ -21,9 +21,11 @@ class Sparsity:
     """R(f) = Σ f for f ≥ 0."""
 
     def value(self, plane):
+        """Return R(f)."""
         return float(plane.sum())
 
     def prox(self, point, metric, weight):
+        """Return the x ≥ 0 of least ½ Σ metric (x − point)² + weight R(x)."""
         return np.maximum(point - weight / metric, 0)
 
 
@@ -31,9 +33,11 @@ class Tikhonov:
     """R(f) = ½ Σ f²."""
 
     def value(self, plane):
+        """Return R(f)."""
         return 0.5 * float(np.vdot(plane, plane))
 
     def prox(self, point, metric, weight):
+        """Return the x ≥ 0 of least ½ Σ metric (x − point)² + weight R(x)."""
         return np.maximum(metric * point / (metric + weight), 0)
 
 

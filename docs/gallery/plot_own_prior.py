@@ -2,9 +2,9 @@
 A denoiser of your own as the prior
 ===================================
 
-A prior is any function that takes a picture and the standard deviation of its noise, and returns it without noise. Here
-it is the non-local means filter of scikit-image. Held-out views decide how much of it is used, and the data keep the last
-word.
+A prior is any function that takes a picture and the standard deviation of its noise, and returns it without noise.
+Here it is the non-local means filter of scikit-image. Held-out views decide how much of it is used, and the data keep
+the last word.
 """
 
 from pathlib import Path

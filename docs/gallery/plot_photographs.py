@@ -2,8 +2,8 @@
 A light field from pictures
 ===========================
 
-Pictures in a folder, named by their row and column, become a light field by `faintfield import grid`. The poses of these
-are not known in mm, so that depths are disparities: the pixels that a point moves from one picture to the next.
+Pictures in a folder, named by their row and column, become a light field by `faintfield import grid`. Their poses are
+not known in mm, so that depths are disparities: the pixels that a point moves from one picture to the next.
 """
 
 import subprocess

@@ -23,7 +23,7 @@ class OperatorOptions(TypedDict, total=False):
 
 
 class PlaneOperator(SceneOperator):
-    """H of one plane in `g = H f + n`, eq. (1) of the paper (docs/physics.md): the plane as the views see it.
+    """H of one plane in `g = H f + n`, eq. (1) of docs/explanation/physics.md: the plane as the views see it.
 
     H interpolates the plane bilinearly where the ray of each pixel meets it; Hᵀ spreads each pixel to the same four
     samples with the same weights. Samples f are an array (row, column), images g an array (view, row, column).

@@ -97,7 +97,7 @@ class SimulatedSettings(_LightSettings, frozen=True, forbid_unknown_fields=True,
 
 
 class PluginSettings(_LightSettings, frozen=True, forbid_unknown_fields=True, tag_field="driver", tag="plugin"):
-    """A light that another package drives; docs/plugins.md.
+    """A light that another package drives; docs/tutorials/camera_driver.md.
 
     Parameters
     ----------

@@ -258,8 +258,8 @@ class StageSettings(Struct, frozen=True, forbid_unknown_fields=True):
     Parameters
     ----------
     protocol : str
-        Firmware of the controller: "grbl" or "marlin"; "micromanager", or the name of a plug-in (docs/plugins.md);
-        "simulated" needs no port and no hardware.
+        Firmware of the controller: "grbl" or "marlin"; "micromanager", or the name of a plug-in
+        (docs/tutorials/camera_driver.md); "simulated" needs no port and no hardware.
     port : str
         Serial device, or a pyserial URL such as "socket://127.0.0.1:7000"; "simulated:grbl", "simulated:grblhal" or
         "simulated:marlin" need no hardware.

@@ -1,4 +1,4 @@
-"""The record of a sensor's noise, `noise.json` (docs/noise.md), its maps, and both as a reconstruction takes them."""
+"""The record of a sensor's noise, `noise.json`, its maps, and both as a reconstruction takes them."""
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
@@ -89,7 +89,7 @@ class EmvaImageRecord(Struct, frozen=True):
 
 
 class EmvaRecord(Struct, frozen=True):
-    """Quantities of EMVA 1288 that follow from others, or from one mean image; docs/noise.md has the formulas.
+    """Quantities of EMVA 1288 that follow from others, or from one mean image (docs/explanation/noise.md).
 
     `dark_noise_e` and the thresholds are those of an exposure of `dark_noise_exposure_s`; 0 is by extrapolation.
     """
