@@ -121,10 +121,15 @@ class Stop(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Until(Struct, frozen=True, forbid_unknown_fields=True):
-    """End of a step in rounds: the noise that a sample of a plane is to reach, and the largest number of rounds.
+    """End of a step in rounds.
 
-    `sigma_e` is the standard deviation of a sample, as wide as a pixel, of the unpenalised estimate, in electrons of
-    one frame of the step's first exposure.
+    Parameters
+    ----------
+    sigma_e : float
+        Noise to reach: the standard deviation of a sample, as wide as a pixel, of the unpenalised estimate, in
+        electrons of one frame of the step's first exposure.
+    at_most_rounds : int
+        Largest number of rounds.
     """
 
     sigma_e: float

@@ -209,7 +209,13 @@ class StepSettings(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SceneSettings(Struct, frozen=True, forbid_unknown_fields=True):
-    """The `[scene]` table: distances of the objects from the camera, at which `faintfield run` reconstructs planes."""
+    """The `[scene]` table: the scene in front of the camera.
+
+    Parameters
+    ----------
+    depth_mm : tuple of float
+        Distances of the objects from the camera, at which `faintfield run` reconstructs planes.
+    """
 
     depth_mm: tuple[float, ...] = ()
 

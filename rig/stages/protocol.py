@@ -41,7 +41,13 @@ class Point(NamedTuple):
 
 
 class Box(Struct, frozen=True, forbid_unknown_fields=True):
-    """A rectangle of positions from the lower to the upper end along each axis, including its edges."""
+    """A rectangle of positions from the lower to the upper end along each axis, including its edges.
+
+    Parameters
+    ----------
+    x_mm, y_mm : (float, float)
+        Lower and upper end along x; lower and upper end along y.
+    """
 
     x_mm: tuple[float, float]
     y_mm: tuple[float, float]
