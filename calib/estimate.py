@@ -23,9 +23,9 @@ class Estimate(Struct, frozen=True, omit_defaults=True):
     Attributes
     ----------
     value : float, optional
-        None if the frames do not determine it.
+        Measured value; None if the frames do not determine it.
     se, ci95 : float, tuple of float, optional
-        Standard error and interval.
+        Standard error; lower and upper end of the 95 % interval.
     why : str, optional
         Why there is no value, and what to record to get one.
     """
@@ -52,7 +52,7 @@ class SeriesGoodness(Struct, frozen=True, omit_defaults=True):
     left_out : str, optional
         Reason why the series was left out; absent if it was used.
     noise_excess, noise_se : float, optional
-        Variance over that of the model, minus 1, with its standard error under Gaussian noise; None for one frame.
+        Variance over that of the model, minus 1, absent for one frame; standard error of it under Gaussian noise.
     level_residual_dn : float, optional
         Level minus that of the model; None where the light of a flat is not known.
     blocks, rows, columns, by_frame : float, optional
@@ -80,7 +80,7 @@ class StageFigure(Struct, frozen=True):
     Attributes
     ----------
     value, sigma : float, optional
-        The figure, in the unit that its name ends with; its standard error.
+        The figure, in the unit that its name ends with; standard error of `value`.
     why : str, optional
         Why there is no value.
     """

@@ -36,7 +36,7 @@ class HeldOutGain(Struct, frozen=True):
     Attributes
     ----------
     value, sigma : float
-        The gain; its standard error.
+        The gain; standard error of `value`.
     patches : int
         Number of patches of the scene whose scatter gives the standard error.
     by_gradient : bool
@@ -74,9 +74,9 @@ class LensChange(Struct, frozen=True):
     Attributes
     ----------
     focal_length, focal_length_sigma : float
-        Relative change of the focal length; its standard deviation.
+        Relative change of the focal length; standard deviation of `focal_length`.
     distortion, distortion_sigma : float
-        Change of the first distortion coefficient; its standard deviation.
+        Change of the first distortion coefficient; standard deviation of `distortion`.
     """
 
     focal_length: float

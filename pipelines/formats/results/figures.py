@@ -60,7 +60,7 @@ class Overview(Struct, frozen=True, kw_only=True):
     size_px : (int, int)
         Width and height of a view.
     exposure_s : float, optional
-        Exposure time of a frame; null if it is not known.
+        Exposure time of a view, all its frames together; null if it is not known.
     frames_per_view : int
         Number of frames of a view.
     read_noise_e : float
@@ -172,7 +172,7 @@ class GeometryErrors(Struct, frozen=True):
     nodes : int
         Number of nodes that were compared.
     centre_rms_mm, centre_rms_axes_mm : float, tuple of float
-        Distance of the measured from the true centres of the cameras, rms; the same along x, y and z.
+        Distance of the measured from the true centres of the cameras, rms; rms along x, y and z.
     rotation_rms_mdeg : float
         Angle between measured and true orientation in thousandths of a degree, rms.
     """
@@ -189,7 +189,7 @@ class KnownValue(Struct, frozen=True):
     Attributes
     ----------
     value, se : float, optional
-        Measured value; its standard error.
+        Measured value; standard error of `value`.
     truth : float
         True value.
     """

@@ -205,7 +205,7 @@ class BoardRecord(Struct, frozen=True):
     name : str
         Name of the board.
     columns, rows : int
-        Numbers of squares across and down.
+        Number of squares across; number of squares down.
     square_mm, marker_mm : float
         Edge length of a square; edge length of a marker.
     dictionary : str

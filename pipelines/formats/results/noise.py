@@ -69,7 +69,7 @@ class SaturationRecord(Struct, frozen=True):
     level_dn : float, optional
         Last value of the converter, or mean of the noisiest series at a full well; null if the end is not reached.
     interval_dn : (float, float), optional
-        Bounds of the level: twice the last value of the converter, or the means of the series next to the noisiest one.
+        Lower and upper bound of the level: at a full well, the means of the series next to the noisiest one.
     """
 
     limit: Literal["ADC", "full well", "not reached"]
@@ -127,9 +127,9 @@ class EmvaImageRecord(Struct, frozen=True):
     exposure_s : float
         Exposure time of the series.
     level : int
-        Index of its light level; 0 for darks.
+        Index of the light level; 0 for darks.
     frames : int
-        Number of its frames.
+        Number of frames.
     signal_dn : float
         Mean signal: above the offset for a dark, above the dark image for a flat.
     """
@@ -152,7 +152,7 @@ class EmvaRecord(Struct, frozen=True):
     responsivity_dn_per_photon : Estimate
         Responsivity R = K η.
     threshold_e, threshold_photons : Estimate
-        Absolute sensitivity threshold μ_e.min, at which SNR = 1; the same in photons, μ_p.min.
+        Absolute sensitivity threshold μ_e.min, at which SNR = 1; that threshold in photons, μ_p.min.
     saturation_photons : Estimate
         Saturation capacity in photons, μ_p.sat.
     snr_max : Estimate
@@ -160,9 +160,9 @@ class EmvaRecord(Struct, frozen=True):
     dynamic_range : Estimate
         Dynamic range DR = μ_p.sat/μ_p.min.
     dsnu_total_e, dsnu_row_e, dsnu_column_e, dsnu_pixel_e : Estimate
-        DSNU of the dark image; its row part; its column part; its pixel part.
+        DSNU of the dark image; row part of DSNU; column part of DSNU; pixel part of DSNU.
     prnu_total, prnu_row, prnu_column, prnu_pixel : Estimate
-        PRNU of the bright image, as a fraction; its row part; its column part; its pixel part.
+        PRNU of the bright image, as a fraction; row part of PRNU; column part of PRNU; pixel part of PRNU.
     dark_current_doubling_k : Estimate
         Temperature difference T_d in kelvin that doubles the dark current.
     dark_image, bright_image : EmvaImageRecord, optional
@@ -282,9 +282,9 @@ class PhaseRecord(Quantities, frozen=True):
     Attributes
     ----------
     phase : (int, int)
-        Row and column of its first pixel.
+        Row and column of the first pixel of the phase.
     colour : str
-        Letter of its filter, such as "R".
+        Letter of the filter, such as "R".
     likelihood : str
         Name of the likelihood that was maximised.
     masked_black_dn : float, optional
@@ -309,7 +309,7 @@ class CovarianceRecord(Struct, frozen=True):
     names : list of str
         Names of the quantities.
     matrix : list of list of float
-        Their covariance (quantity, quantity), in the products of their units.
+        Covariance of the quantities (quantity, quantity), in the products of their units.
     """
 
     names: list[str]
@@ -322,7 +322,7 @@ class TemperatureRange(Struct, frozen=True):
     Attributes
     ----------
     mean, min, max : float
-        Mean; lowest; highest.
+        Mean temperature; lowest temperature; highest temperature.
     """
 
     mean: float
@@ -373,7 +373,7 @@ class NoiseRecord(_StandardQuantities, frozen=True, kw_only=True):
     warnings : list of str
         Problems of the frames.
     maps, maps_sha256 : str
-        Name of the file with the maps per pixel; its SHA-256.
+        Name of the file with the maps per pixel; SHA-256 of that file.
     provenance : Provenance, optional
         Command, options, inputs and versions.
     fit, emva1288 : FitRecord, EmvaRecord

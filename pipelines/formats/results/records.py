@@ -66,7 +66,7 @@ class Certificate(Struct, frozen=True, kw_only=True):
     value : float
         PMLEM: bound on the relative distance to the optimum.
     stationarity, slack : float
-        PMLEM: part of the bound from the gradient; part of the bound from the penalty and the limit at zero.
+        PMLEM: part of the bound from the gradient; PMLEM: part of the bound from the penalty and the limit at zero.
     tolerance : float
         Distance at which the iteration stops.
     reached : bool
@@ -218,7 +218,7 @@ class PlaneRecord(Struct, frozen=True, kw_only=True):
     mean_e : float
         Mean light of the samples per detector pixel of the reference view.
     saturated_share, unknown_share : float, optional
-        Share of saturated pixels in all views; share of the samples, NaN, that are seen mostly by such pixels.
+        Share of saturated pixels in all views; share of the samples, NaN, that mostly saturated pixels see.
     passes_before : float, optional
         Passes over the data before the iteration: for its start, its weight and its prior.
     penalty_weight_curve : list of WeightScore, optional
@@ -304,7 +304,7 @@ class FocusPoint(Struct, frozen=True):
     Attributes
     ----------
     detail_e2, sigma_e2 : float
-        Power of the detail that two halves of the views share; its standard deviation.
+        Power of the detail that two halves of the views share; standard deviation of `detail_e2`.
     """
 
     detail_e2: float
@@ -319,7 +319,7 @@ class FocusCurve(Struct, frozen=True, kw_only=True):
     depth_mm : list of float
         Depths of the planes.
     detail_e2, sigma_e2 : list of float
-        Power of the detail that two halves of the views share, by plane; its standard deviation, by plane.
+        Power of the detail that two halves of the views share, by plane; standard deviation of `detail_e2`.
     sharp_mm : list of float
         Depths at which the power peaks.
     """

@@ -85,11 +85,11 @@ class HeldOutRecord(Struct, frozen=True, kw_only=True):
     surface : float
         Mean squared error over the variance of the noise, predicted by the surface; 1 is perfect.
     planes : float, optional
-        The same by the depths of the surface on a few planes.
+        That error, predicted by the depths of the surface on a few planes.
     standard_error : float, optional
         Standard error of the difference between `planes` and `surface`.
     neighbours : float, optional
-        The same by the mean of each view's neighbours, blurred.
+        That error, predicted by the mean of each view's neighbours, blurred.
     """
 
     views: list[Count]
@@ -133,7 +133,7 @@ class SurfaceChannel(Struct, frozen=True, kw_only=True):
     mean_e : float
         Mean light of the samples per detector pixel of the reference view.
     saturated_share, unknown_share : float, optional
-        Share of saturated pixels in all views; share of the samples, NaN, that are seen mostly by such pixels.
+        Share of saturated pixels in all views; share of the samples, NaN, that mostly saturated pixels see.
     prior : PriorRecord, optional
         Prior of the picture.
     """
@@ -161,7 +161,7 @@ class SurfaceFacts(Struct, frozen=True, kw_only=True):
     searched : (float, float)
         Nearest and farthest depth that were considered, in `unit`.
     range_found : bool
-        True if these were found in the views.
+        True if the range was found in the views.
     depths : int
         Number of depths that were compared.
     bins_px : int
@@ -202,13 +202,13 @@ class SurfaceRecord(SurfaceFacts, frozen=True, kw_only=True):
     Attributes
     ----------
     picture, picture_sigma : str
-        Name of the TIFF with the light of each sample; name of the TIFF with its standard deviation.
+        Name of the TIFF with the light of each sample; name of the TIFF with the standard deviation of that light.
     picture_proposal, picture_moved : str, optional
         Name of the TIFF with the light that the prior proposed; name of the TIFF with picture less proposal, in
         standard deviations of the noise.
     depth, depth_sigma : str
-        Name of the TIFF with the depth of each sample in `unit`, NaN where it is not known; name of the TIFF with its
-        standard deviation.
+        Name of the TIFF with the depth of each sample in `unit`, NaN where it is not known; name of the TIFF with the
+        standard deviation of that depth.
     depth_confidence : str
         Name of the TIFF with the probability that each depth is right within 2 %.
     visibility : str

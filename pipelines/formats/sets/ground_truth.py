@@ -33,7 +33,7 @@ class TruePlane(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     depth_mm : float
         Depth of the object.
     texture : str
-        File of its light in expected electrons.
+        File of the object's light in expected electrons.
     visible : str
         File of the mask of the region where the reference camera sees it.
     """
@@ -104,7 +104,7 @@ class TrueDepth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     depth_mm : str
         File of the depths along the camera's axis, at the centres of the pixels, NaN where there is none.
     source, sha256 : str
-        Name of the file that was imported; its SHA-256.
+        Name of the file that was imported; SHA-256 of that file.
     """
 
     format: Literal[1]
