@@ -6,6 +6,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent / "_extensions"))
+from types_of_names import type_aliases
 
 project = "faintfield"
 author = "The faintfield developers"
@@ -31,8 +32,9 @@ autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 python_maximum_signature_line_length = 88
 numpydoc_show_class_members = False
-# Types in signatures that are no public names have no page.
-nitpick_ignore_regex = [("py:class", r"(collections|numpy|pathlib|faintfield\.\w+)\..*|\w+\[.*")]
+# Types of other packages and aliases in signatures have no page.
+nitpick_ignore_regex = [("py:class", r"(collections|cv2|msgspec|numpy|pathlib)\..*|\w+\[.*")]
+nitpick_ignore = [("py:class", name) for name in type_aliases()]
 # sphinx-gallery has linked the names of its examples already, and Sphinx removes the flags of doctests from others.
 suppress_warnings = ["codeautolink.match_name", "codeautolink.match_block"]
 

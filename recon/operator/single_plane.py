@@ -13,7 +13,17 @@ from faintfield.recon.operator.scene_operator import SceneOperator
 
 
 class OperatorOptions(TypedDict, total=False):
-    """Options of `recon.operator.scene_operator.SceneOperator` that the operators of one plane take, too."""
+    """Options of `recon.operator.scene_operator.SceneOperator` that the operators of one plane take, too.
+
+    Attributes
+    ----------
+    flat, valid : array (row, column) or (lattice, row, column), bool array (view, row, column), optional
+        Relative response of each pixel; False for pixels that do not count in one view.
+    lattice_of_view : int array (view,), optional
+        The lattice of detector pixels of each view; the first by default.
+    dtype, workers : dtype, int, optional
+        Type of samples and images, and number of threads, by default as many as the process may use.
+    """
 
     flat: NDArray[np.floating] | None
     valid: NDArray[np.bool_] | None
