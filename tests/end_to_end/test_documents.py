@@ -13,7 +13,11 @@ from faintfield.pipelines.formats.sets.elemental_file import ElementalSetFile
 
 _ROOT = Path(__file__).parents[2]
 _SKIPPED = ("make ", "git clone ")
-DOCUMENTS = ("README.md", "docs/guide.md", "docs/api.md", "docs/how-to/operators.md")
+_LESSONS = (page for folder in ("tutorials", "how-to") for page in sorted((_ROOT / "docs" / folder).glob("*.md")))
+DOCUMENTS = (
+    "README.md",
+    *(str(page.relative_to(_ROOT)) for page in _LESSONS if re.search(r"^```(sh|python)$", page.read_text(), re.MULTILINE)),
+)
 
 # Smaller numbers for the examples of the README, so that all of them run with the quick tests.
 SMALLER = {
