@@ -13,11 +13,6 @@ from faintfield.pipelines.formats.sets.elemental_file import ElementalSetFile
 
 _ROOT = Path(__file__).parents[2]
 _SKIPPED = ("make ", "git clone ")
-_LESSONS = (page for folder in ("tutorials", "how-to") for page in sorted((_ROOT / "docs" / folder).glob("*.md")))
-DOCUMENTS = (
-    "README.md",
-    *(str(page.relative_to(_ROOT)) for page in _LESSONS if re.search(r"^```(sh|python)$", page.read_text(), re.MULTILINE)),
-)
 
 # Smaller numbers for the examples of the README, so that all of them run with the quick tests.
 SMALLER = {
@@ -34,6 +29,11 @@ def _blocks(document: str, *kinds: str) -> list[tuple[str, str]]:
     text = (_ROOT / document).read_text()
     found = re.findall(r"^```(\w+)\n(.*?)^```$", text, flags=re.DOTALL | re.MULTILINE)
     return [(kind, content) for kind, content in found if kind in kinds]
+
+
+_PAGES = [path for folder in ("tutorials", "how-to") for path in sorted((_ROOT / "docs" / folder).glob("*.md"))]
+_LESSONS = [str(path.relative_to(_ROOT)) for path in _PAGES]
+DOCUMENTS = ["README.md", *(lesson for lesson in _LESSONS if _blocks(lesson, "sh", "python"))]
 
 
 def _run_examples(blocks: list[tuple[str, str]]) -> None:
