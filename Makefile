@@ -54,7 +54,7 @@ build/bench:
 
 docs: $(DOCS)/installed ## the site of the documentation: build/docs/index.html
 	$(DOCS)/bin/python -c 'from faintfield.recon import compile_kernels; compile_kernels()'
-	$(DOCS)/bin/python -m sphinx -E -W --keep-going -q docs build/docs
+	PATH="$(CURDIR)/$(DOCS)/bin:$$PATH" $(DOCS)/bin/python -m sphinx -E -W --keep-going -q docs build/docs
 
 results: $(VENV)/installed ## the demo's figures and pictures, put into docs and the paper; needs Chromium
 	$(BIN)/faintfield demo $(OUT)
@@ -66,12 +66,12 @@ lock: ## renew requirements.lock and docs.lock from pyproject.toml; they leave o
 	$(PYTHON) -m venv .uv
 	.uv/bin/pip --disable-pip-version-check --quiet install uv
 	$(COMPILE) --extra cluster --extra zarr --group dev --override overrides.txt -o requirements.lock
-	$(COMPILE) --group docs --constraint requirements.lock -o docs.lock
+	$(COMPILE) --extra notebook --group docs --override overrides.txt --constraint requirements.lock -o docs.lock
 
 clean: ## remove what the tasks made
 	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +
 	rm -rf $(VENV) $(DOCS) .uv build dist demo *.egg-info .ruff_cache .mypy_cache .pytest_cache .hypothesis .import_linter_cache
-	rm -rf docs/reference/names docs/tutorials/gallery
+	rm -rf docs/reference/names docs/tutorials/gallery docs/tutorials/failures
 
 # uv installs the same packages four times faster than pip; where it cannot reach pip's index, pip does it.
 # $(call install,LOCK,ENVIRONMENT)

@@ -23,9 +23,9 @@ class Estimate(Struct, frozen=True, omit_defaults=True):
     Attributes
     ----------
     value : float, optional
-        None if the frames do not determine it.
+        Measured value; None if the frames do not determine it.
     se, ci95 : float, tuple of float, optional
-        Standard error and interval.
+        Standard error; lower and upper end of the 95 % interval.
     why : str, optional
         Why there is no value, and what to record to get one.
     """
@@ -41,8 +41,18 @@ class SeriesGoodness(Struct, frozen=True, omit_defaults=True):
 
     Attributes
     ----------
+    kind : {"dark", "flat"}
+        Lens covered, or evenly lit.
+    exposure_s : float
+        Exposure time.
+    level : int
+        Index of the light level; 0 for darks.
+    frames : int
+        Number of frames.
+    left_out : str, optional
+        Reason why the series was left out; absent if it was used.
     noise_excess, noise_se : float, optional
-        Variance over that of the model, minus 1, with its standard error under Gaussian noise; None for one frame.
+        Variance over that of the model, minus 1, absent for one frame; standard error of it under Gaussian noise.
     level_residual_dn : float, optional
         Level minus that of the model; None where the light of a flat is not known.
     blocks, rows, columns, by_frame : float, optional
@@ -65,7 +75,15 @@ class SeriesGoodness(Struct, frozen=True, omit_defaults=True):
 
 
 class StageFigure(Struct, frozen=True):
-    """A figure of the stage with its standard error, or the reason why there is none."""
+    """A figure of the stage with its standard error, or the reason why there is none.
+
+    Attributes
+    ----------
+    value, sigma : float, optional
+        The figure, in the unit that its name ends with; standard error of `value`.
+    why : str, optional
+        Why there is no value.
+    """
 
     value: float | None
     sigma: float | None = None
@@ -107,9 +125,15 @@ class StageReport(Struct, frozen=True):
 
 
 class Repeatability(Struct, frozen=True):
-    """Standard deviation of the gantry's position at a node between sweeps, per axis, and its standard error.
+    """Repeatability of the stage, from the same nodes in several sweeps.
 
-    It is zero if the corners' noise explains all differences.
+    Attributes
+    ----------
+    sd_mm : float
+        Standard deviation of the stage's position at a node between sweeps, per axis; zero if the noise of the corners
+        explains all differences.
+    se_mm : float
+        Standard error of `sd_mm`.
     """
 
     sd_mm: float

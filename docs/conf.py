@@ -6,6 +6,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent / "_extensions"))
+from types_of_names import type_aliases
 
 project = "faintfield"
 author = "The faintfield developers"
@@ -15,14 +16,14 @@ version = release = installed_version("faintfield")
 extensions = [
     "sphinx.ext.autodoc",
     "numpydoc",
-    "myst_parser",
+    "myst_nb",  # Markdown by myst_parser, and notebooks
     "sphinx_design",
     "sphinx_gallery.gen_gallery",
     "sphinx_codeautolink",
     "reference_pages",
     "repository_links",
 ]
-exclude_patterns = ["gallery", "_extensions"]
+exclude_patterns = ["gallery", "failures", "_extensions", "tutorials/*/*.ipynb"]  # sphinx-gallery makes these to download
 default_role = "code"
 smartquotes = False  # two hyphens are an option
 nitpicky = True
@@ -31,8 +32,9 @@ autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 python_maximum_signature_line_length = 88
 numpydoc_show_class_members = False
-# Types in signatures that are no public names have no page.
-nitpick_ignore_regex = [("py:class", r"(collections|numpy|pathlib|faintfield\.\w+)\..*|\w+\[.*")]
+# Types of other packages and aliases in signatures have no page.
+nitpick_ignore_regex = [("py:class", r"(collections|cv2|msgspec|numpy|pathlib)\..*|\w+\[.*")]
+nitpick_ignore = [("py:class", name) for name in type_aliases()]
 # sphinx-gallery has linked the names of its examples already, and Sphinx removes the flags of doctests from others.
 suppress_warnings = ["codeautolink.match_name", "codeautolink.match_block"]
 
@@ -43,15 +45,19 @@ myst_heading_anchors = 4
 _run = "plot_" if find_spec("deepinv") else "plot_(?!deepinv)"
 
 sphinx_gallery_conf = {
-    "examples_dirs": "gallery",
+    "examples_dirs": ["gallery", "failures"],
     "filename_pattern": _run,
-    "ignore_pattern": "dark_scene",
-    "gallery_dirs": "tutorials/gallery",
+    "ignore_pattern": "_scene",
+    "gallery_dirs": ["tutorials/gallery", "tutorials/failures"],
     "download_all_examples": False,
     "remove_config_comments": True,
     "show_signature": False,
     "write_computation_times": False,  # its page loads scripts from other hosts
 }
+
+nb_execution_mode = "force"
+nb_execution_raise_on_error = True
+nb_execution_timeout = 300
 
 html_theme = "pydata_sphinx_theme"
 html_title = "faintfield"

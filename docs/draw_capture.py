@@ -44,7 +44,7 @@ _SCREENS = ((1400, 1000), (1024, 1000), (390, 844))
 _DEPTHS_MM = (400.0, 450.0, 500.0, 550.0, 600.0, 650.0, 700.0)
 # Electrons per pixel and second, as the dark scene is planned.
 _LIGHT_E_PER_S = 13.0
-# What docs/capture.md shows: phase and width.
+# What docs/how-to/run_a_capture.md shows: phase and width.
 _SHOWN = (("prompt", 1400), ("boards", 1024), ("dark_scene", 1400), ("dark_scene", 390))
 # Their longest part, in widths of the screen, and their width.
 _LONGEST = 2.2

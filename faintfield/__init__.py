@@ -1,7 +1,7 @@
 """Photon-starved integral imaging: calibrate a camera on a grid of nodes, and reconstruct what it saw in the dark.
 
-`__all__` lists the public names, and docs/api.md shows them in use. A name is loaded from its module at its first use,
-so `import faintfield` is quick.
+`__all__` lists the public names, and docs/how-to/use_python.md shows them in use. A name is loaded from its module at
+its first use, so `import faintfield` is quick.
 """
 
 from importlib import import_module

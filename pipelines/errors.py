@@ -84,7 +84,7 @@ class UnknownKey(BadValue):
 class ArrangementError(InputError):
     """Pictures are no views from a grid, or do not tell which.
 
-    The group of the failures below, each of which has its remedy (docs/archives.md).
+    The group of the failures below, each of which has its remedy (docs/how-to/import_pictures.md).
     """
 
 
@@ -172,7 +172,7 @@ class ClusterFailed(InputError):
     """The workers of a cluster cannot be reached, or died; the planes they finished are kept.
 
     Check that the scheduler runs, its address, and the logs; with `--workers`, the memory; then the same command
-    resumes (docs/cluster.md).
+    resumes (docs/how-to/sweep_many_planes.md).
     """
 
 

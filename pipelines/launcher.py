@@ -79,7 +79,7 @@ EXPORTS = (
 
 _START = """Start with: faintfield demo first-demo
 
-The --help of every command ends with an example; docs/guide.md leads from the parts list to the first plane."""
+The --help of every command ends with an example; docs/tutorials/rig.md leads from the parts list to the first plane."""
 
 
 def _explain_usage(failure: CycloptsError) -> str:

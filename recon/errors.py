@@ -54,9 +54,9 @@ class NothingInFocus(ReconstructionError):
 
     Give a range by `--sweep-mm`, or by `--depth-range-mm` for a surface; use more light; check the poses.
 
-    A message that names shuffled views: the views agree no better than in random places (docs/depth.md), because of
-    noise, copies, different scenes, or a wrong order. Check order and places of the pictures; use more light; or make
-    planes at depths given by `--depth`.
+    A message that names shuffled views: the views agree no better than in random places (docs/explanation/depth.md),
+    because of noise, copies, different scenes, or a wrong order. Check order and places of the pictures; use more
+    light; or make planes at depths given by `--depth`.
 
     A message that names an option of `import grid`: rows or columns run the other way, or are exchanged. Import again
     with that option.

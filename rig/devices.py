@@ -47,11 +47,22 @@ _OUTPUTS: dict[str, tuple[OutputKind, ...]] = {
 
 @dataclass(frozen=True)
 class Rig:
-    """The devices of a capture, not yet connected, and their clock; `lights` are those that it switches, by name.
+    """The devices of a capture, not yet connected, and their clock.
 
-    `arrange` is called with kind and sweep at the beginning of each step; a simulated lab then does what a person does
-    in a real one. A real camera may look on while a simulated stage moves: then `camera_sees_stage` is False, as it
-    neither swings with the stage nor shares its clock.
+    Attributes
+    ----------
+    stage, camera : Gantry, Camera
+        The stage and the camera.
+    clock : Clock
+        Clock of all devices.
+    arrange : callable
+        Is called with kind and sweep at the beginning of each step; a simulated lab then does what a person does in a
+        real one.
+    camera_sees_stage : bool
+        False if a real camera looks on while a simulated stage moves: it neither swings with the stage nor shares its
+        clock.
+    lights : mapping of str to Light
+        Lights that the rig switches, by name.
     """
 
     stage: Gantry
@@ -217,7 +228,7 @@ def open_stage(
     Returns
     -------
     Gantry
-        The stage, with `connect`, `home`, `move_to` and `close`; docs/stage.md says when a position is trusted.
+        The stage, with `connect`, `home`, `move_to` and `close`; see docs/explanation/stage.md on trust in positions.
 
     Raises
     ------

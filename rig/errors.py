@@ -121,7 +121,7 @@ class PlanRefused(RigError):
 
     rig.toml has impossible values, or differs from that of the session: the message names key and values. A session
     that has begun keeps its plan; `faintfield check rig.toml --session SESSION` lists what may change
-    (docs/capture.md).
+    (docs/how-to/run_a_capture.md).
     """
 
 
@@ -169,7 +169,7 @@ class WrongFirmware(PlanRefused):
 class UnknownPlugin(PlanRefused):
     """No driver of this name is built in or installed, or it does not have these settings.
 
-    Choose a `backend` or `protocol` that the message lists, or install its package (docs/plugins.md).
+    Choose a `backend` or `protocol` that the message lists, or install its package (docs/tutorials/camera_driver.md).
     """
 
 
@@ -191,7 +191,7 @@ class CameraError(RigError):
 
     Came without a request: the program that saves into the watched folder takes frames by itself, or was triggered
     before the capture was "exposing". Set it to take one frame each time it is triggered; or state `delay_s`
-    (docs/capture.md).
+    (docs/how-to/run_a_capture.md).
 
     A message that names two sizes: the camera's region, binning, image size or bit depth was changed. Set it as it was;
     to go on with the new one, begin a new session. If the only frame so far is the odd one, take this one again: the
@@ -246,7 +246,7 @@ class SessionCorrupt(SessionError):
     `capture` again.
 
     A message that names journal.sqlite-wal: version 0.2.0 sealed the session while another program read its journal.
-    Use `faintfield verify SESSION --repair` (docs/sessions.md).
+    Use `faintfield verify SESSION --repair` (docs/how-to/check_a_session.md).
     """
 
 

@@ -31,8 +31,14 @@ def set_properties(core: Any, label: str, properties: Mapping[str, str]) -> None
 class SharedCore:
     """A core that is loaded for its first user and unloaded after its last; its methods block, and may hang.
 
-    Devices are loaded once, since most can be opened only once. By default the configuration is that of the
-    demonstration devices, and their adapters are those that pymmcore-plus finds.
+    Devices are loaded once, since most can be opened only once.
+
+    Parameters
+    ----------
+    configuration : str
+        Configuration file; by default that of the demonstration devices.
+    adapters : str
+        Folder of the device adapters; by default that which pymmcore-plus finds.
     """
 
     def __init__(self, configuration: str = "", adapters: str = "") -> None:

@@ -110,7 +110,15 @@ class Grid(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Stop(Struct, frozen=True, forbid_unknown_fields=True):
-    """A node and its position."""
+    """A node and its position.
+
+    Attributes
+    ----------
+    node : (int, int)
+        Row and column of the node.
+    target : Point
+        Position of the stage.
+    """
 
     node: tuple[int, int]
     target: Point
@@ -121,10 +129,15 @@ class Stop(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Until(Struct, frozen=True, forbid_unknown_fields=True):
-    """End of a step in rounds: the noise that a sample of a plane is to reach, and the largest number of rounds.
+    """End of a step in rounds.
 
-    `sigma_e` is the standard deviation of a sample, as wide as a pixel, of the unpenalised estimate, in electrons of
-    one frame of the step's first exposure.
+    Parameters
+    ----------
+    sigma_e : float
+        Noise to reach: the standard deviation of a sample, as wide as a pixel, of the unpenalised estimate, in
+        electrons of one frame of the step's first exposure.
+    at_most_rounds : int
+        Largest number of rounds.
     """
 
     sigma_e: float
@@ -301,11 +314,24 @@ def check_frame_count(count: int) -> None:
 
 
 class PlannedFrame(Struct, frozen=True):
-    """One frame that the plan asks for: the one with index `number`, in the step with index `step`.
+    """One frame that the plan asks for.
 
-    `sweep` is the number of earlier steps of the same kind: the sweep of a board, the light level of a flat. `repeat`
-    is the index among the frames of the same exposure time at the same stop, in all rounds, and `round` that of the
-    round over the grid.
+    Attributes
+    ----------
+    number, step : int
+        Index of the frame in the plan; index of its step.
+    kind : {"charuco", "bright", "dark_scene", "noise_reference", "dark", "flat"}
+        Kind of the step.
+    sweep : int
+        Number of earlier steps of the same kind: the sweep of a board, the light level of a flat.
+    stop : Stop
+        Node at which it is taken.
+    exposure_s : float
+        Exposure time.
+    repeat : int
+        Index among the frames of the same exposure time at the same stop, in all rounds.
+    round : int
+        Index of the round over the grid.
     """
 
     number: int

@@ -1,4 +1,4 @@
-"""Cameras, stages and lights from other packages, found by their entry points; docs/plugins.md shows one."""
+"""Cameras, stages and lights from other packages, found by their entry points (docs/tutorials/camera_driver.md)."""
 
 import difflib
 from collections.abc import Callable, Iterator, Mapping

@@ -75,10 +75,10 @@ class SettleSettings(Struct, frozen=True, forbid_unknown_fields=True):
     Parameters
     ----------
     measure, exposure_s : bool, float
-        Measure the rest once per session, from short frames after a move; exposure time of these.
+        Measure the rest once per session, from short frames after a move; exposure time of the short frames.
     limit_px, board_limit_px : float
-        Largest shift of the picture that does no harm; the same in board sweeps, whose corners fit to some thousandths
-        of a pixel.
+        Largest shift of the picture that does no harm; largest shift in board sweeps, whose corners fit to some
+        thousandths of a pixel.
     longest_s : float
         Duration of the measurement; there is a warning if the rig still swings at its end.
     wait_s : float
@@ -209,7 +209,13 @@ class StepSettings(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SceneSettings(Struct, frozen=True, forbid_unknown_fields=True):
-    """The `[scene]` table: distances of the objects from the camera, at which `faintfield run` reconstructs planes."""
+    """The `[scene]` table: the scene in front of the camera.
+
+    Parameters
+    ----------
+    depth_mm : tuple of float
+        Distances of the objects from the camera, at which `faintfield run` reconstructs planes.
+    """
 
     depth_mm: tuple[float, ...] = ()
 
@@ -219,7 +225,7 @@ class SceneSettings(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class RigSettings(Struct, frozen=True, forbid_unknown_fields=True):
-    """Content of a rig.toml, which describes the rig and its capture (docs/capture.md).
+    """Content of a rig.toml, which describes the rig and its capture (docs/how-to/run_a_capture.md).
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
 """Contract tests: what every camera, stage, light and sweep must do, ours and those of other packages.
 
-They need pytest. `docs/plugins.md` shows how a package runs them.
+They need pytest. `docs/tutorials/camera_driver.md` shows how a package runs them.
 """
 
 import pytest

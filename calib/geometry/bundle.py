@@ -75,7 +75,13 @@ class BundleProblem:
 
 @dataclass(frozen=True)
 class Bundle:
-    """Solution: mrcal's optimization inputs at the optimum, where `mrcal.optimize(**inputs)` stays."""
+    """Solution of a bundle adjustment.
+
+    Attributes
+    ----------
+    inputs : dict
+        Optimization inputs of mrcal at the optimum, where `mrcal.optimize(**inputs)` stays.
+    """
 
     inputs: dict[str, Any]
 

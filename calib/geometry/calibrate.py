@@ -93,7 +93,8 @@ def calibrate_geometry(
     """Return lens, poses and their covariance from the corners of boards seen from the nodes.
 
     Lens, camera poses and board poses minimise the distances between corners and their projections, by bundle
-    adjustment (docs/geometry.md). The solution is refused if it does not determine the transfer between views.
+    adjustment (docs/explanation/geometry.md). The solution is refused if it does not determine the transfer between
+    views.
 
     Parameters
     ----------

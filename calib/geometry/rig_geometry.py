@@ -19,7 +19,15 @@ _CHANCE = 1e-3
 
 @dataclass(frozen=True)
 class BoardPose:
-    """Pose of a board during a sweep; the board's origin is its first inner corner."""
+    """Pose of a board during a sweep; the board's origin is its first inner corner.
+
+    Attributes
+    ----------
+    target : Target
+        The board, with its sweep and homing.
+    rt_ref_board : float array (6,)
+        Rodrigues vector in rad and translation in mm, from the board's frame to the reference camera's.
+    """
 
     target: Target
     rt_ref_board: NDArray[np.float64]
@@ -27,7 +35,15 @@ class BoardPose:
 
 @dataclass(frozen=True)
 class HomingShift:
-    """Shift (3,) of all cameras from one homing to a later one, in the reference camera's frame, and its covariance."""
+    """Shift of all cameras from one homing of the stage to a later one, in the reference camera's frame.
+
+    Attributes
+    ----------
+    before, after : int
+        Numbers of the two homings.
+    shift_mm, covariance_mm2 : float array (3,), float array (3, 3)
+        The shift, and its covariance.
+    """
 
     before: int
     after: int

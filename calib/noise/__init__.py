@@ -1,4 +1,4 @@
-"""Measure the noise of a sensor from dark and flat frames; docs/noise.md describes the physics.
+"""Measure the noise of a sensor from dark and flat frames; docs/explanation/noise.md describes the physics.
 
 `SeriesSums` reduces frames to sufficient statistics, and `calibrate` turns these into numbers, maps and warnings.
 """

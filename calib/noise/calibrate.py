@@ -46,9 +46,16 @@ _MAX_STRAIGHT = 1e-3
 
 @dataclass(frozen=True)
 class Histogram:
-    """Values of the dark series of one exposure, from the lowest to the highest (value,).
+    """Values of the dark series of one exposure, from the lowest to the highest.
 
-    `count` is the number of times each occurred among the sampled pixels and frames, `expected` the same by the fit.
+    Attributes
+    ----------
+    exposure_s : float
+        Exposure time.
+    value_dn : int array (value,)
+        The values.
+    count, expected : int array (value,), float array (value,)
+        How often each value occurs among the sampled pixels and frames, and how often the fit expects it.
     """
 
     exposure_s: float
@@ -134,7 +141,8 @@ class NoiseCalibration:
 def calibrate(series: Sequence[Series], saturation_dn: float = np.inf) -> NoiseCalibration:
     """Measure the noise of a sensor, or of one of its colour phases, from dark and flat frames.
 
-    The model is `dn = offset + gain · ( Poisson(light + dark current · t) + N(0, read noise²) )`, see docs/noise.md.
+    The model is `dn = offset + gain · ( Poisson(light + dark current · t) + N(0, read noise²) )`
+    (docs/explanation/noise.md).
 
     Parameters
     ----------

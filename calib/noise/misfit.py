@@ -28,7 +28,19 @@ _NOTABLE_FRACTION, _NOTABLE_DRIFT, _MAX_SCATTER_CHANCE = 0.005, 0.1, 1e-3
 
 @dataclass(frozen=True)
 class TransferPoint:
-    """One series as EMVA 1288 plots it: measured and modelled mean and variance, in DN and DN²."""
+    """One series as EMVA 1288 plots it.
+
+    Attributes
+    ----------
+    kind, exposure_s, frames : str, float, int
+        "dark" or "flat", exposure time, and number of frames.
+    mean_dn : float
+        Mean of the pixels.
+    variance_dn2, variance_se_dn2 : float
+        Temporal variance of a pixel and its standard error; NaN for a single frame.
+    model_mean_dn, model_variance_dn2 : float
+        The same by the model. The model has no mean of its own for flats: it is the measured one.
+    """
 
     kind: str
     exposure_s: float

@@ -1,4 +1,4 @@
-"""Gain and read noise estimated from the views of a scene, where nobody measured them; docs/noise.md says how.
+"""Gain and read noise estimated from the views of a scene, where nobody measured them (docs/explanation/noise.md).
 
 Neighbouring views show the same scene, moved. The part of three of them that no movement explains is noise, and its
 variance over the light is a photon transfer curve. Each block of the middle view is compared on its own:

@@ -22,7 +22,7 @@ def body(value: object) -> str:
     return linked("\n".join(parse_docstring(value)["Extended Summary"]).strip())
 
 
-# Name of a page in a text, such as docs/noise.md.
+# Name of a page in a text, such as docs/explanation/noise.md.
 PAGE_NAME = re.compile(r"`?docs/([\w/-]+)\.md`?")
 
 

@@ -19,6 +19,8 @@ _UNITS = {
 _WORDS = {types.IntType: "whole number", types.FloatType: "number", types.BoolType: "true or false"}
 # Largest number of tables of one type whose names are in a heading.
 _MOST_NAMES = 3
+# First letter of a text that begins with a word, not with a symbol such as k1 or β.
+_LOWER_WORD = re.compile(r"^[a-z](?=[a-z]+\b)")
 _LIMITS = {"ge": "at least {}", "gt": "more than {}", "le": "at most {}", "lt": "less than {}"}
 
 
@@ -111,7 +113,7 @@ def _meaning(kind: type, name: str) -> str:
             if name in (names := entry.name.split(", ")):
                 parts = "\n".join(entry.desc).removesuffix(".").split("; ")
                 text = parts[names.index(name)] if len(parts) == len(names) else "; ".join(parts)
-                return linked(f"{text[:1].upper()}{text[1:]}.")
+                return linked(f"{_LOWER_WORD.sub(lambda letter: letter[0].upper(), text)}.")
     return ""
 
 

@@ -1,9 +1,11 @@
-"""Public names of `faintfield`: a table of each group, and a page of each name."""
+"""Public names of `faintfield`, and the types that they take and return: a table of each group, and a page of each."""
 
 import inspect
+from collections.abc import Mapping
 from pathlib import Path
 
 from docstrings import summary, table
+from types_of_names import full_name, shows_constructor, types_of_names
 
 import faintfield
 
@@ -28,22 +30,44 @@ def grouped_names() -> dict[str, list[str]]:
 
 def name_tables(folder: str) -> str:
     """Return a table of each group; the pages of the names are in a folder."""
-    return "\n".join(_group(group, names, folder) for group, names in grouped_names().items())
+    return "\n".join(
+        f"## {group}\n\n{_table({f'faintfield.{name}': getattr(faintfield, name) for name in names}, folder)}"
+        for group, names in grouped_names().items()
+    )
 
 
-def _group(group: str, names: list[str], folder: str) -> str:
-    rows = ((f"{{py:obj}}`{name} <faintfield.{name}>`", summary(getattr(faintfield, name))) for name in names)
-    pages = "\n".join(f"{folder}/{name}" for name in names)
-    return f"## {group}\n\n{table(('name', 'meaning'), '30 70', rows)}\n```{{toctree}}\n:hidden:\n\n{pages}\n```\n"
+def type_table(folder: str) -> str:
+    """Return a table of the types that public names take and return; their pages are in a folder."""
+    return _table({full_name(kind): kind for kind in types_of_names()}, folder)
+
+
+def _table(values: Mapping[str, object], folder: str) -> str:
+    rows = ((f"{{py:obj}}`{_last(name)} <{name}>`", summary(value)) for name, value in values.items())
+    pages = "\n".join(f"{folder}/{_page(name)}" for name in values)
+    return f"{table(('name', 'meaning'), '30 70', rows)}\n```{{toctree}}\n:hidden:\n\n{pages}\n```\n"
+
+
+def _last(name: str) -> str:
+    return name.rpartition(".")[2]
+
+
+def _page(name: str) -> str:
+    return name.removeprefix("faintfield.")
 
 
 def write_name_pages(folder: Path) -> None:
-    """Write a page of each name, which autodoc fills."""
+    """Write a page of each name and type, which autodoc fills."""
     folder.mkdir(parents=True, exist_ok=True)
     for name in faintfield.__all__:
-        value = getattr(faintfield, name)
-        kind = "class" if inspect.isclass(value) else "function"
-        directive = "exception" if inspect.isclass(value) and issubclass(value, Exception) else kind
-        members = "\n   :members:" if kind == "class" else ""
-        text = f"{name}\n{'=' * len(name)}\n\n.. currentmodule:: faintfield\n\n.. auto{directive}:: {name}{members}\n"
-        (folder / f"{name}.rst").write_text(text)
+        _write_page(folder, f"faintfield.{name}", getattr(faintfield, name), "")
+    for kind in types_of_names():
+        _write_page(folder, full_name(kind), kind, "" if shows_constructor(kind) else "()")
+
+
+def _write_page(folder: Path, name: str, value: object, signature: str) -> None:
+    module, _, last = name.rpartition(".")
+    kind = "class" if inspect.isclass(value) else "function"
+    directive = "exception" if inspect.isclass(value) and issubclass(value, Exception) else kind
+    members = "\n   :members:" if kind == "class" else ""
+    heading = f"{last}\n{'=' * len(last)}\n\n.. currentmodule:: {module}\n\n"
+    (folder / f"{_page(name)}.rst").write_text(f"{heading}.. auto{directive}:: {last}{signature}{members}\n")

@@ -9,9 +9,10 @@ from docstrings import PAGE_NAME
 from docutils import nodes
 from error_pages import error_table, grbl_table
 from format_pages import file_format
-from name_pages import name_tables, write_name_pages
+from name_pages import name_tables, type_table, write_name_pages
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
+from types_of_names import full_name, shows_constructor, types_of_names
 
 # Folder of the pages of public names, in the folder of the page that lists them.
 NAMES = "names"
@@ -24,7 +25,11 @@ _MAKERS: dict[str, Callable[[str], str]] = {
     "toml-format": lambda name: file_format(resolve_name(name), toml=True),
     "json-format": lambda name: file_format(resolve_name(name), toml=False),
     "public-names": lambda _: name_tables(NAMES),
+    "types-of-names": lambda _: type_table(NAMES),
 }
+
+
+_WITHOUT_CONSTRUCTOR = {full_name(kind) for kind in types_of_names() if not shows_constructor(kind)}
 
 
 class MadeFromCode(SphinxDirective):
@@ -45,10 +50,22 @@ def _link_pages(app: Sphinx, what: str, name: str, value: object, options: objec
     lines[:] = [PAGE_NAME.sub(r":doc:`\1 </\1>`", line) for line in lines]
 
 
+def _leave_out_constructor(app: Sphinx, what: str, name: str, *_: object) -> tuple[str, None] | None:
+    """Show a type that nobody has to construct by its name alone; its docstring describes its attributes."""
+    return ("", None) if what == "class" and name in _WITHOUT_CONSTRUCTOR else None
+
+
+def _leave_out_tuple_fields(app: Sphinx, what: str, name: str, value: object, *_: object) -> bool | None:
+    """Leave out the fields of a named tuple, which its docstring describes."""
+    return True if (getattr(value, "__doc__", None) or "").startswith("Alias for field number") else None
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Add the directives, and write the pages of the public names."""
+    """Add the directives, and write the pages of the public names and their types."""
     for name in _MAKERS:
         app.add_directive(name, MadeFromCode)
     app.connect("autodoc-process-docstring", _link_pages)
+    app.connect("autodoc-process-signature", _leave_out_constructor)
+    app.connect("autodoc-skip-member", _leave_out_tuple_fields)
     write_name_pages(Path(app.srcdir) / "reference" / NAMES)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

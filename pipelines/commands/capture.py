@@ -65,7 +65,7 @@ def plan(rig: Path, /, *, options: PlanOptions = _PLAN) -> Prediction:
 
     Stage and camera are asked for their speeds, and nothing moves. A table compares exposures, grids and frames per
     node, and with --sigma-e names the shortest session that reaches a wanted noise. What is not known is said to be
-    unknown, and why. docs/capture.md explains the numbers, and compares them with simulated captures.
+    unknown, and why. docs/how-to/predict_a_capture.md explains the numbers, and compares them with simulated captures.
 
     An option with several values takes them one after another, such as --exposures-ms 100 200 --grids 3x3 5x5.
 

@@ -45,7 +45,21 @@ def demo(out: Path = Path("demo"), /, *, quick: bool = False, snr: Positive = 0.
 
 
 class Simulated(msgspec.Struct, frozen=True):
-    """The result of `faintfield simulate`."""
+    """The result of `faintfield simulate`.
+
+    Attributes
+    ----------
+    out : str
+        Folder of the set.
+    views : int
+        Number of views.
+    snr : float
+        Expected signal-to-noise ratio of the true light by eq. (4), a ratio of powers.
+    photons_linear, photons_from_moments : float
+        Photons per pixel by eq. (7), linear in the SNR; photons per pixel of a uniform object with the same SNR.
+    photons_on_object : float
+        Mean photons per pixel of the object region in the reference view.
+    """
 
     out: str
     views: int

@@ -72,8 +72,12 @@ def at_phase(pixels: NDArray[Any], phase: tuple[int, int], period: tuple[int, in
 class Lattice:
     """The detector pixels of one phase of a mosaic; all pixels without colour filters.
 
-    `first` is row and column of its first pixel, `step` the distance to its next, and `shape` counts its rows and
-    columns; an incomplete period at the far edges is left out.
+    Attributes
+    ----------
+    first, step : (int, int)
+        Row and column of the first pixel; distance to the next pixel along rows and columns.
+    shape : (int, int)
+        Number of rows and columns; an incomplete period at the far edges is left out.
     """
 
     first: tuple[int, int]
@@ -87,11 +91,18 @@ class Lattice:
 
 @dataclass(frozen=True)
 class Frame:
-    """One exposure, (row, column) or (row, column, RGB).
+    """One exposure. What a file does not state is None.
 
-    `mosaic` has the rows of the smallest period of the colour filters, such as ("RG", "GB"). `black_dn` is the black
-    level of each phase, from the sensor's masked pixels if it has any, else as the camera states it. What a file does
-    not state is None.
+    Attributes
+    ----------
+    pixels_dn : array (row, column) or (row, column, RGB)
+        Values of the pixels.
+    mosaic : tuple of str, optional
+        Rows of the smallest period of the colour filters, such as ("RG", "GB").
+    black_dn : float array (row, column of the period), optional
+        Black level of each phase, from the sensor's masked pixels if it has any, else as the camera states it.
+    saturation_dn, exposure_s : float, optional
+        White level and exposure time that the file states.
     """
 
     pixels_dn: NDArray[Any]
@@ -105,8 +116,14 @@ class Frame:
 class ChannelLayout:
     """Position of one colour in the frames.
 
-    `name` is "grey", "red", "green" or "blue", `plane_of_colour` the index of the colour in RGB frames. Of a mosaic
-    there is one lattice for each of its phases that has this colour.
+    Attributes
+    ----------
+    name : {"grey", "red", "green", "blue"}
+        The colour.
+    plane_of_colour : int, optional
+        Index of the colour in RGB frames; None for frames of one value per pixel.
+    lattices : tuple of Lattice
+        Pixels that have this colour: one lattice for each phase of a mosaic that has it.
     """
 
     name: str

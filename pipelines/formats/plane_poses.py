@@ -106,7 +106,7 @@ def read_plane_poses(paths: Sequence[Path]) -> list[TiltedPlane]:
     planes: dict[str, TiltedPlane] = {}
     for path in paths:
         poses = read_toml(
-            path, PlanePoses, remedy="name a TOML file with a [[plane]] for each plane (docs/depth.md)"
+            path, PlanePoses, remedy="name a TOML file with a [[plane]] for each plane (docs/how-to/tilt_planes.md)"
         ).plane
         if not poses:
             raise BadValue(f"{path}: names no [[plane]]; add one")

@@ -27,7 +27,21 @@ _LAST_KEY = re.compile(rf',"{DIGEST_KEY}":"([0-9a-f]{{64}})"\}}\Z'.encode())
 
 
 class Provenance[Options](msgspec.Struct, frozen=True, kw_only=True):
-    """Provenance of a result, the last keys of its JSON: inputs by SHA-256, options as they took effect, versions."""
+    """Provenance of a result, the last keys of its JSON: inputs by SHA-256, options as they took effect, versions.
+
+    Attributes
+    ----------
+    units : StatedUnits, optional
+        Units in which the result is stated; without them mm, electrons and s.
+    command : str
+        Name of the command that made the result.
+    options : Options
+        Options of the command as they took effect.
+    inputs : dict of str
+        SHA-256 of each file that was read, by its name.
+    versions : dict of str
+        Versions of Python and of the packages that computed the result.
+    """
 
     units: StatedUnits | UnsetType = UNSET
     command: str

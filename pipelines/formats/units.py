@@ -101,6 +101,11 @@ class StatedUnits(Units, frozen=True, forbid_unknown_fields=False, omit_defaults
     """The `units` of a record: those of its set, and whether its exposure is known.
 
     A record without them, of an earlier version, has these defaults.
+
+    Attributes
+    ----------
+    exposure : {"s", "unknown"}
+        Unit of exposure times. "unknown": the set states none.
     """
 
     exposure: Literal["s", "unknown"] = "s"

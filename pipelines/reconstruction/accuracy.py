@@ -105,8 +105,18 @@ def _back_projections(noise_free: ElementalSet, depths: list[float]) -> dict[flo
 class DepthErrors(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Errors of the depths that are known, at the samples where the truth is known, too.
 
-    `share` is that of the samples with a true depth, `median_relative_error` a share of the true depth, and
-    `within_2_percent` the share of the compared samples whose error is at most that.
+    Attributes
+    ----------
+    file : str
+        Name of the TIFF with the depths that were compared.
+    samples : int
+        Number of samples that were compared.
+    share : float
+        Share of the samples with a true depth that were compared.
+    median_error_mm, median_relative_error : float
+        Median of the absolute errors; the same relative to the true depth.
+    within_2_percent : float
+        Share of the compared samples whose error is at most 2 % of the true depth.
     """
 
     file: str

@@ -63,7 +63,7 @@ class Options:
     surface
         Instead of planes (`run`: beside them), reconstruct one picture of the scene from the reference view, sharp
         everywhere, with the depth of each pixel and how sure both are: picture.tiff, depth_mm.tiff, surface.ply and
-        others, see docs/results.md. For a session, its folder is reconstructions/surface by default.
+        others, see docs/how-to/make_surface.md. For a session, its folder is reconstructions/surface by default.
     depth_range_mm
         NEAR:FAR: range of the surface's depths, such as 400:1500. By default it is found by comparing the views.
     disparity_range_px

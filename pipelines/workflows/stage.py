@@ -77,7 +77,7 @@ def check_stage(connection: StageConnection) -> list[Check]:
     if failed:
         raise StageUnfit(
             "; ".join(f"{check.name}: {check.measured}, and {check.limit} is asked for" for check in failed)
-            + "; mend that before a capture (docs/stage.md)"
+            + "; mend that before a capture (docs/reference/stage_controllers.md)"
         )
     return checks
 

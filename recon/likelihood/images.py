@@ -62,7 +62,7 @@ class PixelLikelihood:
 
 @dataclass(frozen=True)
 class ElementalImages:
-    """All views of one scene, g of `g = H f + n`, eq. (1) of the paper (docs/physics.md), with their known statistics.
+    """All views of one scene with their known statistics: g of `g = H f + n`, eq. (1) of docs/explanation/physics.md.
 
     A view's pixels are `Poisson(H f + b) + N(0, σ²)`. The images of one colour of a mosaic lie on *lattices* (of every
     second pixel, for example); each view then appears once per lattice, and maps are given per lattice.

@@ -22,8 +22,14 @@ _TRANSPARENT, _OPAQUE = 0.15, 0.35
 class Occluders(NamedTuple):
     """Planes that hide those behind them: light of a plane is multiplied by `Π (1 − H_z' α_z')` over nearer planes z'.
 
-    H_z' is without the response of the pixels. `opacities` are α of each plane (row, column), 0 to 1. Planes of the
-    same depth do not hide one another.
+    H_z' is without the response of the pixels. Planes of the same depth do not hide one another.
+
+    Attributes
+    ----------
+    opacities : sequence of float array (row, column)
+        Opacity α of each plane, 0 to 1.
+    depths_mm : sequence of float
+        Depth of each plane.
     """
 
     opacities: Sequence[Image]

@@ -63,7 +63,7 @@ class SceneOperator:
 
     Notes
     -----
-    f is in expected electrons per detector pixel before the flat field; see docs/physics.md, "The operator".
+    f is in expected electrons per detector pixel before the flat field (docs/explanation/physics.md, "The operator").
     """
 
     def __init__(

@@ -13,7 +13,17 @@ from faintfield.recon.operator.scene_operator import SceneOperator
 
 
 class OperatorOptions(TypedDict, total=False):
-    """Options of `recon.operator.scene_operator.SceneOperator` that the operators of one plane take, too."""
+    """Options of `recon.operator.scene_operator.SceneOperator` that the operators of one plane take, too.
+
+    Attributes
+    ----------
+    flat, valid : array (row, column) or (lattice, row, column), bool array (view, row, column), optional
+        Relative response of each pixel; False for pixels that do not count in one view.
+    lattice_of_view : int array (view,), optional
+        The lattice of detector pixels of each view; the first by default.
+    dtype, workers : dtype, int, optional
+        Type of samples and images, and number of threads, by default as many as the process may use.
+    """
 
     flat: NDArray[np.floating] | None
     valid: NDArray[np.bool_] | None
@@ -23,7 +33,7 @@ class OperatorOptions(TypedDict, total=False):
 
 
 class PlaneOperator(SceneOperator):
-    """H of one plane in `g = H f + n`, eq. (1) of the paper (docs/physics.md): the plane as the views see it.
+    """H of one plane in `g = H f + n`, eq. (1) of docs/explanation/physics.md: the plane as the views see it.
 
     H interpolates the plane bilinearly where the ray of each pixel meets it; Hᵀ spreads each pixel to the same four
     samples with the same weights. Samples f are an array (row, column), images g an array (view, row, column).

@@ -61,7 +61,7 @@ class SurfaceOperator(PlaneOperator):
 
     Notes
     -----
-    The light of a sample is the same in every direction (Lambert); see docs/physics.md, "Through a surface".
+    The light of a sample is the same in every direction (Lambert); docs/explanation/physics.md, "Through a surface".
     """
 
     def __init__(

@@ -30,7 +30,8 @@ _MIN_KNOWN = 0.01
 class DataFit:
     """L(f), the negative log-likelihood of the elemental images of all or some views.
 
-    For shifted Poisson data it is `Σ m − y + y ln(y/m)` with `y = (g + σ²)₊` and `m = H f + b + σ²` (docs/physics.md).
+    For shifted Poisson data it is `Σ m − y + y ln(y/m)` with `y = (g + σ²)₊` and `m = H f + b + σ²`
+    (docs/explanation/physics.md).
 
     Parameters
     ----------

@@ -23,7 +23,7 @@ def back_projection(
     """Return the mean of the views at each sample, `Hᵀ(g − b) / Hᵀ H 1`.
 
     Without flat field the denominator is s = Hᵀ 1, the number of views that contribute, as in the paper
-    (docs/physics.md).
+    (docs/explanation/physics.md).
 
     Parameters
     ----------

@@ -16,7 +16,17 @@ class Penalty:
     "tv": φ = t, isotropic total variation, not smoothed. "quadratic": φ = t²/2δ. "huber-tv": φ = t²/2δ up to t = δ and
     t − δ/2 beyond. "none": 0.
 
-    δ is `smoothing_e`, in electrons. ValueError is raised if it is not positive where it is needed.
+    Parameters
+    ----------
+    name : {"tv", "huber-tv", "quadratic", "none"}
+        The penalty.
+    smoothing_e : float
+        δ, in electrons.
+
+    Raises
+    ------
+    ValueError
+        δ is not positive where it is needed.
     """
 
     name: PenaltyName = "tv"

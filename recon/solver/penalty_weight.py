@@ -72,9 +72,9 @@ def universal_penalty_weight(operator: SceneOperator, images: ElementalImages, s
     """Return a penalty weight from the noise alone: β = 0.7 √( s / (f + b + σ²) ).
 
     s is its median over the samples that are seen well, and f, b and σ² are means. The root is the standard deviation
-    of the likelihood's gradient at each sample. Eq. (3) of the paper (docs/physics.md), the gradient of the penalty, is
-    of the order of one, so this weight removes fluctuations of about that size. It is a starting point, not the best
-    weight for a scene.
+    of the likelihood's gradient at each sample. The gradient of the penalty, eq. (3) of
+    docs/explanation/physics.md, is of the order of one, so this weight removes fluctuations of about that size. It is a
+    starting point, not the best weight for a scene.
 
     Parameters
     ----------

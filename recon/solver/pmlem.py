@@ -86,7 +86,7 @@ class PmlemIterate:
     plane : float array (samples)
         Expected electrons per detector pixel, at least zero; (sample,) for several planes together.
     objective, certificate : float, Certificate
-        L(f) + β Σ φ(|∇f|), and the distance from the optimum.
+        `L(f) + β Σ φ(|∇f|)`, and the distance from the optimum.
     passes, inner_steps : int
         Passes over the data, and steps of inner problems, so far.
     dual : DualField

@@ -40,7 +40,17 @@ type _Pair = tuple[float, float]
 
 
 class ProxResult(NamedTuple):
-    """The solution x ≥ 0 (samples), a bound on the objective's excess over its minimum, and steps made."""
+    """Solution of a proximal problem.
+
+    Attributes
+    ----------
+    plane : float array (samples)
+        The solution x ≥ 0.
+    gap : float
+        Bound on the excess of the objective over its minimum.
+    steps : int
+        Number of steps.
+    """
 
     plane: Image
     gap: float

@@ -170,7 +170,7 @@ class AravisSettings(CoolingSettings, frozen=True, forbid_unknown_fields=True, t
 
 
 class PluginSettings(MosaicSettings, frozen=True, forbid_unknown_fields=True, tag_field="backend", tag="plugin"):
-    """A camera that another package drives; docs/plugins.md.
+    """A camera that another package drives; docs/tutorials/camera_driver.md.
 
     Parameters
     ----------

@@ -42,7 +42,7 @@ class ControllerSettings(_LightSettings, frozen=True, forbid_unknown_fields=True
     Parameters
     ----------
     output, number : str, int
-        `flood`, `mist` or `spindle` with GRBL and grblHAL; `pin` or `fan` with Marlin, and its number.
+        `flood`, `mist` or `spindle` with GRBL and grblHAL, `pin` or `fan` with Marlin; number of the pin or fan.
     level : float, optional
         Value (S) that switches it on; by default 1000 for the spindle, and 255 for pins and fans.
     """
@@ -69,7 +69,7 @@ class CommandSettings(_LightSettings, frozen=True, forbid_unknown_fields=True, t
     Parameters
     ----------
     on, off : tuple of str
-        Program and arguments that switch it; there is no shell.
+        Program and arguments that switch the light on; those that switch it off. There is no shell.
     state : tuple of str
         Program and arguments that print `on` or `off`, or 1 or 0; by default the light is not read back.
     limit_s : float
@@ -97,7 +97,7 @@ class SimulatedSettings(_LightSettings, frozen=True, forbid_unknown_fields=True,
 
 
 class PluginSettings(_LightSettings, frozen=True, forbid_unknown_fields=True, tag_field="driver", tag="plugin"):
-    """A light that another package drives; docs/plugins.md.
+    """A light that another package drives; docs/tutorials/camera_driver.md.
 
     Parameters
     ----------

@@ -57,8 +57,18 @@ _MAX_PENDING_TRAFFIC = 2000
 class FrameRecord(Struct, frozen=True):
     """Entry of the journal about a frame, without its file.
 
-    It has the position that the stage reported before the exposure, metadata from the camera, the values and warnings
-    of `rig.capture.checks.Findings`, and the names of the lights that were on; None where a person saw to the light.
+    Attributes
+    ----------
+    position_mm : Point
+        Position that the stage reported before the exposure.
+    exposure_s : float
+        Exposure time.
+    camera : dict
+        Metadata from the camera.
+    checks, warnings : dict of float, tuple of str
+        Values and warnings of `rig.capture.checks.Findings`.
+    lights : tuple of str, optional
+        Names of the lights that were on; None where a person saw to the light.
     """
 
     position_mm: Point
@@ -78,8 +88,18 @@ class FrameRecord(Struct, frozen=True):
 class CommittedFrame(Struct, frozen=True):
     """A frame that was taken and is on disk.
 
-    `intent` is the number of the exposure within the session, `frame` the index in the plan, `file` the name within
-    `frames/`, and `void` why the frame is void although its file stays.
+    Attributes
+    ----------
+    intent : int
+        Number of the exposure within the session.
+    frame : int
+        Index of the frame in the plan.
+    file, sha256, bytes : str, str, int
+        Name within `frames/`, its SHA-256, and its size.
+    record : FrameRecord
+        Entry of the journal.
+    void : str, optional
+        Reason why the frame is void although its file stays.
     """
 
     intent: int

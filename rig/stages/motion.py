@@ -66,7 +66,15 @@ _ROUNDING_MM = 1e-6
 
 
 class StageWorkspace(Struct, frozen=True):
-    """The travel of the stage, and boxes that it must neither enter nor cross."""
+    """Positions that the stage may take.
+
+    Attributes
+    ----------
+    travel_mm : Box
+        Travel of the stage.
+    keep_out : tuple of Box
+        Boxes that the stage must neither enter nor cross.
+    """
 
     travel_mm: Box
     keep_out: tuple[Box, ...] = ()

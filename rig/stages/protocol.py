@@ -41,7 +41,13 @@ class Point(NamedTuple):
 
 
 class Box(Struct, frozen=True, forbid_unknown_fields=True):
-    """A rectangle of positions from the lower to the upper end along each axis, including its edges."""
+    """A rectangle of positions from the lower to the upper end along each axis, including its edges.
+
+    Parameters
+    ----------
+    x_mm, y_mm : (float, float)
+        Lower and upper end along x; lower and upper end along y.
+    """
 
     x_mm: tuple[float, float]
     y_mm: tuple[float, float]
@@ -126,9 +132,16 @@ class Identity(Struct, frozen=True):
 
 
 class Position(Struct, frozen=True):
-    """A reported position; it is `trusted` if nothing since homing could have changed the stage's count of steps.
+    """A reported position.
 
-    `tolerance_mm` is how far the report may be from its target, per axis.
+    Attributes
+    ----------
+    point : Point
+        The position.
+    tolerance_mm : (float, float)
+        Distance by which the report may be from its target, per axis.
+    trusted : bool
+        True if nothing since homing could have changed the stage's count of steps.
     """
 
     point: Point
@@ -142,14 +155,28 @@ class Position(Struct, frozen=True):
 
 
 class AnswerTime(NamedTuple):
-    """Duration of a command (s), and by how much less it may have taken because its answer was read late."""
+    """Duration of a command.
+
+    Attributes
+    ----------
+    taken_s, late_s : float
+        Duration in s, and by how much less it may have been because its answer was read late.
+    """
 
     taken_s: float
     late_s: float
 
 
 class Homing(Struct, frozen=True):
-    """The result of homing: the position at its end, and how long the controller took."""
+    """The result of homing.
+
+    Attributes
+    ----------
+    position : Position
+        Position at the end of homing.
+    time : AnswerTime
+        Time that the controller took.
+    """
 
     position: Position
     time: AnswerTime
@@ -258,8 +285,8 @@ class StageSettings(Struct, frozen=True, forbid_unknown_fields=True):
     Parameters
     ----------
     protocol : str
-        Firmware of the controller: "grbl" or "marlin"; "micromanager", or the name of a plug-in (docs/plugins.md);
-        "simulated" needs no port and no hardware.
+        Firmware of the controller: "grbl" or "marlin"; "micromanager", or the name of a plug-in
+        (docs/tutorials/camera_driver.md); "simulated" needs no port and no hardware.
     port : str
         Serial device, or a pyserial URL such as "socket://127.0.0.1:7000"; "simulated:grbl", "simulated:grblhal" or
         "simulated:marlin" need no hardware.

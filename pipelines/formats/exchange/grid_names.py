@@ -207,7 +207,7 @@ def _expression(pattern: str) -> re.Pattern[str]:
 
 
 def places_by_habit(names: Sequence[str]) -> Places:
-    """Return the numbers of names by the habits of archives and cameras, see docs/archives.md.
+    """Return the numbers of names by the habits of archives and cameras, see docs/how-to/import_pictures.md.
 
     In this order: row, column and position; a position alone; letters or words for row and column; the two numbers that
     vary from name to name; one number that varies, which is an index. A number is never split into digits.

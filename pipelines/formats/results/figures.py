@@ -14,8 +14,22 @@ METRICS_FILE = "metrics.json"
 class Brightness(Struct, frozen=True):
     """The SNR and photon figures of a set's reference view; light is in the units of the overview.
 
-    `snr` is that of eq. (4), a ratio of powers; `electrons_linear` and `electrons_from_moments` are electrons per pixel
-    by eq. (7), and of a uniform object with this SNR. None stands for what is not known, or has no meaning.
+    Null stands for what is not known, or has no meaning.
+
+    Attributes
+    ----------
+    region : str
+        Region of the view that was measured.
+    noise_from : str
+        Source of the noise power: the noise reference, or the noise model.
+    snr : float, optional
+        Signal-to-noise ratio of eq. (4), a ratio of powers.
+    electrons_linear, electrons_from_moments : float, optional
+        Electrons per pixel by eq. (7), linear in the SNR; electrons per pixel of a uniform object with this SNR.
+    mean_signal_e : float
+        Mean signal per pixel of the region, above the dark signal.
+    photons_linear, photons_from_moments : float, optional
+        Photons per pixel by eq. (7), linear in the SNR; photons per pixel of a uniform object with this SNR.
     """
 
     region: str
@@ -29,9 +43,42 @@ class Brightness(Struct, frozen=True):
 
 
 class Overview(Struct, frozen=True, kw_only=True):
-    """`overview.json`: a set at a glance, beside its pictures, which are linear in light unless they have a `tone`.
+    """`overview.json`: a set at a glance, beside its pictures.
 
-    `grey_scale_dn` are black and white of these; the pixels of the reference view are integers if `whole_dn`.
+    Attributes
+    ----------
+    units : StatedUnits, optional
+        Units of the set.
+    set : str
+        Name of the folder of the set.
+    views : int
+        Number of views.
+    grid : (int, int), optional
+        Rows and columns of the nodes; null if the views are in no grid.
+    poses : {"stated", "measured", "aligned", "nominal", "true"}
+        Source of the poses.
+    size_px : (int, int)
+        Width and height of a view.
+    exposure_s : float, optional
+        Exposure time of a view, all its frames together; null if it is not known.
+    frames_per_view : int
+        Number of frames of a view.
+    read_noise_e : float
+        Read noise of a frame, rms over the pixels.
+    has_noise_reference : bool
+        True if the set has frames without light.
+    quantum_efficiency : float, optional
+        Quantum efficiency, electrons per photon; null if it is not known.
+    dark_e : float
+        Mean dark signal of a view per pixel.
+    grey_scale_dn : (float, float)
+        Values of a pixel that the pictures show as black and as white.
+    whole_dn : bool
+        True if the pixels of the reference view are whole numbers.
+    tone : {"srgb"}, optional
+        Tone curve of the pictures; absent if they are linear in light.
+    brightness : Brightness
+        Light of the reference view.
     """
 
     units: StatedUnits | UnsetType = UNSET
@@ -55,7 +102,26 @@ class Overview(Struct, frozen=True, kw_only=True):
 class PlaneErrors(Struct, frozen=True, kw_only=True):
     """The errors of one plane against the truth, the object scaled to 0…1.
 
-    `prior` is that of a penalised plane; unset by versions that did not write it.
+    Attributes
+    ----------
+    depth_mm : float
+        Depth of the plane.
+    method : str
+        Method of the reconstruction.
+    prior : str, optional
+        Prior, or penalty, of the plane; absent if nothing is penalised.
+    poses : {"stated", "measured", "aligned", "nominal", "true"}
+        Source of the poses.
+    object : str
+        Name of the object at this depth.
+    mse_bright : float
+        Mean square error in the object region, against the back-projection of the views without noise.
+    mse_texture : float
+        Mean square error in the object region, against the true texture.
+    mse_plane : float, optional
+        Mean square error over the whole plane, against the true texture.
+    psnr_db : float, optional
+        Peak signal-to-noise ratio that follows from `mse_bright`.
     """
 
     depth_mm: float
@@ -70,14 +136,28 @@ class PlaneErrors(Struct, frozen=True, kw_only=True):
 
 
 class SnrRecord(Struct, frozen=True):
-    """The SNR of eq. (4): asked of the simulator, and measured."""
+    """Signal-to-noise ratio of eq. (4), a ratio of powers.
+
+    Attributes
+    ----------
+    asked, measured : float, optional
+        Expected SNR of the true light; measured SNR of the reference view.
+    """
 
     asked: float
     measured: float | None
 
 
 class PhotonsRecord(Struct, frozen=True):
-    """Photons per pixel of the reference view, by three definitions."""
+    """True photons per pixel of the reference view, by three definitions.
+
+    Attributes
+    ----------
+    linear, from_moments : float
+        Photons by eq. (7), linear in the SNR; photons of a uniform object with the same SNR.
+    on_object : float
+        Mean number of photons over the object region.
+    """
 
     linear: float
     from_moments: float
@@ -85,7 +165,17 @@ class PhotonsRecord(Struct, frozen=True):
 
 
 class GeometryErrors(Struct, frozen=True):
-    """Errors of the measured poses."""
+    """Errors of the measured poses.
+
+    Attributes
+    ----------
+    nodes : int
+        Number of nodes that were compared.
+    centre_rms_mm, centre_rms_axes_mm : float, tuple of float
+        Distance of the measured from the true centres of the cameras, rms; rms along x, y and z.
+    rotation_rms_mdeg : float
+        Angle between measured and true orientation in thousandths of a degree, rms.
+    """
 
     nodes: int
     centre_rms_mm: float
@@ -94,7 +184,15 @@ class GeometryErrors(Struct, frozen=True):
 
 
 class KnownValue(Struct, frozen=True):
-    """A measured number, its standard error, and the truth."""
+    """A measured number with its truth.
+
+    Attributes
+    ----------
+    value, se : float, optional
+        Measured value; standard error of `value`.
+    truth : float
+        True value.
+    """
 
     value: float | None
     se: float | None
@@ -102,7 +200,23 @@ class KnownValue(Struct, frozen=True):
 
 
 class Metrics(Struct, frozen=True, kw_only=True):
-    """`metrics.json`: the errors of planes whose truth is known; a demo adds those of its calibration."""
+    """`metrics.json`: the errors of planes whose truth is known; a demo adds those of its calibration.
+
+    Attributes
+    ----------
+    geometry : GeometryErrors, optional
+        Errors of the measured poses.
+    noise : dict of KnownValue, optional
+        Measured and true numbers of the sensor, by name.
+    planes : list of PlaneErrors
+        Errors of each plane.
+    units : StatedUnits, optional
+        Units of the set.
+    snr : SnrRecord, optional
+        Signal-to-noise ratio of the set.
+    photons_per_px : PhotonsRecord, optional
+        Photons of the set.
+    """
 
     geometry: GeometryErrors | UnsetType = UNSET
     noise: dict[str, KnownValue] | UnsetType = UNSET

@@ -50,7 +50,21 @@ DEFAULT_DEPTHS_MM = (500.0, 700.0)
 
 
 class LensRecord(Struct, frozen=True):
-    """The lens, `distortion` in OpenCV's order; `sigma` of fx, fy, cx, cy and the distortion."""
+    """Lens of the camera.
+
+    Attributes
+    ----------
+    model : str
+        Lens model: "pinhole", "opencv4", "opencv5" or "opencv8"; "opencv" in the record of `faintfield align`.
+    fx_px, fy_px : float
+        Focal length along x and y.
+    cx_px, cy_px : float
+        Principal point; the centre of the first pixel is (0, 0).
+    distortion : tuple of float
+        Distortion coefficients in OpenCV's order: k1, k2, p1, p2, k3, k4, k5, k6, as many as the model has.
+    sigma : tuple of float
+        Standard deviations of fx, fy, cx, cy and the distortion coefficients; empty if they are not stated.
+    """
 
     model: str
     fx_px: float
@@ -62,7 +76,19 @@ class LensRecord(Struct, frozen=True):
 
 
 class NodeRecord(Struct, frozen=True):
-    """The camera's pose at a node; its sigmas are relative to the reference node."""
+    """Pose of the camera at a node; its standard deviations are relative to the reference node.
+
+    Attributes
+    ----------
+    node : (int, int)
+        Row and column of the node.
+    rt_cam_ref : tuple of float
+        Rodrigues vector in rad and translation in mm, from the reference camera's frame to the camera's.
+    sigma_mm : float
+        Standard deviation of the camera's centre, over its three axes together.
+    sigma_rad : float
+        Standard deviation of the camera's orientation, over its three axes together.
+    """
 
     node: Node
     rt_cam_ref: Pose
@@ -77,7 +103,15 @@ class NodeRecord(Struct, frozen=True):
 
 
 class HomingRecord(Struct, frozen=True):
-    """Shift of all cameras from one homing of the stage to a later one, in the reference frame, with its error."""
+    """Shift of all cameras from one homing of the stage to a later one, in the reference frame, with its error.
+
+    Attributes
+    ----------
+    before, after : int
+        Number of the earlier homing; number of the later homing.
+    shift_mm, sigma_mm : tuple of float
+        Shift along x, y and z; standard deviation along each axis.
+    """
 
     before: int
     after: int
@@ -88,7 +122,22 @@ class HomingRecord(Struct, frozen=True):
 class CameraPoses(Struct, frozen=True, kw_only=True):
     """The part of `geometry.json` that a reconstruction needs; a file written by hand may hold nothing else.
 
-    Poses with the `source` "views" include what homings shifted.
+    Attributes
+    ----------
+    format : 1
+        Version of the format.
+    source : {"views"}, optional
+        "views": the poses were found by the views of the scene and include the shifts by homings. Absent: by boards.
+    lens : LensRecord
+        Lens of the camera.
+    size_px : (int, int)
+        Width and height of the images.
+    reference_node : (int, int)
+        Row and column of the node whose camera is the reference frame.
+    nodes : list of NodeRecord
+        Pose of the camera at each node.
+    homings : list of HomingRecord, optional
+        Shifts by homings of the stage between the board images, where they show.
     """
 
     format: Literal[1] = 1
@@ -149,9 +198,28 @@ class PosesOfSession(CameraPoses, frozen=True, kw_only=True):
 
 
 class BoardRecord(Struct, frozen=True):
-    """A board as it stood during a sweep, with what is printed on it and how far it bulges along x and y.
+    """A board as it stood during a sweep.
 
-    `homing` is there if a homing of the stage shifted the cameras within the sweep.
+    Attributes
+    ----------
+    name : str
+        Name of the board.
+    columns, rows : int
+        Number of squares across; number of squares down.
+    square_mm, marker_mm : float
+        Edge length of a square; edge length of a marker.
+    dictionary : str
+        Name of OpenCV's dictionary of markers.
+    first_marker_id : int
+        Number of the first marker in the dictionary.
+    sweep : int
+        Number of the sweep in which it stood there.
+    rt_ref_board : tuple of float
+        Rodrigues vector in rad and translation in mm, from the board's frame to the reference camera's.
+    warp_mm : (float, float)
+        Height of the bulge at the middle of the board, along x and along y.
+    homing : int, optional
+        Number of the homing that came before, if a homing shifted the cameras within the sweep.
     """
 
     name: str
@@ -168,7 +236,17 @@ class BoardRecord(Struct, frozen=True):
 
 
 class GeometryOptions(Struct, frozen=True):
-    """The options of `faintfield geometry` as they took effect."""
+    """The options of `faintfield geometry` as they took effect.
+
+    Attributes
+    ----------
+    lens : str
+        Lens model.
+    depth_mm : tuple of float
+        Depths at which the transfer between views must be known.
+    limit_px : float
+        Largest standard deviation of the transfer that is accepted.
+    """
 
     lens: str
     depth_mm: tuple[float, ...]
@@ -179,6 +257,39 @@ class GeometryRecord(CameraPoses, frozen=True, kw_only=True):
     """`geometry.json` whole: the lens and the poses, how well they are known, and how they were found.
 
     It vouches for the files beside it, by SHA-256; those of earlier versions do not.
+
+    Attributes
+    ----------
+    rms_inlier_px : float
+        Residual of the corners, rms per axis over the inliers.
+    rms_mrcal_px : float
+        Residual as mrcal states it: rms distance over all corners, masked ones included.
+    corner_sigma_px : float
+        Standard deviation of a typical corner, per axis, estimated from the residuals.
+    corners, outliers : int
+        Number of corners that were fitted; number of corners that were left out.
+    holdout_ratio : float, optional
+        Residual of boards left out of the fit over that of the fit; null if no board could be left out.
+    warnings : list of str
+        Problems of the views and of the fit.
+    transfer_sigma_px : dict of float
+        Standard deviation of a point that is transferred between views, by depth in mm; rms over views and image.
+    repeatability : Repeatability, optional
+        Repeatability of the stage; null with a single sweep.
+    boards : list of BoardRecord
+        Pose of each board in each sweep.
+    stage : StageReport
+        Errors of the stage.
+    command : str
+        Name of the command that made the result.
+    options : GeometryOptions
+        Options of the command as they took effect.
+    inputs : dict of str
+        SHA-256 of each file that was read, by its name.
+    versions : dict of str
+        Versions of Python and of the packages that computed the result.
+    sha256 : dict of str, optional
+        SHA-256 of each file beside the record, by its name.
     """
 
     rms_inlier_px: float

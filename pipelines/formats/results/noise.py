@@ -1,4 +1,4 @@
-"""The record of a sensor's noise, `noise.json` (docs/noise.md), its maps, and both as a reconstruction takes them."""
+"""The record of a sensor's noise, `noise.json`, its maps, and both as a reconstruction takes them."""
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
@@ -45,14 +45,32 @@ _MAPS_TAKEN, _MAPS_WRITTEN = (*_NEEDED, "mask", "relative_response"), 12
 
 
 class ResponseRecord(Struct, frozen=True):
-    """The bend of the response: a signal of s DN is the charge (s/g)(1 + κ₁ s + κ₂ s² + …), κ₁ in 1/DN and so on."""
+    """Bend of the response: the charge behind a signal of s DN is (s/g)(1 + κ₁ s + κ₂ s² + …).
+
+    Attributes
+    ----------
+    bends_per_dn : list of float
+        Coefficients κ₁ in 1/DN, κ₂ in 1/DN² and so on.
+    up_to_dn : float
+        Signal up to which the bend was measured.
+    """
 
     bends_per_dn: list[float]
     up_to_dn: float
 
 
 class SaturationRecord(Struct, frozen=True):
-    """End of the range of the flats, and its reason."""
+    """End of the range of the flats, and its reason.
+
+    Attributes
+    ----------
+    limit : {"ADC", "full well", "not reached"}
+        Cause of the end: the converter, or the full well of the pixels. "not reached": no flat saturates.
+    level_dn : float, optional
+        Last value of the converter, or mean of the noisiest series at a full well; null if the end is not reached.
+    interval_dn : (float, float), optional
+        Lower and upper bound of the level: at a full well, the means of the series next to the noisiest one.
+    """
 
     limit: Literal["ADC", "full well", "not reached"]
     level_dn: float | None
@@ -62,8 +80,30 @@ class SaturationRecord(Struct, frozen=True):
 class FitRecord(Struct, frozen=True):
     """Saturation and response from the flats, how far series scatter about the model, and how well each fits.
 
-    `telegraph_pixels` is how many jump between two levels; `maps_absent` tells why there is no map of the gain per
-    pixel, or of the read noise.
+    Attributes
+    ----------
+    saturation : SaturationRecord
+        End of the range of the flats.
+    saturation_e : Estimate
+        Saturation capacity μ_e.sat.
+    linearity_error : Estimate
+        Linearity error LE: mean absolute deviation of the response from a straight line, as a fraction.
+    response : ResponseRecord, optional
+        Bend of the response; null if it is straight or not known.
+    noise_error : Estimate
+        Scatter of the noise of the series about the model, as a fraction of the variance.
+    drift_dn : Estimate
+        Scatter of the mean levels of the darks about a straight line over exposure time.
+    light_error : Estimate
+        Scatter of the mean levels of the flats about the response, as a fraction of the level.
+    lamp_flicker : Estimate
+        Scatter of the light from frame to frame within a series, as a fraction.
+    series : list of SeriesGoodness
+        Goodness of fit of each series, and the reason for each that was left out.
+    telegraph_pixels : int
+        Number of pixels that jump between two levels.
+    maps_absent : dict of str
+        Reason why there is no map of the gain or of the read noise, by the name of the map.
     """
 
     saturation: SaturationRecord
@@ -80,7 +120,19 @@ class FitRecord(Struct, frozen=True):
 
 
 class EmvaImageRecord(Struct, frozen=True):
-    """The series whose mean image shows DSNU or PRNU; levels in DN above the dark of zero exposure."""
+    """Series whose mean image shows DSNU or PRNU.
+
+    Attributes
+    ----------
+    exposure_s : float
+        Exposure time of the series.
+    level : int
+        Index of the light level; 0 for darks.
+    frames : int
+        Number of frames.
+    signal_dn : float
+        Mean signal: above the offset for a dark, above the dark image for a flat.
+    """
 
     exposure_s: float
     level: int
@@ -89,9 +141,32 @@ class EmvaImageRecord(Struct, frozen=True):
 
 
 class EmvaRecord(Struct, frozen=True):
-    """Quantities of EMVA 1288 that follow from others, or from one mean image; docs/noise.md has the formulas.
+    """Quantities of EMVA 1288 that follow from others, or from one mean image (docs/explanation/noise.md).
 
-    `dark_noise_e` and the thresholds are those of an exposure of `dark_noise_exposure_s`; 0 is by extrapolation.
+    Attributes
+    ----------
+    dark_noise_exposure_s : float
+        Exposure time for which the dark noise and the thresholds hold; 0 is an extrapolation.
+    dark_noise_e : Estimate
+        Temporal dark noise σ_d, without that of rounding.
+    responsivity_dn_per_photon : Estimate
+        Responsivity R = K η.
+    threshold_e, threshold_photons : Estimate
+        Absolute sensitivity threshold μ_e.min, at which SNR = 1; that threshold in photons, μ_p.min.
+    saturation_photons : Estimate
+        Saturation capacity in photons, μ_p.sat.
+    snr_max : Estimate
+        Largest signal-to-noise ratio of a pixel, SNR_max = √μ_e.sat.
+    dynamic_range : Estimate
+        Dynamic range DR = μ_p.sat/μ_p.min.
+    dsnu_total_e, dsnu_row_e, dsnu_column_e, dsnu_pixel_e : Estimate
+        DSNU of the dark image; row part of DSNU; column part of DSNU; pixel part of DSNU.
+    prnu_total, prnu_row, prnu_column, prnu_pixel : Estimate
+        PRNU of the bright image, as a fraction; row part of PRNU; column part of PRNU; pixel part of PRNU.
+    dark_current_doubling_k : Estimate
+        Temperature difference T_d in kelvin that doubles the dark current.
+    dark_image, bright_image : EmvaImageRecord, optional
+        Series of darks from which DSNU follows; series of flats from which PRNU follows.
     """
 
     dark_noise_exposure_s: float
@@ -149,6 +224,37 @@ class Quantities(Struct, frozen=True, kw_only=True):
     """Measurements of a sensor, or of one phase of its colour filter mosaic.
 
     A reconstruction needs the first four. Only noise.json files that were written by hand lack any of the others.
+
+    Attributes
+    ----------
+    offset_dn : Estimate
+        Mean of a dark frame of zero exposure, μ_y.dark in EMVA 1288.
+    gain_dn_per_e : Estimate
+        Overall system gain K.
+    read_noise_e : Estimate
+        Standard deviation of the read noise of a pixel, σ_d at zero exposure, without that of rounding.
+    dark_current_e_per_s : Estimate
+        Dark current μ_I, mean over the pixels.
+    read_noise_dn : Estimate
+        The read noise in DN, before the gain is divided out.
+    dark_signal_dn_per_s : Estimate
+        Growth of the dark level with exposure time, K μ_I.
+    dsnu_dn, dsnu_e : Estimate
+        Pixel part of DSNU: standard deviation of the offset over the pixels.
+    dcnu_e_per_s : Estimate
+        Standard deviation of the dark current over the pixels.
+    frame_jitter_dn : Estimate
+        Standard deviation of the level from frame to frame.
+    row_noise_dn, column_noise_dn : Estimate
+        Noise that the pixels of a row share in one frame; noise that the pixels of a column share in one frame.
+    dsnu_row_dn, dsnu_column_dn : Estimate
+        Row part of DSNU, the same in all frames; column part of DSNU, the same in all frames.
+    prnu : Estimate
+        Pixel part of PRNU: standard deviation of the response to light over the pixels, as a fraction.
+    nonlinearity_per_dn : Estimate
+        First coefficient κ₁ of the bend of the response: the charge behind a signal s is (s/K)(1 + κ₁ s + …).
+    quantum_efficiency : Estimate or float, optional
+        Quantum efficiency η, electrons per photon.
     """
 
     offset_dn: Estimate
@@ -171,7 +277,21 @@ class Quantities(Struct, frozen=True, kw_only=True):
 
 
 class PhaseRecord(Quantities, frozen=True):
-    """One phase of the mosaic: where its first pixel is, its filter, and its quantities."""
+    """One phase of the mosaic: its place, its filter, and its quantities.
+
+    Attributes
+    ----------
+    phase : (int, int)
+        Row and column of the first pixel of the phase.
+    colour : str
+        Letter of the filter, such as "R".
+    likelihood : str
+        Name of the likelihood that was maximised.
+    masked_black_dn : float, optional
+        Black level that the files of the darks state, mean over the frames; null if they state none.
+    fit, emva1288 : FitRecord, EmvaRecord
+        Scatter about the model and goodness of fit; quantities of EMVA 1288 that follow.
+    """
 
     phase: tuple[int, int]
     colour: str
@@ -182,14 +302,28 @@ class PhaseRecord(Quantities, frozen=True):
 
 
 class CovarianceRecord(Struct, frozen=True):
-    """The covariance of the quantities named."""
+    """Covariance of estimates.
+
+    Attributes
+    ----------
+    names : list of str
+        Names of the quantities.
+    matrix : list of list of float
+        Covariance of the quantities (quantity, quantity), in the products of their units.
+    """
 
     names: list[str]
     matrix: list[list[float]]
 
 
 class TemperatureRange(Struct, frozen=True):
-    """The temperature of the frames in °C."""
+    """Temperature of the sensor over the frames that state it, in °C.
+
+    Attributes
+    ----------
+    mean, min, max : float
+        Mean temperature; lowest temperature; highest temperature.
+    """
 
     mean: float
     min: float
@@ -207,6 +341,43 @@ class NoiseRecord(_StandardQuantities, frozen=True, kw_only=True):
 
     Pixels are (row, column). `mosaic` and `planes`, one entry per phase, are left out without colour filters; with
     them, each plane has its own `fit` and `emva1288`. Older files have none.
+
+    Attributes
+    ----------
+    format : 1
+        Version of the format.
+    standard : str
+        Standard whose names, symbols and units are used.
+    covariance : CovarianceRecord
+        Covariance of offset, gain, read noise and dark current, as far as they have values.
+    likelihood : str
+        Name of the likelihood that was maximised; with a mosaic, the names of all phases.
+    saturation_dn : Estimate or float, optional
+        Value from which a pixel is saturated, stated or found; of the phase that saturates first.
+    size_px : (int, int), optional
+        Width and height of the frames.
+    mosaic : tuple of str, optional
+        Rows of the smallest period of the colour filters, such as ["RG", "GB"].
+    planes : list of PhaseRecord
+        Measurements of each phase of the mosaic.
+    hot_pixels : list of (int, int)
+        Pixels [row, column] whose dark signal stands out.
+    noisy_pixels : list of (int, int)
+        Pixels [row, column] whose noise is far above the usual.
+    dead_pixels : list of (int, int)
+        Pixels [row, column] that respond to light by less than half of what their neighbours do.
+    temperature_c : TemperatureRange, optional
+        Temperature of the sensor; null if no frame states it.
+    frames : list of NoiseFrame
+        Frames of the set.
+    warnings : list of str
+        Problems of the frames.
+    maps, maps_sha256 : str
+        Name of the file with the maps per pixel; SHA-256 of that file.
+    provenance : Provenance, optional
+        Command, options, inputs and versions.
+    fit, emva1288 : FitRecord, EmvaRecord
+        Scatter about the model and goodness of fit; quantities of EMVA 1288 that follow.
     """
 
     covariance: CovarianceRecord = CovarianceRecord([], [])

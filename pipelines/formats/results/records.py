@@ -57,11 +57,32 @@ def record_name(name: str) -> str:
 
 
 class Certificate(Struct, frozen=True, kw_only=True):
-    """Convergence of an iteration.
+    """Convergence of an iteration; the keys depend on the method.
 
-    PMLEM to its optimum: `value` bounds the relative distance to the optimum (`stationarity` and `slack` are its
-    parts), and `reached` says whether it is below `tolerance`. One-step-late: `relative_change` of the last pass.
-    With a penalty of one's own: `relative_change` still to expect, and whether it has `settled` below the tolerance.
+    Attributes
+    ----------
+    kind : str
+        What the certificate states, in words.
+    value : float
+        PMLEM: bound on the relative distance to the optimum.
+    stationarity, slack : float
+        PMLEM: part of the bound from the gradient; PMLEM: part of the bound from the penalty and the limit at zero.
+    tolerance : float
+        Distance at which the iteration stops.
+    reached : bool
+        PMLEM: true if the bound is within the tolerance.
+    passes : int
+        Passes over the data.
+    inner_steps : int
+        PMLEM: steps of the inner problems, all together.
+    relative_change : float
+        One-step-late: change of the plane by the last pass. With a penalty of one's own: change still to expect.
+    settled : bool
+        True if the relative change is small enough to stop.
+    oscillates : bool
+        One-step-late: true if the plane swings between passes.
+    kept_at_start : int
+        One-step-late: number of samples that keep their first value, as too few pixels see them for this weight.
     """
 
     kind: str = ""
@@ -84,14 +105,30 @@ class Certificate(Struct, frozen=True, kw_only=True):
 
 
 class WeightScore(Struct, frozen=True):
-    """A penalty weight that was tried: the negative log-likelihood of the held-out views."""
+    """A penalty weight that was tried, and its score.
+
+    Attributes
+    ----------
+    weight : float
+        Penalty weight β.
+    held_out : float
+        Negative log-likelihood of the held-out views; the smallest is best.
+    """
 
     weight: float
     held_out: float
 
 
 class PenaltyRecord(Struct, frozen=True):
-    """The penalty, with its smoothing in electrons."""
+    """Penalty of a plane.
+
+    Attributes
+    ----------
+    name : str
+        Name of the penalty, such as "tv".
+    smoothing_e : float
+        δ: difference of neighbouring samples up to which "huber-tv" is quadratic, or the scale of "quadratic"; else 0.
+    """
 
     name: str
     smoothing_e: float
@@ -100,10 +137,20 @@ class PenaltyRecord(Struct, frozen=True):
 class PriorRecord(Struct, frozen=True, kw_only=True):
     """Proposal of a prior for a plane, and its change by the data.
 
-    `mixture` has the weights of the candidates by region, with or without light and detail. `moved_sigma` is the root
-    mean square of plane less proposal, in standard deviations of the back-projection's noise, and `penalty_weight` the
-    weight of their differences. `no_network` says why the trained network has no part in it, `left_out` why the plane
-    is that of total variation instead.
+    Attributes
+    ----------
+    name : str
+        Name of the prior.
+    mixture : dict of dict of float
+        Weights of the candidates, by region of the plane: with or without light and detail.
+    moved_sigma : float
+        Plane less proposal, rms, in standard deviations of the back-projection's noise.
+    penalty_weight : float
+        Weight of the penalty on the differences between plane and proposal.
+    no_network : str
+        Reason why the trained network has no part in the proposal.
+    left_out : str
+        Reason why the plane is that of total variation instead.
     """
 
     name: str
@@ -115,7 +162,7 @@ class PriorRecord(Struct, frozen=True, kw_only=True):
 
 
 class SolveRecord(Struct, frozen=True, kw_only=True):
-    """Solution of one colour of a plane: the middle part of `PlaneRecord`."""
+    """Solution of one colour of a plane: the middle part of `PlaneRecord`, which describes the fields."""
 
     penalty_weight: float | None
     penalty_weight_chosen: str
@@ -135,9 +182,67 @@ class SolveRecord(Struct, frozen=True, kw_only=True):
 class PlaneRecord(Struct, frozen=True, kw_only=True):
     """One colour of one plane, in reconstruction.json and in the plane's own record.
 
-    A plane given by a pose has a `name` and `rt_ref_plane`, whose lengths are those of the poses of the set.
-    `saturated_share` is that of the pixels of all views, and `unknown_share` that of the samples, NaN, most of whose
-    pixels are; unset without any.
+    Attributes
+    ----------
+    name : str, optional
+        Name of a plane that is given by a pose.
+    depth_mm : float
+        Depth at which the axis of the reference camera meets the plane.
+    rt_ref_plane : tuple of float, optional
+        Pose of the plane, Rodrigues vector in rad and translation in the unit of the poses of the set, from the plane's
+        frame to the reference camera's.
+    method : str
+        Method of the reconstruction.
+    channel : str
+        Colour of the plane.
+    file : str
+        Name of the TIFF with the light of the samples.
+    shape : (int, int)
+        Rows and columns.
+    pitch_mm : float
+        Distance between neighbouring samples.
+    origin_mm : (float, float)
+        x and y of the first sample's centre on the plane.
+    penalty_weight : float, optional
+        Penalty weight β; null if the method has none.
+    penalty_weight_chosen : str
+        How the weight was chosen, in words.
+    epsilon_e2 : float, optional
+        ε of eq. (3), the smoothing of total variation by one-step-late iterations; null for other methods.
+    passes : int
+        Passes over the data.
+    objective : float, optional
+        Negative log-likelihood plus weighted penalty; null for a back-projection.
+    certificate : Certificate, optional
+        Convergence of the iteration; null for a back-projection.
+    mean_e : float
+        Mean light of the samples per detector pixel of the reference view.
+    saturated_share, unknown_share : float, optional
+        Share of saturated pixels in all views; share of the samples, NaN, that mostly saturated pixels see.
+    passes_before : float, optional
+        Passes over the data before the iteration: for its start, its weight and its prior.
+    penalty_weight_curve : list of WeightScore, optional
+        Weights that were tried; null if the weight was not chosen by held-out views.
+    penalty : PenaltyRecord, optional
+        Penalty of the plane.
+    likelihood : str, optional
+        Name of the noise model of a pixel.
+    occlusion : bool, optional
+        True if planes hide those behind them. False: that explained the images no better.
+    occlusion_left_out : str, optional
+        Reason why no plane hides another.
+    prior : PriorRecord, optional
+        Prior of the plane.
+    flux_e : float
+        Light of the whole plane in one view: the sum over its samples, weighted by their area in detector pixels.
+    sigma_file : str, optional
+        Name of the TIFF with the standard deviation of each sample.
+    opacity_file : str, optional
+        Name of the TIFF with the opacity of each sample, 0 to 1.
+    proposal_file : str, optional
+        Name of the TIFF with the light that the prior proposed.
+    moved_file : str, optional
+        Name of the TIFF with plane less proposal, in standard deviations of the back-projection's noise.
     """
 
     name: str | UnsetType = UNSET
@@ -194,14 +299,30 @@ def check_depths(planes: Sequence[PlaneRecord], units: StatedUnits | UnsetType) 
 
 
 class FocusPoint(Struct, frozen=True):
-    """The power of detail on a plane, and its standard deviation."""
+    """Focus of one colour of a plane.
+
+    Attributes
+    ----------
+    detail_e2, sigma_e2 : float
+        Power of the detail that two halves of the views share; standard deviation of `detail_e2`.
+    """
 
     detail_e2: float
     sigma_e2: float
 
 
 class FocusCurve(Struct, frozen=True, kw_only=True):
-    """Focus against depth, and the depths at which it peaks."""
+    """Focus against depth, and the depths at which it peaks.
+
+    Attributes
+    ----------
+    depth_mm : list of float
+        Depths of the planes.
+    detail_e2, sigma_e2 : list of float
+        Power of the detail that two halves of the views share, by plane; standard deviation of `detail_e2`.
+    sharp_mm : list of float
+        Depths at which the power peaks.
+    """
 
     depth_mm: list[float]
     detail_e2: list[float]
@@ -217,9 +338,26 @@ class FocusCurve(Struct, frozen=True, kw_only=True):
 class BestFocusRecord(Struct, frozen=True):
     """Search by `--depth-mm auto` for depths of best focus.
 
-    `p_value` is the share of `shuffles`, views exchanged between their places, whose views agree at least as well, and
-    `z_shuffled` by how many of their standard deviations the stated places are better. `sure_of_lit` is the share of
-    the samples with light whose depth is sure.
+    Attributes
+    ----------
+    depth_mm : list of float
+        Depths of best focus.
+    searched_mm : list of (float, float)
+        Nearest and farthest depth of each search, the coarsest first.
+    depths_per_search : int
+        Number of depths that each search compares.
+    bins_px : int
+        Width in detector pixels of the bins of the last search.
+    share_of_sure : list of float
+        Share of the sure samples that are at each depth of best focus.
+    sure_of_lit : float, optional
+        Share of the samples with light whose depth is sure.
+    p_value : float, optional
+        Probability of such agreement by chance: (1 + the shuffles that agree as well)/(1 + `shuffles`).
+    z_shuffled : float, optional
+        Standard deviations of the shuffled views by which the stated places agree better than their mean.
+    shuffles : int, optional
+        Number of times that views were exchanged between their places.
     """
 
     depth_mm: list[float]
@@ -236,7 +374,28 @@ class BestFocusRecord(Struct, frozen=True):
 class DepthMapRecord(Struct, frozen=True):
     """The maps of a sweep: their files, unit and how much of them is known.
 
-    `share_of_sure` are the shares of the sure samples at the depths that stand out, as of `BestFocusRecord`.
+    Attributes
+    ----------
+    file : str
+        Name of the TIFF with the depth or disparity of each sample, NaN where it is not sure.
+    confidence : str
+        Name of the TIFF with the probability of each depth.
+    all_in_focus : str
+        Name of the TIFF with the light of each sample at its depth.
+    unit : {"mm", "px", "relative"}
+        Unit of the map: mm, px of disparity, or the unit of the poses.
+    bins_px : int
+        Width in detector pixels of the bins in which views were compared.
+    sure_above : float
+        Probability from which on a depth counts as sure.
+    sure_share : float
+        Share of the samples whose depth is sure.
+    median : float, optional
+        Median of the sure depths; null without any.
+    share_of_sure : list of float, optional
+        Share of the sure samples at each depth that stands out.
+    sure_of_lit : float, optional
+        Share of the samples with light whose depth is sure.
     """
 
     file: FileName
@@ -264,7 +423,27 @@ class _Planes:
 
 @dataclass(frozen=True, kw_only=True)
 class ReconstructionOptions(SolverOptions, _Planes):
-    """The options of `faintfield reconstruct` as they took effect."""
+    """The options of `faintfield reconstruct` as they took effect.
+
+    Attributes
+    ----------
+    method : str
+        Method of the reconstruction.
+    depth_mm : list of float
+        Depths of the planes.
+    pitch_mm : float, optional
+        Distance between samples; null: one detector pixel of the reference view at each depth.
+    focus : bool
+        True if focus was measured.
+    auto_sweep : int, optional
+        Number of the last depths that are those of `--sweep auto`.
+    depth_map : {"mm", "px", "relative"}, optional
+        Unit of the depth map; null without one.
+    plane_pose : dict of list of float
+        Poses of tilted planes by name: Rodrigues vector, translation, then width and height if they are stated.
+    poses : {"stated", "measured", "aligned", "nominal", "true"}
+        Source of the poses: the set, boards, the views, the commanded places, or the simulator.
+    """
 
     prior: PriorName | UnsetType | None = UNSET  # type: ignore[assignment]
     proposal: bool | UnsetType = UNSET  # type: ignore[assignment]
@@ -277,7 +456,19 @@ class ReconstructionOptions(SolverOptions, _Planes):
 
 
 class PlaneFileRecord(Provenance[ReconstructionOptions], frozen=True):
-    """The record beside a plane (`plane_00500.0.json`), which vouches for its files."""
+    """The record beside a plane (`plane_00500.0.json`), which vouches for its files.
+
+    Attributes
+    ----------
+    format : 1
+        Version of the format.
+    planes : list of PlaneRecord
+        The colours of the plane.
+    focus : list of FocusPoint, optional
+        Focus of each colour; null if it was not measured.
+    sha256 : dict of str
+        SHA-256 of each file beside the record, by its name.
+    """
 
     format: Literal[1]
     planes: list[PlaneRecord]
@@ -294,7 +485,17 @@ class PlaneFileRecord(Provenance[ReconstructionOptions], frozen=True):
 
 
 class DepthMapFileRecord(Provenance[ReconstructionOptions], frozen=True):
-    """`depth_map.json`, which vouches for the maps beside it."""
+    """`depth_map.json`, which vouches for the maps beside it.
+
+    Attributes
+    ----------
+    format : 1
+        Version of the format.
+    depth_map : DepthMapRecord
+        The maps.
+    sha256 : dict of str
+        SHA-256 of each file beside the record, by its name.
+    """
 
     format: Literal[1]
     depth_map: DepthMapRecord
@@ -307,7 +508,33 @@ class DepthMapFileRecord(Provenance[ReconstructionOptions], frozen=True):
 
 
 class ReconstructionRecord(Struct, frozen=True, kw_only=True):
-    """`reconstruction.json`: all planes of one method, and their `Provenance`."""
+    """`reconstruction.json`: all planes of one method, and their `Provenance`.
+
+    Attributes
+    ----------
+    format : 1
+        Version of the format.
+    planes : list of PlaneRecord
+        Each colour of each plane.
+    focus : FocusCurve, optional
+        Focus curve of a sweep.
+    best_focus : BestFocusRecord, optional
+        Search for depths of best focus.
+    depth_map : DepthMapRecord, optional
+        Maps of a sweep.
+    wall_time_s : float
+        Time that the command took.
+    units : StatedUnits, optional
+        Units in which the result is stated; without them mm, electrons and s.
+    command : str
+        Name of the command that made the result.
+    options : ReconstructionOptions
+        Options of the command as they took effect.
+    inputs : dict of str
+        SHA-256 of each file that was read, by its name.
+    versions : dict of str
+        Versions of Python and of the packages that computed the result.
+    """
 
     format: Literal[1] = 1
     planes: Annotated[list[PlaneRecord], Meta(min_length=1)]

@@ -33,7 +33,8 @@ SURFACE_FILE = "surface.json"
 
 # Largest share of what changes from view to view that a surface may leave unexplained: simulated ones with right poses
 # and range leave at most 0.44 at any light, with poses off by 3 mm and 15 mrad at least 0.76, outside the range more
-# than 1 (docs/surface.md). The share is known if the changes raise the deviance by at least the second number.
+# than 1 (docs/explanation/surface.md). The share is known if the changes raise the deviance by at least the second
+# number.
 MAX_UNEXPLAINED, _MIN_CHANGES = 2 / 3, 0.2
 
 # Mean deviance of a surface above which nothing vouches for it, without neighbours to compare with.
@@ -55,8 +56,16 @@ class _Range:
 class SurfaceOptions(SolverOptions, _Range):
     """The options of `faintfield reconstruct --surface` as they took effect.
 
-    `depth_range_mm` is None if the range was to be found. `prior` is stated if one was asked for; otherwise the picture
-    is that of total variation with detail added by a filter.
+    Attributes
+    ----------
+    depth_range_mm : (float, float), optional
+        Nearest and farthest depth of the search; null if the range was to be found.
+    unit : {"mm", "px", "relative"}
+        Unit of depths: "px" if disparities were asked for, else that of the set.
+    prior : {"tv", "patches", "learned", "auto"}, optional
+        Prior that was asked for; otherwise the picture is that of total variation with detail added by a filter.
+    poses : {"stated", "measured", "aligned", "nominal", "true"}
+        Source of the poses: the set, boards, the views, the commanded places, or the simulator.
     """
 
     uncertainty: bool | UnsetType = UNSET  # type: ignore[assignment]
@@ -66,11 +75,22 @@ class SurfaceOptions(SolverOptions, _Range):
 
 
 class HeldOutRecord(Struct, frozen=True, kw_only=True):
-    """Prediction of views that were left out from the other views, compared in a number of `pixels`.
+    """Prediction of views that were left out from the other views.
 
-    `surface`, `planes` and `neighbours` are the mean deviances per pixel of the prediction by the surface; by the same
-    depths on a few planes; and by the mean of each view's neighbours, blurred. Smaller is better; a perfect prediction
-    has 1. `standard_error` is that of the difference between `planes` and `surface`.
+    Attributes
+    ----------
+    views : list of int
+        Indices of the views that were left out, in the order of the set.
+    pixels : int
+        Number of their pixels that were compared.
+    surface : float
+        Mean squared error over the variance of the noise, predicted by the surface; 1 is perfect.
+    planes : float, optional
+        That error, predicted by the depths of the surface on a few planes.
+    standard_error : float, optional
+        Standard error of the difference between `planes` and `surface`.
+    neighbours : float, optional
+        That error, predicted by the mean of each view's neighbours, blurred.
     """
 
     views: list[Count]
@@ -93,7 +113,31 @@ class HeldOutRecord(Struct, frozen=True, kw_only=True):
 
 
 class SurfaceChannel(Struct, frozen=True, kw_only=True):
-    """Solution of one colour of the picture; shares of saturated pixels and unknown samples as in `PlaneRecord`."""
+    """Solution of one colour of the picture.
+
+    Attributes
+    ----------
+    channel : str
+        Colour of the picture.
+    penalty_weight : float, optional
+        Penalty weight β.
+    penalty_weight_chosen : str
+        How the weight was chosen, in words.
+    penalty_weight_curve : list of WeightScore, optional
+        Weights that were tried; null if the weight was not chosen by held-out views.
+    certificate : Certificate, optional
+        Convergence of the iteration.
+    passes : int
+        Passes over the data.
+    likelihood : str
+        Name of the noise model of a pixel.
+    mean_e : float
+        Mean light of the samples per detector pixel of the reference view.
+    saturated_share, unknown_share : float, optional
+        Share of saturated pixels in all views; share of the samples, NaN, that mostly saturated pixels see.
+    prior : PriorRecord, optional
+        Prior of the picture.
+    """
 
     channel: str
     penalty_weight: float | None
@@ -111,11 +155,32 @@ class SurfaceChannel(Struct, frozen=True, kw_only=True):
 class SurfaceFacts(Struct, frozen=True, kw_only=True):
     """Record of the estimation of a surface, without its maps.
 
-    `searched` are the nearest and farthest depth that were considered, in `unit`; `range_found` says that they were
-    found in the views. `depths` were compared, first in bins of `bins_px` detector pixels. Depth and picture were
-    estimated in turn in `rounds`. `sure_above` is the probability from which on a depth counts as sure, and
-    `share_of_sure` the shares of the sure samples at the depths that stand out, as of `BestFocusRecord`;
-    `sure_of_lit` is the share of the samples with light whose depth is sure.
+    Attributes
+    ----------
+    unit : {"mm", "px", "relative"}
+        Unit of depths: mm, px of disparity from one node to the next, or the unit of the poses.
+    searched : (float, float)
+        Nearest and farthest depth that were considered, in `unit`.
+    range_found : bool
+        True if the range was found in the views.
+    depths : int
+        Number of depths that were compared.
+    bins_px : int
+        Width in detector pixels of the bins in which views were compared.
+    rounds : int
+        Number of times that depth and picture were estimated in turn.
+    sure_above : float
+        Probability from which on a depth counts as sure.
+    held_out : HeldOutRecord, optional
+        Prediction of views that were left out; null if nothing could be compared.
+    share_of_sure : list of float, optional
+        Share of the sure samples at each depth that stands out.
+    sure_of_lit : float, optional
+        Share of the samples with light whose depth is sure.
+    channels : list of SurfaceChannel
+        Solution of each colour of the picture.
+    wall_time_s : float
+        Time that the command took.
     """
 
     unit: Literal["mm", "px", "relative"]
@@ -135,11 +200,30 @@ class SurfaceFacts(Struct, frozen=True, kw_only=True):
 class SurfaceRecord(SurfaceFacts, frozen=True, kw_only=True):
     """A surface: what the estimation says, the names of its files, and how much of it is known.
 
-    Files of light, of depth in `unit` (NaN where it is not known), and of their standard deviations; `picture_proposal`
-    is what the prior proposed, `picture_moved` how far the data moved the picture from it. `depth_confidence` is the
-    probability that the depth is right within 2 %, `visibility` the pixels that see a sample, `points` the
-    samples of known depth as a point cloud, None in px, and `film` the picture from viewpoints between the nodes.
-    `known_share` and `sure_share` are shares of the samples, `median` is that of the known depths.
+    Attributes
+    ----------
+    picture, picture_sigma : str
+        Name of the TIFF with the light of each sample; name of the TIFF with the standard deviation of that light.
+    picture_proposal, picture_moved : str, optional
+        Name of the TIFF with the light that the prior proposed; name of the TIFF with picture less proposal, in
+        standard deviations of the noise.
+    depth, depth_sigma : str
+        Name of the TIFF with the depth of each sample in `unit`, NaN where it is not known; name of the TIFF with the
+        standard deviation of that depth.
+    depth_confidence : str
+        Name of the TIFF with the probability that each depth is right within 2 %.
+    visibility : str
+        Name of the TIFF with the pixels that see each sample, about one for each view.
+    points : str, optional
+        Name of the point cloud of the samples of known depth; null for depths in px.
+    film : str, optional
+        Name of the film from viewpoints between the nodes; null if it could not be made.
+    shape : (int, int)
+        Rows and columns of the maps.
+    known_share, sure_share : float
+        Share of the samples whose depth is known; share of the samples whose depth is sure.
+    median : float, optional
+        Median of the known depths, in `unit`; null without any.
     """
 
     picture: FileName
@@ -210,7 +294,17 @@ class SurfaceRecord(SurfaceFacts, frozen=True, kw_only=True):
 
 
 class SurfaceFileRecord(Provenance[SurfaceOptions], frozen=True):
-    """`surface.json`, which vouches for its `files`."""
+    """`surface.json`, which vouches for its `files`.
+
+    Attributes
+    ----------
+    format : 1
+        Version of the format.
+    surface : SurfaceRecord
+        The surface.
+    sha256 : dict of str
+        SHA-256 of each file beside the record, by its name.
+    """
 
     format: Literal[1]
     surface: SurfaceRecord

@@ -131,7 +131,8 @@ def load_board_set(folder: Path) -> BoardSet:
     if has_session(folder) and not is_file(folder / FILE_NAME):
         return _of_session(folder)
     path = folder if is_file(folder) else folder / FILE_NAME
-    remedy = f"name a session with charuco frames, or a folder of board images and {FILE_NAME} (docs/geometry.md)"
+    page = "docs/how-to/measure_geometry.md"
+    remedy = f"name a session with charuco frames, or a folder of board images and {FILE_NAME} ({page})"
     settings = read_toml(path, BoardSetFile, remedy=remedy)
     boards = named_boards(path, settings.board)
     files: dict[tuple[Node, int, int], list[Path]] = {}

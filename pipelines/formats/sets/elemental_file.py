@@ -124,7 +124,7 @@ class Arrangement(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
         What told where rows and columns begin: parts that near objects hide; the sign of all disparities, negative
         where pictures are not aligned; only the names of the files; options of the command.
     transposed, rows_flipped, columns_flipped : bool
-        The first number of a name is the column; rows, columns were reversed to run down and right.
+        The first number of a name is the column; rows were reversed to run down; columns were reversed to run right.
     aligned : bool, optional
         The pictures are aligned (rectified) on a plane in the scene; None where nothing was seen.
     pitch_ratio : float
@@ -167,7 +167,7 @@ class ElementalSetFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     reference_view : int
         Number of the view whose camera is the reference frame, from 0.
     units, arrangement, camera, view : Units, Arrangement, Camera, list of View
-        Their own tables.
+        Units of the set; what an import found about the grid; camera and lens; the views.
     noise : Noise or str
         A table, or the name of a `noise.json` in the folder.
     """

@@ -47,13 +47,32 @@ MAX_RESPONSE = 1e6
 class ElementalSet:
     """An elemental set that was checked when it was loaded: everything but the pixels.
 
-    Paths in the set are relative to its `folder`, and `settings` is what `elemental.toml` says. `noise` is the model of
-    the camera, whose offset is zero with `offset_from_files`. `flat` is the relative response (row, column), and
-    `unusable` are the pixels that are left out (hot, dead). `measured_in` is the geometry.json of the lens, if it is
-    not the set's own; `described_in` the file that says what the images are. `noise_reference` are exposures without
-    light, and `bright_view` is the reference view in plenty of light with its exposure in s, if there are any.
-    `read_frame` reads a frame, given its path and its size in px; see `reconstruction.channels.keeping_frames`. Frames
-    of a set `in_memory` may be real numbers, and are no files.
+    Attributes
+    ----------
+    folder : Path
+        Folder of the set, to which its paths are relative.
+    settings : ElementalSetFile
+        Content of `elemental.toml`.
+    noise : NoiseModel
+        Noise model of the camera; its offset is zero with `offset_from_files`.
+    flat : float32 array (row, column), optional
+        Relative response of each pixel.
+    unusable : bool array (row, column)
+        Pixels that are left out (hot, dead).
+    measured_in : Path, optional
+        The geometry.json of the lens, if it is not the set's own.
+    poses : {"stated", "measured", "aligned", "nominal", "true"}
+        Source of the poses.
+    described_in : str
+        Name of the file that says what the images are.
+    noise_reference : tuple of Path
+        Exposures without light.
+    bright_view : (Path, float), optional
+        The reference view in plenty of light, and its exposure time in s.
+    read_frame : callable
+        Reads a frame, given its path and its size in px; see `reconstruction.channels.keeping_frames`.
+    in_memory : bool
+        True if the frames are no files; they may then be real numbers.
     """
 
     folder: Path
@@ -66,7 +85,9 @@ class ElementalSet:
     described_in: str = FILE_NAME
     noise_reference: tuple[Path, ...] = ()
     bright_view: tuple[Path, float] | None = None
-    read_frame: Callable[[Path, tuple[int, int]], Frame] = field(default=read_frame, compare=False, repr=False)
+    read_frame: Callable[[Path, tuple[int, int]], Frame] = field(
+        default_factory=lambda: read_frame, compare=False, repr=False
+    )
     in_memory: bool = False
 
     @cached_property

@@ -24,7 +24,19 @@ _SAME_DEPTH_MM = 0.05
 
 
 class TruePlane(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One object: its texture in expected electrons on the default grid of its depth, and where it is visible."""
+    """One object, on the default grid of its depth.
+
+    Attributes
+    ----------
+    name : str
+        Name of the object.
+    depth_mm : float
+        Depth of the object.
+    texture : str
+        File of the object's light in expected electrons.
+    visible : str
+        File of the mask of the region where the reference camera sees it.
+    """
 
     name: str
     depth_mm: float
@@ -35,8 +47,12 @@ class TruePlane(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class TrueSurface(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Light that the reference camera would see without distortion and vignetting, on the samples of its own pixels.
 
-    Files of the depths along its axis, at the centres of the pixels, NaN at nothing; and of the expected electrons, the
-    mean over each pixel.
+    Attributes
+    ----------
+    depth_mm : str
+        File of the depths along the camera's axis, at the centres of the pixels, NaN at nothing.
+    picture : str
+        File of the expected electrons, the mean over each pixel.
     """
 
     depth_mm: str
@@ -44,7 +60,28 @@ class TrueSurface(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Truth(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """`truth.json`; file names are relative to the set. A scene consists of flat objects or is one surface."""
+    """`truth.json`; file names are relative to the set. A scene consists of flat objects or is one surface.
+
+    Attributes
+    ----------
+    snr : float
+        Expected signal-to-noise ratio of the true light by eq. (4), a ratio of powers.
+    photons_linear, photons_from_moments : float
+        Photons per pixel by eq. (7), linear in the SNR; photons per pixel of a uniform object with the same SNR.
+    photons_on_object : float
+        Mean photons per pixel of the object region in the reference view.
+    noise_free : str
+        Folder of a set with the same views without noise.
+    poses : {"stated", "measured", "aligned", "nominal", "true"}
+        Source of the poses that the set states: "true" or "nominal".
+    true_rt_cam_ref : list of tuple of float
+        True pose of each view: Rodrigues vector in rad and translation in mm, from the reference camera's frame to the
+        camera's.
+    planes : list of TruePlane
+        Flat objects; empty for a surface.
+    surface : TrueSurface, optional
+        Surface of the scene.
+    """
 
     snr: float
     photons_linear: float
@@ -58,9 +95,16 @@ class Truth(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
 
 
 class TrueDepth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """`true_depth.json`: the file of the depth of each pixel of the reference view, and the hash of its source.
+    """`true_depth.json`: the true depth of each pixel of the reference view, which an imported set brings.
 
-    Depths are those along the camera's axis, at the centres of the pixels, NaN where there is none.
+    Attributes
+    ----------
+    format : 1
+        Version of the format.
+    depth_mm : str
+        File of the depths along the camera's axis, at the centres of the pixels, NaN where there is none.
+    source, sha256 : str
+        Name of the file that was imported; SHA-256 of that file.
     """
 
     format: Literal[1]

@@ -131,7 +131,8 @@ def load_noise_set(folder: Path) -> FrameSeries:
 
 
 def _read_settings(path: Path) -> NoiseSet:
-    remedy = f"name a session, or a folder with {FILE_NAME} (docs/noise.md); `faintfield import emva1288` makes one"
+    page = "docs/how-to/measure_noise.md"
+    remedy = f"name a session, or a folder with {FILE_NAME} ({page}); `faintfield import emva1288` makes one"
     settings = read_toml(path, NoiseSet, remedy=remedy)
     if not settings.frame:
         raise BadValue(f"{path}: names no frame; give a [[frame]] with file, kind and exposure_s for each")

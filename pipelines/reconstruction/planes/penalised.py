@@ -41,8 +41,7 @@ _SEED = 1
 
 # What bounds the distance to the optimum, in words.
 _PMLEM_CERTIFICATE = (
-    "bound on the relative distance to the optimum, from its optimality conditions in the metric of the data; "
-    "see docs/physics.md"
+    "bound on the relative distance to the optimum, from its optimality conditions in the metric of the data"
 )
 _CUSTOM_CERTIFICATE = (
     "relative distance to expect from the lengths of the last two steps; with a penalty of one's own, nothing bounds it"

@@ -79,7 +79,7 @@ def test_tables_of_toml_are_valid(simulated_scene: Path, tmp_path: Path, done: C
         assert not any(valid(kind, damaged) for damaged in (*_damaged(content, key), content | {"veiw": []}))
     assert valid("truth", json.loads((simulated_scene / "truth.json").read_bytes()))
     documents = Path(__file__).parents[3] / "docs"
-    for kind, name in (("boards", "geometry.md"), ("plane-poses", "depth.md")):
+    for kind, name in (("boards", "how-to/measure_geometry.md"), ("plane-poses", "how-to/tilt_planes.md")):
         (example,) = re.findall(r"```toml\n(format = 1\n.*?)```", (documents / name).read_text(), re.DOTALL)
         assert valid(kind, tomllib.loads(example))
         assert not valid(kind, tomllib.loads(example.replace("name =", "nam =")))

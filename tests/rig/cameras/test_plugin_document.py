@@ -1,4 +1,4 @@
-"""The camera of docs/plugins.md runs, and meets the contract."""
+"""The camera of docs/tutorials/camera_driver.md runs, and meets the contract."""
 
 import re
 import socketserver
@@ -13,7 +13,7 @@ import numpy as np
 from faintfield.rig.clock import WallClock
 from faintfield.testing import camera_contract
 
-_DOCUMENT = Path(__file__).parents[3] / "docs" / "plugins.md"
+_DOCUMENT = Path(__file__).parents[3] / "docs" / "tutorials" / "camera_driver.md"
 _PICTURE = np.arange(12, dtype=np.uint16).reshape(3, 4) * 5000
 
 
