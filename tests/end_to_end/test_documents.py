@@ -13,7 +13,6 @@ from faintfield.pipelines.formats.sets.elemental_file import ElementalSetFile
 
 _ROOT = Path(__file__).parents[2]
 _SKIPPED = ("make ", "git clone ")
-DOCUMENTS = ("README.md", "docs/guide.md", "docs/api.md", "docs/how-to/operators.md")
 
 # Smaller numbers for the examples of the README, so that all of them run with the quick tests.
 SMALLER = {
@@ -30,6 +29,11 @@ def _blocks(document: str, *kinds: str) -> list[tuple[str, str]]:
     text = (_ROOT / document).read_text()
     found = re.findall(r"^```(\w+)\n(.*?)^```$", text, flags=re.DOTALL | re.MULTILINE)
     return [(kind, content) for kind, content in found if kind in kinds]
+
+
+_PAGES = [path for folder in ("tutorials", "how-to") for path in sorted((_ROOT / "docs" / folder).glob("*.md"))]
+_LESSONS = [str(path.relative_to(_ROOT)) for path in _PAGES]
+DOCUMENTS = ["README.md", *(lesson for lesson in _LESSONS if _blocks(lesson, "sh", "python"))]
 
 
 def _run_examples(blocks: list[tuple[str, str]]) -> None:
