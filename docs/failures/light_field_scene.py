@@ -66,7 +66,7 @@ def light_field(
 
 
 def show(surface: faintfield.Surface, true_depth_mm: Image) -> None:
-    """Draw the picture, its depth as found, where that is sure, and in truth; print how much of the sure is right."""
+    """Draw picture, depth found, its sure part and true depth; print the share of sure depths that is right."""
     figure, axes = plt.subplots(1, 4, figsize=(14, 3.2), layout="constrained")
     axes[0].imshow(surface.picture, cmap="gray")
     axes[1].imshow(surface.depth, vmin=350, vmax=1000)

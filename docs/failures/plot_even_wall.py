@@ -3,7 +3,7 @@ Even walls
 ==========
 
 Where a wall has no detail, the views agree at every depth. The depth there is continued from its surroundings, and is
-not sure. The picture is right all the same, because every depth predicts the same light.
+not *sure* (confidence below 0.9). The picture is still right, because every depth predicts the same light.
 """
 
 from tempfile import TemporaryDirectory

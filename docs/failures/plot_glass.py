@@ -2,7 +2,7 @@
 Glass
 =====
 
-A pane shows two lights at one place: what stands behind it, and what it reflects. A surface has one depth for each
+A pane shows two things in one place: what is behind it, and what it reflects. A surface has one depth for each
 sample, that of the stronger detail.
 """
 

@@ -2,8 +2,8 @@
 A mirror
 ========
 
-All views agree on the image behind a plane mirror. Its depth is that of the mirrored object, as sure as any other: a
-light field cannot know that there is a mirror.
+All views agree on the image behind a plane mirror. The depth found is that of the mirrored object, as sure as any
+other: nothing in a light field shows that there is a mirror.
 """
 
 from tempfile import TemporaryDirectory
@@ -16,7 +16,7 @@ wall, mirrored = Layer(brick() / 255, 500.0), Layer(gravel()[:, ::-1] / 255, 850
 
 
 def view(camera_mm: Place) -> Image:
-    """Return the wall, and in a mirror on it an object that stands 350 mm before it."""
+    """Return the wall, and in a mirror on it an object 350 mm in front of it."""
     return np.where(window(camera_mm, wall.depth_mm), mirrored.seen_from(camera_mm), wall.seen_from(camera_mm))
 
 

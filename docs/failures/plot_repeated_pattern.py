@@ -2,8 +2,8 @@
 Repeated patterns
 =================
 
-A pattern that repeats within the parallax of the views fits itself at several depths. No comparison of the views can
-tell which of them is the true one.
+A pattern that repeats within the parallax of the views matches itself at several depths. No comparison of the views can
+show which of them is true.
 """
 
 from light_field_scene import FOCAL_PX, STEP_MM, Layer, light_field
@@ -12,7 +12,7 @@ from numpy import indices
 import faintfield
 
 # %%
-# A wall of squares stands at 700 mm. A square has 4 px in a view, so that the pattern repeats after 8 px.
+# A wall of squares is at 700 mm. A square is 4 px wide in a view, so the pattern repeats after 8 px.
 
 true_depth_mm = 700.0
 squares = (indices((512, 512)) // 16).sum(axis=0) % 2
@@ -28,7 +28,7 @@ except faintfield.ReconstructionError as failure:
 
 # %%
 # At the true depth a point moves by 6.9 px from view to view. At the depth where it moves by 8 px more, the plane is as
-# sharp. Only a depth that is known from elsewhere helps.
+# sharp. Only other knowledge of the depth helps.
 
 moved_px = FOCAL_PX * STEP_MM / true_depth_mm
 wrong_depth_mm = round(FOCAL_PX * STEP_MM / (moved_px + 8.0))

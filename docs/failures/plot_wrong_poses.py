@@ -2,8 +2,8 @@
 Wrong poses
 ===========
 
-If the stated poses are not those of the camera, the views contradict one another at every depth. Nearly nothing is
-called sure. `faintfield align` finds the poses by the views themselves.
+If the stated poses are not those of the camera, the views contradict one another at every depth. Almost no depth
+is sure. `faintfield align` finds the poses from the views.
 """
 
 from tempfile import TemporaryDirectory

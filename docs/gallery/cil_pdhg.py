@@ -1,8 +1,8 @@
 """Total variation by CIL
 ======================
 
-CIL, the Core Imaging Library, is installed by conda alone, so this page shows the code without its result: it was
-written against CIL's sources and has not been run. A class with `direct` and `adjoint` makes H an operator of CIL; the
+CIL, the Core Imaging Library, is installed by conda only. So this page shows the code without its result: it was
+written from CIL's sources and has not been run. A class with `direct` and `adjoint` makes H an operator of CIL; the
 views are the channels of its images. PDHG then minimises ‖H f − g‖²/2v + β TV(f) for f ≥ 0.
 """
 

@@ -2,8 +2,8 @@
 ========================
 
 deepinv takes H as two functions of tensors of the shape (batch, channel, ...); here the views are the channels of the
-images. A proximal gradient iteration puts a denoiser in the place of a penalty: total generalised variation, which
-keeps slopes as well as edges and needs no training. A network of `deepinv.models` can stand there, too, once its
+images. A proximal gradient iteration uses a denoiser in place of a penalty. Here it is total generalised variation,
+which keeps slopes as well as edges and needs no training. A network of `deepinv.models` can replace it, once its
 weights are loaded. The example needs the packages `torch` and `deepinv`.
 """
 

@@ -1,9 +1,10 @@
 """
-Is the gain believable?
-=======================
+Is the gain right?
+==================
 
-The gain turns the camera's numbers (DN) into electrons. It is the slope of the photon transfer: the noise of a pixel
-grows with its light. Every quantity comes with a 95 % interval, or with the reason why the frames do not determine it.
+The gain turns electrons into the camera's numbers (DN). It is the slope of the photon transfer curve, the variance of
+a pixel against its signal. Every quantity comes with a 95 % interval, or with the reason why the frames do not
+determine it.
 """
 
 import matplotlib.pyplot as plt
@@ -25,7 +26,7 @@ def series(kind: str, exposure_s: float, light_e: float, level: int = 0):
 
 
 # %%
-# Two short dark exposures tell little about the gain: the dark current adds hardly any noise.
+# Two short dark exposures do not determine the gain: the dark current adds hardly any noise.
 
 darks = [series("dark", exposure_s, 0.0) for exposure_s in (0.1, 0.2)]
 gain = calibrate_noise(darks).estimates["gain_dn_per_e"]

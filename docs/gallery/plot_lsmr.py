@@ -34,8 +34,8 @@ damped_e = mean_e + solution.reshape(H.dims)
 print(f"lsmr: {iterations} iterations")
 
 # %%
-# Least squares undoes the blur of the mean of the views, and amplifies the noise. The likelihood knows that light is
-# positive and that its noise grows with it, and total variation smooths all but edges.
+# Least squares undoes the blur of the mean of the views, and amplifies the noise. The likelihood includes that light
+# is positive and that its noise grows with it. Total variation smooths all but edges.
 
 weight = universal_penalty_weight(operator, dark, start_e)
 for iterate in pmlem(DataFit(operator, dark, level_e=1.0), start_e, penalty_weight=weight):

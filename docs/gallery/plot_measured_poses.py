@@ -2,9 +2,9 @@
 Measured and nominal poses
 ==========================
 
-A gantry misses its nodes. Here each position is off by 0.3 mm and each rotation by 3.5 mrad, which shifts the views by
-several pixels. With the poses that were commanded the plane is blurred, with those that the camera really had it is
-sharp.
+A gantry misses its nodes, the positions of the grid. Here positions are off by about 0.3 mm and rotations by about
+3.5 mrad, which shifts the views by one or two pixels. With the commanded poses the plane is blurred. With the true
+poses it is sharp.
 """
 
 from pathlib import Path
@@ -24,7 +24,7 @@ for poses in ("nominal", "true"):
     planes[poses] = light_field.plane(500.0)
 
 # %%
-# A rotation by 3.5 mrad moves a point by this many pixels:
+# A rotation of 3.5 mrad shifts a view by this many pixels:
 
 print(f"{3.5e-3 * light_field.lens.fx_px:.1f} px")
 

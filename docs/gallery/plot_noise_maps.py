@@ -33,10 +33,10 @@ def dark_series(exposure_s: float, frames: int = 40):
 
 calibration = calibrate_noise([dark_series(exposure_s) for exposure_s in (0.1, 1.0, 10.0)])
 maps = calibration.maps
-print(f"{maps.unusable.sum()} unusable pixels; {np.sum(dark_e_per_s == 200.0)} are hot in truth")
+print(f"{maps.unusable.sum()} unusable pixels; {np.sum(dark_e_per_s == 200.0)} are really hot")
 
 # %%
-# Each map is the best estimate of each pixel: where the frames tell little, it is close to the mean of all pixels.
+# Each map is the best estimate of each pixel: where the frames say little, it is close to the mean of all pixels.
 
 pictures = {
     "offset, DN": maps.offset_dn,

@@ -2,8 +2,8 @@
 Planes alone, together, and with occlusion
 ==========================================
 
-A plane that is reconstructed alone contains the blur of the objects at other depths. Planes that are found together
-share the light among them. With occlusion, nearer objects also hide farther ones.
+A plane that is reconstructed alone contains the blur of the objects at other depths. Planes that are reconstructed
+together share the light among them. With occlusion, nearer objects also hide farther ones.
 """
 
 from pathlib import Path
@@ -19,7 +19,7 @@ faintfield.simulate(dark, options=faintfield.SyntheticOptions(size_px=(240, 180)
 light_field = faintfield.open(dark)
 
 # %%
-# The farther plane, the airplane at 700 mm, contains the blur of the truck if it is found alone.
+# The farther plane, the airplane at 700 mm, contains the blur of the truck if it is reconstructed alone.
 
 titles = {"pmlem": "each alone", "joint": "together", "occlusion": "together, with occlusion"}
 figure, axes = plt.subplots(2, 3, figsize=(13, 6.6), layout="constrained")

@@ -2,7 +2,7 @@
 One dark view, and the planes of all views
 ==========================================
 
-At SNR 0.16 about one electron reaches each pixel of the object, and the read noise is three times as large. A single
+At SNR 0.16, each pixel of the object gets about one electron of signal and 3.5 electrons of read noise. A single
 view shows next to nothing. All 49 views together show a truck at 500 mm and an airplane at 700 mm.
 """
 

@@ -2,8 +2,9 @@
 A penalty of your own
 =====================
 
-A penalty is any object with two methods: `value` returns R(f), and `prox` finds the plane of least R(f) plus squared
-distance to another. The weight is chosen by cross-validation, as that of total variation is.
+A penalty is any object with two methods: `value` returns R(f), and `prox` finds the plane that
+minimises R(f) plus the squared distance to another plane. The weight is chosen by cross-validation, as for total
+variation.
 """
 
 import matplotlib.pyplot as plt
@@ -13,8 +14,8 @@ from dark_scene import dark_light_field
 light_field, truth_e = dark_light_field()
 
 # %%
-# The sparsity of a plane: R(f) = Σ |f|. It draws each sample to zero by the same amount, which suits stars or beads
-# before black. Tikhonov's penalty R(f) = ½ Σ f² draws bright samples more.
+# The sparsity of a plane: R(f) = Σ |f|. It pulls each sample towards zero by the same amount, which suits stars or
+# beads on black. Tikhonov's penalty R(f) = ½ Σ f² pulls bright samples more.
 
 
 class Sparsity:

@@ -2,8 +2,8 @@
 The penalty weight
 ==================
 
-The weight β of the penalty decides how smooth a plane becomes. By default it is the weight whose plane predicts
-held-out views best. Here the truth is known, so the choice can be compared with the best one.
+The weight β of the penalty decides how smooth a plane becomes. By default, the weight is chosen that predicts held-out
+views best. Here the truth is known, so the choice can be compared with the best one.
 """
 
 from pathlib import Path

@@ -3,7 +3,7 @@ A light field from pictures
 ===========================
 
 Pictures in a folder, named by their row and column, become a light field by `faintfield import grid`. Their poses are
-not known in mm, so that depths are disparities: the pixels that a point moves from one picture to the next.
+not known in mm, so depths are disparities: the pixels by which a point moves from one picture to the next.
 """
 
 import subprocess
@@ -21,7 +21,7 @@ pictures, bright, dark = (Path(folder.name, name) for name in ("pictures", "brig
 pictures.mkdir()
 
 # %%
-# Here rendered views stand in for photographs, as JPEGs with the tone curve of a camera.
+# Here rendered views replace photographs, as JPEGs with the tone curve of a camera.
 
 options = faintfield.SyntheticOptions(
     size_px=(240, 180), lens="ideal", position_error_mm=0.0, rotation_error_mrad=0.0, objects="surfaces", pitch_mm=30.0

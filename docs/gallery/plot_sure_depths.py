@@ -27,7 +27,7 @@ sure = surface.sure & known
 print(f"sure: {sure.mean():.0%} of the depths; {np.mean(error[sure] < 0.02):.1%} of these are right within 2 %")
 
 # %%
-# Wrong depths lie where the scene has little detail. Few of them are called sure.
+# Wrong depths lie where the scene has little detail. Few of them are *sure*, with a confidence of at least 0.9.
 
 figure, axes = plt.subplots(1, 3, figsize=(14, 3.6), layout="constrained")
 confidence = axes[0].imshow(surface.confidence, vmin=0, vmax=1)

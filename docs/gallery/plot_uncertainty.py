@@ -26,7 +26,7 @@ inside = np.mean(np.abs(error_e[visible]) < 1.64 * plane.sigma[visible])
 print(f"{inside:.0%} of the samples of the truck lie within 1.64 σ of the truth")
 
 # %%
-# σ is largest at edges, because what is uncertain there is their place.
+# σ is largest at edges, because their place is uncertain.
 
 figure, axes = plt.subplots(1, 3, figsize=(14, 3.6), layout="constrained")
 plane.plot(axes[0])
