@@ -5,8 +5,6 @@ from importlib.metadata import version as installed_version
 from importlib.util import find_spec
 from pathlib import Path
 
-from jupyter_client.connect import ConnectionFileMixin
-
 sys.path.insert(0, str(Path(__file__).parent / "_extensions"))
 from types_of_names import type_aliases
 
@@ -63,7 +61,6 @@ sphinx_gallery_conf = {
     "write_computation_times": False,  # its page loads scripts from other hosts
 }
 
-ConnectionFileMixin.transport.default_value = "ipc"  # no port of a notebook that others on the machine could reach
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True
 nb_execution_timeout = 300
