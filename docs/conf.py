@@ -48,6 +48,7 @@ sphinx_gallery_conf = {
     "examples_dirs": ["gallery", "failures"],
     "filename_pattern": _run,
     "ignore_pattern": "_scene",
+    "within_subsection_order": "gallery_order.ReadingOrder",
     "gallery_dirs": ["tutorials/gallery", "tutorials/failures"],
     "download_all_examples": False,
     "remove_config_comments": True,

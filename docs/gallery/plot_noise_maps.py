@@ -12,13 +12,13 @@ import numpy as np
 from faintfield import Conditions, calibrate_noise, measure_series
 
 # %%
-# A simulated sensor: columns with offsets of their own, a corner that glows, pixels with more read noise, hot pixels.
+# A simulated sensor: columns with offsets of their own, dark currents that differ by 30 %, pixels with more read
+# noise, and hot pixels.
 
 rng = np.random.default_rng(3)
 shape = (128, 128)
 offset_dn = 100.0 + rng.normal(0.0, 3.0, shape[1]) + rng.normal(0.0, 1.0, shape)
-rows, columns = np.mgrid[: shape[0], : shape[1]]
-dark_e_per_s = 0.5 + 3.0 * np.exp(-(rows**2 + columns**2) / 40**2)
+dark_e_per_s = 0.5 * rng.lognormal(0.0, 0.3, shape)
 dark_e_per_s[rng.random(shape) < 0.002] = 200.0
 read_noise_e = np.where(rng.random(shape) < 0.02, 8.0, 3.0)
 

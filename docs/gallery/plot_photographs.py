@@ -45,6 +45,8 @@ print(light_field)
 # One picture that is sharp everywhere, and the disparity of its points.
 
 surface = light_field.surface(Path(folder.name, "surface"))
+# sphinx_gallery_thumbnail_number = 2
+
 light_field.plot()
 surface.plot()
 plt.show()

@@ -24,6 +24,8 @@ print(surface)
 # %%
 # A slanted wall, a rising floor, a ball, a tilted page and a thin rod. The depth is drawn where it is sure.
 
+# sphinx_gallery_thumbnail_number = 2
+
 light_field.plot()
 surface.plot()
 plt.show()
