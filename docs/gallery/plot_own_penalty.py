@@ -14,7 +14,7 @@ from dark_scene import dark_light_field
 light_field, truth_e = dark_light_field()
 
 # %%
-# The sparsity of a plane: R(f) = Σ |f|. It pulls each sample towards zero by the same amount, which suits stars or
+# The sparsity of a plane, R(f) = Σ f for f ≥ 0, pulls each sample towards zero by the same amount. This suits stars or
 # beads on black. Tikhonov's penalty R(f) = ½ Σ f² pulls bright samples more.
 
 
