@@ -23,7 +23,12 @@ extensions = [
     "reference_pages",
     "repository_links",
 ]
-exclude_patterns = ["gallery", "failures", "_extensions", "tutorials/*/*.ipynb"]  # sphinx-gallery makes these to download
+exclude_patterns = [
+    "gallery",
+    "failures",
+    "_extensions",
+    "tutorials/*/*.ipynb",
+]  # sphinx-gallery makes these to download
 default_role = "code"
 smartquotes = False  # two hyphens are an option
 nitpicky = True

@@ -13,7 +13,7 @@ from dark_scene import dark_light_field
 light_field, truth_e = dark_light_field()
 
 # %%
-# The sparsity of a plane: R(f) = Σ |f|. It draws each sample to zero by the same amount, which suits stars or beads
+# The sparsity of a plane, R(f) = Σ f for f ≥ 0, draws each sample to zero by the same amount. This suits stars or beads
 # before black. Tikhonov's penalty R(f) = ½ Σ f² draws bright samples more.
 
 

@@ -13,6 +13,8 @@ from faintfield.pipelines.formats.sets.elemental_file import ElementalSetFile
 
 _ROOT = Path(__file__).parents[2]
 _SKIPPED = ("make ", "git clone ")
+# A line, or all lines of a here-document.
+_COMMAND = re.compile(r"^(.+<< *'?(\w+)'?.*\n[\s\S]*?^\2$|.+)$", re.MULTILINE)
 
 # Smaller numbers for the examples of the README, so that all of them run with the quick tests.
 SMALLER = {
@@ -43,11 +45,11 @@ def _run_examples(blocks: list[tuple[str, str]]) -> None:
         if kind == "python":
             exec(content, names)
             continue
-        for line in content.splitlines():
-            if line.startswith("faintfield "):
-                assert run(shlex.split(line, comments=True)[1:]) == 0, line
-            elif not line.startswith(_SKIPPED):
-                subprocess.run(["bash", "-euo", "pipefail", "-c", line], check=True)
+        for command, _ in re.findall(_COMMAND, content):
+            if command.startswith("faintfield "):
+                assert run(shlex.split(command, comments=True)[1:]) == 0, command
+            elif not command.startswith(_SKIPPED):
+                subprocess.run(["bash", "-euo", "pipefail", "-c", command], check=True)
 
 
 def test_examples_of_readme_run_with_smaller_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
