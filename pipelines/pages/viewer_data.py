@@ -20,7 +20,7 @@ from faintfield.pipelines.pages.page import smaller_uri
 from faintfield.pipelines.pages.report_pictures import PlaneSections
 from faintfield.pipelines.pages.report_planes import Plane, best_column, column_titles, existing
 from faintfield.pipelines.pages.report_sets import SetSection
-from faintfield.pipelines.reconstruction.depth.depth_map import robust_limits
+from faintfield.pipelines.reconstruction.depth.depth_map import limits_of_likely, robust_limits
 from faintfield.pipelines.reconstruction.planes.saturation import has_unknown
 from faintfield.recon.threads import map_in_threads
 
@@ -300,15 +300,14 @@ def _surface_sources(
         return np.asarray(read_frame(existing(folder / name)).pixels_dn, np.float32)
 
     def limits(kind: Kind, name: str) -> tuple[float, float]:
-        """Return black and white of a kind; colours of depths span the sure ones, as in the preview."""
+        """Return black and white of a kind; colours of depths span the likely ones, as in the preview."""
         if kind == "confidence":
             return 0.0, 1.0
         values = read(name)
         if kind in ("light", "sigma"):
             return 0.0, white_level(values) or 1.0
         if kind == "depth":
-            sure = read(surface.depth_confidence) >= surface.sure_above
-            values = values[sure] if sure.any() else values
+            return limits_of_likely(values, read(surface.depth_confidence))
         return robust_limits(values)
 
     sources = []

@@ -127,8 +127,8 @@ def select_planes(options: Options) -> Selection:
     """
     if not options.given(PLACES):
         raise WrongUsage(
-            "no plane is asked for; give --depth auto, --sweep auto, --depth-mm, --sweep-mm FIRST:LAST:COUNT, "
-            "--disparity-px, --sweep-px or --plane-pose"
+            "no plane is asked for; give --surface for one picture that is sharp everywhere, --depth auto, or in the "
+            "unit of the set --depth NUMBER or --sweep FIRST:LAST:COUNT, or --plane-pose FILE"
         )
     selection = Selection(
         options=options,

@@ -173,6 +173,12 @@ def map_picture(
     return content.getvalue()
 
 
+def limits_of_likely(depth: NDArray[np.floating], confidence: NDArray[np.floating]) -> tuple[float, float]:
+    """Return limits between which nearly all depths lie that are rather right than wrong; of all, if there are none."""
+    likely = confidence >= 0.5
+    return robust_limits(depth[likely] if likely.any() else depth)
+
+
 def robust_limits(values: NDArray[np.floating]) -> tuple[float, float]:
     """Return limits between which nearly all known values of a map lie; 0 and 1 if none is known."""
     known = values[np.isfinite(values)]

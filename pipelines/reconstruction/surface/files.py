@@ -31,7 +31,7 @@ from faintfield.pipelines.formats.results.surface import (
     SurfaceRecord,
 )
 from faintfield.pipelines.formats.units import LightUnit, StatedUnits, units_of
-from faintfield.pipelines.reconstruction.depth.depth_map import map_picture, robust_limits
+from faintfield.pipelines.reconstruction.depth.depth_map import limits_of_likely, map_picture, robust_limits
 from faintfield.pipelines.reconstruction.surface.parallax import FRAME_MS, render_parallax, viewpoints
 from faintfield.recon.operator.grid import PlaneGrid
 
@@ -142,7 +142,7 @@ def _named_maps(
         yield _PROPOSED[1], moved, _colour_map(moved, "picture less proposal (σ)")
     confidence = maps.depth_confidence
     sure = confidence >= record.sure_above
-    limits = robust_limits(maps.depth[sure] if sure.any() else maps.depth)
+    limits = limits_of_likely(maps.depth, confidence)
     yield record.depth, maps.depth, map_picture(maps.depth, f"{what} ({record.unit})", *limits, sure)
     yield record.depth_sigma, maps.depth_sigma, _colour_map(maps.depth_sigma, f"σ of the {what} ({record.unit})")
     yield record.depth_confidence, confidence, map_picture(confidence, f"probability of the {what}", 0.0, 1.0)
