@@ -223,18 +223,26 @@ class Capture:
         if request == "stop":
             self._dialogue.stop()
         if request == "pause":
-            self._dialogue.show_status(frame, "paused")
-            lines: tuple[str, ...] = (f"The next frame is {frame.name}.",)
-            answers: tuple[Answer, ...] = ("go", "retake", "skip", "stop")
-            if self._dialogue.rounds.progress(frame.step) is not None:
-                answers = ("go", "retake", "skip", "finish", "stop")
-                lines += ("The step can finish with this round.",)
-            choice = self._dialogue.ask_or_stop(Prompt("paused", "Paused", lines, answers, "go"))
+            while (choice := self._ask_in_pause(frame)) == "retake":
+                self._retake()
         if choice == "finish":
             self._dialogue.rounds.limit(frame)
         if choice == "skip":
             self._session.skip(frame)
-        if choice == "retake" and self._taker.last is not None:
+        if choice == "retake":
+            self._retake()
+
+    def _ask_in_pause(self, frame: PlannedFrame) -> Answer:
+        self._dialogue.show_status(frame, "paused")
+        lines: tuple[str, ...] = (f"The next frame is {frame.name}.",)
+        answers: tuple[Answer, ...] = ("go", "retake", "skip", "stop")
+        if self._dialogue.rounds.progress(frame.step) is not None:
+            answers = ("go", "retake", "skip", "finish", "stop")
+            lines += ("The step can finish with this round.",)
+        return self._dialogue.ask_or_stop(Prompt("paused", "Paused", lines, answers, "go"))
+
+    def _retake(self) -> None:
+        if self._taker.last is not None:
             self._take(self._taker.last)
 
     def _handle_failure(self, frame: PlannedFrame, failure: Exception) -> Answer:

@@ -79,6 +79,13 @@ def test_retake_keeps_both_files_counts_the_later(folder: Path) -> None:
     assert taken_frames(folder)[2][1].intent == 4
 
 
+def test_retake_in_pause_stays_paused(folder: Path) -> None:
+    operator = Operator({"paused": ["retake", "retake", "stop"]}, {3: "pause"})
+    assert isinstance(capture(folder, operator), CaptureStopped)
+    assert operator.frames == [0, 1, 2, 2, 2]
+    assert [prompt.key for prompt in operator.prompts] == ["home", "step", "paused", "paused", "paused"]
+
+
 @pytest.mark.parametrize("answer", ["again", "keep"])
 def test_skipped_frames_are_asked_for_at_the_end(folder: Path, answer: Answer) -> None:
     operator = Operator({"skipped": [answer], "step": ["go", "skip"]}, {1: "skip"})
