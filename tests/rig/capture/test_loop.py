@@ -285,7 +285,7 @@ def test_status_states_stage_camera_and_steps(folder: Path) -> None:
     operator = Operator()
     assert capture(folder, operator) is None
     states = [(status.doing, status.stage, status.camera) for status in operator.statuses]
-    assert states[0] == ("waiting for your answer", "connected, its position is not known", "ready")
+    assert states[0] == ("connected", "connected, its position is not known", "ready")
     assert states[1] == ("homing", "homes", "ready")
     assert ("exposing", "at rest at -300.0, -350.0 mm", "exposes for 0.1 s") in states
     assert ("moving", "moves to node 0, 1", "ready") in states
