@@ -98,6 +98,7 @@ def test_verify_names_missing_frames(whole: Path, shell: Shell) -> None:
     assert shell.run("verify", shell.session) == 1
     assert shell.words.count("problem: ") == 10
     assert "SessionCorrupt" in shell.words
+    assert f"{FRAMES - 20} of {FRAMES} frames present and whole, damaged" in shell.words
     assert shell.run("verify", shell.session / "absent") == 1
     assert "MissingFile" in shell.words
 
