@@ -75,8 +75,8 @@ def jog_stage(connection: StageConnection, dx_mm: float, dy_mm: float, unlock: b
             if stage.travel().holds(target):
                 raise
             raise StageRejected(
-                f"the jog from {start} to {target} ends outside the travel {stage.travel()}; jog the other way, or home "
-                f"first ({failure})"
+                f"the jog from {start} to {target} ends outside the travel {stage.travel()}; jog the other way, or "
+                f"home first ({failure})"
             ) from failure
         inform(f"reported at {position.point}; not homed, so the true position is unknown")
         return position
