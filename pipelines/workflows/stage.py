@@ -68,7 +68,7 @@ def jog_stage(connection: StageConnection, dx_mm: float, dy_mm: float, unlock: b
         except StageAlarm as failure:
             if unlock or failure.position_kept:  # by a door, say, which is no lock
                 raise
-            raise StageAlarm(f"{failure}, or give --unlock to jog without homing") from failure
+            raise StageAlarm(f"{failure}; or give --unlock to jog without homing") from failure
         except StageRejected as failure:
             start = stage.position().point
             target = Point(start.x_mm + dx_mm, start.y_mm + dy_mm)
