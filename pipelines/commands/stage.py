@@ -33,7 +33,7 @@ def home(connection: StageConnection = _NOWHERE) -> Position:
     return home_stage(connection)
 
 
-@app.command(sort_key=4, help_epilogue="Example: faintfield stage goto 100 50 --home --rig rig.toml")
+@app.command(sort_key=4, help_epilogue="Example: faintfield stage goto -100 -50 --home --port simulated:grbl")
 def goto(
     x_mm: float,
     y_mm: float,
@@ -57,7 +57,7 @@ def goto(
     return move_stage(connection, Point(x_mm, y_mm), home)
 
 
-@app.command(sort_key=2, help_epilogue="Example: faintfield stage jog 1 0 --port /dev/ttyUSB0")
+@app.command(sort_key=2, help_epilogue="Example: faintfield stage jog -1 0 --unlock --port simulated:grbl")
 def jog(
     dx_mm: float,
     dy_mm: float,

@@ -75,12 +75,23 @@ def capture_session(
         except RigError as failure:
             panel.end(str(failure))
             raise
-        panel.end(f"Complete. Next: faintfield run {folder}")
+        following = _next_command(session)
+        panel.end(f"Complete. Next: {following}")
         count = len(session.valid()) - before
         for ended in session.rounds_ended.values():
             inform(f"{folder}: {describe_rounds(ended)}")
-    inform(f"{folder}: complete, {count} frames taken; next: faintfield run {folder}")
+    inform(f"{folder}: complete, {count} frames taken; next: {following}")
     return count
+
+
+def _next_command(session: Session) -> str:
+    """Return the command that makes results of a complete session; of one without any, that which verifies it."""
+    folder, kinds = session.folder, {session.frames[number].kind for number in session.valid()}
+    if "dark_scene" in kinds:
+        return f"faintfield run {folder}" + ("" if session.rig.scene.depth_mm else " --depth-mm DEPTH")
+    measured = {"dark": "noise", "charuco": "geometry"}
+    commands = [f"faintfield {command} {folder}" for kind, command in measured.items() if kind in kinds]
+    return " and ".join(commands) or f"faintfield verify {folder}"
 
 
 def _plan_session(settings: RigSettings, folder: Path) -> FrozenPlan:

@@ -60,7 +60,9 @@ class TerminalView:
             yield
 
     def _refresh(self) -> None:
-        """Print new prompts and warnings, and update the picture."""
+        """Update the picture, and print new prompts and warnings above it."""
+        if console.is_terminal:
+            self._live.update(self._picture(), refresh=True)
         status, asked = self._panel.status, self._panel.asked
         if asked is not None and asked.number != self._prompt_number:
             if not self._prompt_number and self._frames is not None:
@@ -77,19 +79,17 @@ class TerminalView:
                 if line not in self._printed:
                     self._printed.add(line)
                     inform(line)
-        if console.is_terminal:
-            self._live.update(self._picture(), refresh=True)
 
     def _picture(self) -> RenderableType:
         """Return the part of the screen that is redrawn."""
-        shown, parts = self._panel.shown, list[Text]()
+        shown, asked, parts = self._panel.shown, self._panel.asked, list[Text]()
         if shown is not None:
             parts.append(Text(_describe_frame(shown, console.width), style="dim"))
             if self._meter is not None and (reading := self._meter.read(shown)) is not None:
                 parts.append(Text(describe_light(reading)))
         if self._panel.status is not None:
-            parts.append(Text(_describe_status(self._panel.status)))
-        if self._panel.asked is None:
+            parts.append(Text(_describe_status(self._panel.status, waiting=asked is not None)))
+        if asked is None:
             parts.append(Text(_key_line(("pause", "retake", "skip", "stop"), "  "), style="dim"))
         lines = sum(part.plain.count("\n") + 1 for part in parts)
         picture = [] if shown is None else [_frame_picture(shown, console.height - lines - 2)]
@@ -120,12 +120,13 @@ def _key_line(buttons: Iterable[Answer | OperatorRequest], gap: str, prompt: Pro
     return gap.join(f"[{KEYS[button]}] {button_label(button, prompt)}" for button in buttons)
 
 
-def _describe_status(status: Status) -> str:
+def _describe_status(status: Status, *, waiting: bool) -> str:
+    doing = "waiting for your answer" if waiting else status.doing
     node = "" if status.node is None else f" node {status.node[0]},{status.node[1]}"
     to_go = f", {format_duration(status.to_go_s)} to go" if status.done < status.total else ""
     rounds = f"\n{visible(status.rounds)}" if status.rounds else ""
     devices = "\n" + visible(f"stage: {status.stage}; camera: {status.camera}") if status.stage else ""
-    return visible(f"{status.done} of {status.total} frames{to_go};{node}: {status.doing}") + rounds + devices
+    return visible(f"{status.done} of {status.total} frames{to_go};{node}: {doing}") + rounds + devices
 
 
 @lru_cache(maxsize=1)

@@ -13,7 +13,7 @@ from faintfield.pipelines.errors import BadValue, WrongUsage
 from faintfield.pipelines.formats.toml_files import read_rig_tables
 from faintfield.pipelines.termination import interrupt_on_termination
 from faintfield.rig.devices import SIMULATED_FIRMWARE, open_stage
-from faintfield.rig.errors import StageUnfit
+from faintfield.rig.errors import NotHomed, StageAlarm, StageRejected, StageUnfit
 from faintfield.rig.simulation.controller.bench import Server
 from faintfield.rig.stages.conformance import Check, check_conformance
 from faintfield.rig.stages.gantry import Gantry
@@ -50,6 +50,11 @@ def move_stage(connection: StageConnection, target: Point, home: bool) -> Positi
         stage.workspace().check_path([target])
         if home:
             stage.home()
+        if not stage.trusted:
+            raise NotHomed(
+                "the stage's position is not known, as opening the port restarts most controllers; give --home, "
+                "which homes before the motion"
+            )
         position = stage.move_to(target.x_mm, target.y_mm)
         inform(f"arrived at {position.point}")
         return position
@@ -58,7 +63,21 @@ def move_stage(connection: StageConnection, target: Point, home: bool) -> Positi
 def jog_stage(connection: StageConnection, dx_mm: float, dy_mm: float, unlock: bool) -> Position:
     """Move by a short distance without homing."""
     with _connected(connection) as stage:
-        position = stage.jog(dx_mm, dy_mm, unlock=unlock)
+        try:
+            position = stage.jog(dx_mm, dy_mm, unlock=unlock)
+        except StageAlarm as failure:
+            if unlock or failure.position_kept:  # by a door, say, which is no lock
+                raise
+            raise StageAlarm(f"{failure}; or give --unlock to jog without homing") from failure
+        except StageRejected as failure:
+            start = stage.position().point
+            target = Point(start.x_mm + dx_mm, start.y_mm + dy_mm)
+            if stage.travel().holds(target):
+                raise
+            raise StageRejected(
+                f"the jog from {start} to {target} ends outside the travel {stage.travel()}; jog the other way, or "
+                f"home first ({failure})"
+            ) from failure
         inform(f"reported at {position.point}; not homed, so the true position is unknown")
         return position
 

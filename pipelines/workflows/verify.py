@@ -81,6 +81,8 @@ def _report_session(folder: Path, verdict: Verdict) -> None:
         state = (
             f"{len(verdict.missing)} still to be taken" if verdict.missing else "not sealed: run capture to finish it"
         )
+    if verdict.problems:
+        state = "damaged"
     inform(f"{folder}: {verdict.present} of {verdict.planned} frames present and whole, {state}")
     for count, what in (
         (len(verdict.left_out), "left out by the operator"),

@@ -113,7 +113,7 @@ class Capture:
         )
         check_plan(session.plan, rig.stage, report)
         self._dialogue.stage, self._dialogue.camera = "connected, its position is not known", "ready"
-        self._dialogue.show_status(session.missing()[0], "waiting for your answer")
+        self._dialogue.show_status(session.missing()[0], "connected")
         if not self._may_home("The stage moves to its switches, to find its position.", "Keep clear of it."):
             self._dialogue.stop()
         self._dialogue.stage = "homes"
@@ -148,7 +148,7 @@ class Capture:
         last = self._taker.last
         continues = last is not None and last.step == first.step  # a further round, or frames to be taken again
         if needs_hand(session.plan.steps[first.step], self._kind_before(first)) and not continues:
-            self._dialogue.show_status(first, "waiting for your answer")
+            self._dialogue.show_status(first, "preparing the step")
             expected = self._dialogue.rounds.expected(of_step)
             duration_s = self._dialogue.pace.remaining_s(expected, 0)
             prompt = step_prompt(session.plan.steps, first, (len(expected), len(of_step)), duration_s)
@@ -212,7 +212,7 @@ class Capture:
             self._taker.take_test(frame)
         except (StageError, NotHomed, CameraError, LightError) as failure:
             self._handle_failure(frame, failure)
-        self._dialogue.show_status(frame, "waiting for your answer")
+        self._dialogue.show_status(frame, "preparing the step")
 
     def _handle_request(self, frame: PlannedFrame) -> None:
         request = self._dialogue.operator.take_request()
@@ -223,18 +223,26 @@ class Capture:
         if request == "stop":
             self._dialogue.stop()
         if request == "pause":
-            self._dialogue.show_status(frame, "paused")
-            lines: tuple[str, ...] = (f"The next frame is {frame.name}.",)
-            answers: tuple[Answer, ...] = ("go", "retake", "skip", "stop")
-            if self._dialogue.rounds.progress(frame.step) is not None:
-                answers = ("go", "retake", "skip", "finish", "stop")
-                lines += ("The step can finish with this round.",)
-            choice = self._dialogue.ask_or_stop(Prompt("paused", "Paused", lines, answers, "go"))
+            while (choice := self._ask_in_pause(frame)) == "retake":
+                self._retake()
         if choice == "finish":
             self._dialogue.rounds.limit(frame)
         if choice == "skip":
             self._session.skip(frame)
-        if choice == "retake" and self._taker.last is not None:
+        if choice == "retake":
+            self._retake()
+
+    def _ask_in_pause(self, frame: PlannedFrame) -> Answer:
+        self._dialogue.show_status(frame, "paused")
+        lines: tuple[str, ...] = (f"The next frame is {frame.name}.",)
+        answers: tuple[Answer, ...] = ("go", "retake", "skip", "stop")
+        if self._dialogue.rounds.progress(frame.step) is not None:
+            answers = ("go", "retake", "skip", "finish", "stop")
+            lines += ("The step can finish with this round.",)
+        return self._dialogue.ask_or_stop(Prompt("paused", "Paused", lines, answers, "go"))
+
+    def _retake(self) -> None:
+        if self._taker.last is not None:
             self._take(self._taker.last)
 
     def _handle_failure(self, frame: PlannedFrame, failure: Exception) -> Answer:

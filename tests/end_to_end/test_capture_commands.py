@@ -98,6 +98,7 @@ def test_verify_names_missing_frames(whole: Path, shell: Shell) -> None:
     assert shell.run("verify", shell.session) == 1
     assert shell.words.count("problem: ") == 10
     assert "SessionCorrupt" in shell.words
+    assert f"{FRAMES - 20} of {FRAMES} frames present and whole, damaged" in shell.words
     assert shell.run("verify", shell.session / "absent") == 1
     assert "MissingFile" in shell.words
 
@@ -162,12 +163,33 @@ step = [
 def test_lights_of_a_rig_file_shine_in_its_capture(shell: Shell) -> None:
     shell.rig.write_text(LIT_RIG)
     assert shell.run("capture", shell.rig, shell.session, "--yes") == 0, shell.words
+    assert f"next: faintfield run {shell.session} --depth-mm DEPTH" in shell.words
     frames = [committed.record for _, committed, _ in taken_frames(shell.session)]
     shone = [record.camera[TRUE_LIGHTS] for record in frames]
     assert shone == ["room,shutter"] * 2 + ["scene,shutter"] * 2 + [""] * 2 + ["room"]
     assert [",".join(record.lights or ()) for record in frames] == shone
     lit, faint, dark = (frames[index].checks["mean_dn"] for index in (0, 2, 4))
     assert lit > faint + 1000.0 > dark + 1000.0
+
+
+@pytest.mark.parametrize(
+    ("kinds", "commands"),
+    [
+        (["dark"], ["noise"]),
+        (["charuco"], ["geometry"]),
+        (["charuco", "dark"], ["noise", "geometry"]),
+        (["bright"], ["verify"]),
+    ],
+)
+def test_next_command_fits_kinds_of_frames(kinds: list[str], commands: list[str], shell: Shell) -> None:
+    text = shell.rig.read_text()
+    steps = "".join(f'[[step]]\nkind = "{kind}"\nexposure_s = 0.1\n' for kind in kinds)
+    shell.rig.write_text(
+        text[: text.index("[[step]]")].replace("rows = 7\ncolumns = 7", "rows = 1\ncolumns = 2") + steps
+    )
+    assert shell.run("capture", shell.rig, shell.session, "--yes") == 0, shell.words
+    named = " and ".join(f"faintfield {command} {shell.session}" for command in commands)
+    assert f"frames taken; next: {named}\n" in shell.words
 
 
 def test_check_remembers_settings_of_stage(shell: Shell) -> None:

@@ -77,5 +77,6 @@ def test_keys_lead_through_capture(tmp_path: Path) -> None:
     terminal.wait_for("Step 7 of 11: Bright set")
     terminal.press("q")
     assert terminal.end() == 1
+    assert not re.search(r"waiting for your answer\s+stage: [^\r\n]*\s+\[p\] pause", terminal.seen)
     assert "CaptureStopped: stopped with 4 of 44 frames taken" in terminal.seen.replace("\r\n", " ")
     assert verify(session).present == 4

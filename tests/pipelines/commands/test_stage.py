@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from faintfield.pipelines.commands.stage import app
 from faintfield.rig.stages.conformance import Check
 from tests.pipelines.conftest import Command, assert_refused
 
@@ -47,24 +48,32 @@ def test_info_and_conformance_are_printed(stage: str, result: Callable[..., Any]
 
 
 def test_goto_needs_homing(result: Callable[..., Any], faintfield: Command) -> None:
-    assert_refused(faintfield("stage", "goto", "-100", "-100", *GRBL), "NotHomed")
+    assert_refused(faintfield("stage", "goto", "-100", "-100", *GRBL), "NotHomed", "; give --home")
     assert result("goto", "-100", "-120.5", "--home", *GRBL)["point"] == [-100.0, -120.5]
     assert result("home", *MARLIN)["trusted"] is True
     position = result("jog", "-1", "-2", "--unlock", *GRBL)
     assert (position["point"], position["trusted"]) == ([-1.0, -2.0], False)
 
 
+@pytest.mark.parametrize("name", ["goto", "jog"])
+def test_example_of_help_works(name: str, done: Command) -> None:
+    done(*str(app[name].help_epilogue).removeprefix("Example: faintfield ").split())
+
+
 @pytest.mark.parametrize(
-    ("arguments", "named"),
+    ("arguments", "named", "remedy"),
     [
-        (("goto", "5", "5", "--home", *GRBL), "OutsideTravel"),
-        (("jog", "1", "1", *GRBL), "StageAlarm"),
-        (("home", "--port", "/dev/no-such-port"), "StageLost"),
+        (("goto", "5", "5", "--home", *GRBL), "OutsideTravel", "choose one inside"),
+        (("jog", "1", "1", *GRBL), "StageAlarm", "or give --unlock"),
+        (("jog", "1", "0", "--unlock", *GRBL), "StageRejected", "jog the other way"),
+        (("home", "--port", "/dev/no-such-port"), "StageLost", "check"),
     ],
 )
-def test_failures_are_one_line_with_a_name(arguments: tuple[str, ...], named: str, faintfield: Command) -> None:
+def test_failures_are_one_line_with_a_name(
+    arguments: tuple[str, ...], named: str, remedy: str, faintfield: Command
+) -> None:
     ended = faintfield("stage", *arguments)
-    assert_refused(ended, named, "; ")
+    assert_refused(ended, named, "; ", remedy)
     assert ended.stderr.count("\n") == 1
 
 

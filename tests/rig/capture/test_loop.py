@@ -79,6 +79,13 @@ def test_retake_keeps_both_files_counts_the_later(folder: Path) -> None:
     assert taken_frames(folder)[2][1].intent == 4
 
 
+def test_retake_in_pause_stays_paused(folder: Path) -> None:
+    operator = Operator({"paused": ["retake", "retake", "stop"]}, {3: "pause"})
+    assert isinstance(capture(folder, operator), CaptureStopped)
+    assert operator.frames == [0, 1, 2, 2, 2]
+    assert [prompt.key for prompt in operator.prompts] == ["home", "step", "paused", "paused", "paused"]
+
+
 @pytest.mark.parametrize("answer", ["again", "keep"])
 def test_skipped_frames_are_asked_for_at_the_end(folder: Path, answer: Answer) -> None:
     operator = Operator({"skipped": [answer], "step": ["go", "skip"]}, {1: "skip"})
@@ -278,7 +285,7 @@ def test_status_states_stage_camera_and_steps(folder: Path) -> None:
     operator = Operator()
     assert capture(folder, operator) is None
     states = [(status.doing, status.stage, status.camera) for status in operator.statuses]
-    assert states[0] == ("waiting for your answer", "connected, its position is not known", "ready")
+    assert states[0] == ("connected", "connected, its position is not known", "ready")
     assert states[1] == ("homing", "homes", "ready")
     assert ("exposing", "at rest at -300.0, -350.0 mm", "exposes for 0.1 s") in states
     assert ("moving", "moves to node 0, 1", "ready") in states
