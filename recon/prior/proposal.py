@@ -57,6 +57,9 @@ _EDGE = 16
 # as all those of means of samples.
 _NEGLIGIBLE, _SMALL = 0.001, 0.1
 
+# Losses that differ by less than this share of the largest product of candidates differ by rounding.
+_ROUNDING = 1e-12
+
 # Rows that a thread mixes at a time: they stay in the cache.
 _STRIP = 32
 
@@ -113,9 +116,11 @@ def best_mixture(scores: Scores, allowed: Sequence[int] | None = None) -> NDArra
     scale = np.abs(errors).max(initial=1e-300)
     sum_is_one = np.append(np.zeros(len(errors)), 1.0)
     shares, _ = nnls(np.vstack([errors / scale, np.ones(chosen.size)]), sum_is_one, maxiter=1000)
-    weights: NDArray[np.float64] = np.zeros(scores.towards.size)
+    weights, first = np.zeros((2, scores.towards.size))
     weights[chosen] = shares / shares.sum()
-    return weights
+    first[chosen[0]] = 1.0
+    alike = scores.loss(first) - scores.loss(weights) <= _ROUNDING * np.abs(scores.gram).max()
+    return first if alike else weights
 
 
 def mixtures_of(

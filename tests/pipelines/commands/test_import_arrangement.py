@@ -149,3 +149,19 @@ def test_noisy_copies_and_darkness_are_warned_of(nine_views: Views, tmp_path: Pa
     src = _write(tmp_path / "dark", dark, white=int(13_000 / float(np.std(dark[0, 0]))))
     ended = done("import", "grid", src, tmp_path / "dark set")
     assert "too dark, or show nothing in common; the order of the names is kept" in ended.stderr
+
+
+def test_objects_before_black_keep_the_order_of_the_names(tmp_path: Path, done: Command) -> None:
+    """Nothing is hidden behind an object before black, which the test of hidden parts may misread."""
+    size = ("--rows", 5, "--columns", 5, "--pitch-mm", 20, "--size-px", 240, 180)
+    exact = ("--lens", "ideal", "--position-error-mm", 0, "--rotation-error-mrad", 0)
+    done("simulate", tmp_path / "scene", *size, *exact)
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    for view in (tmp_path / "scene" / "noise_free").glob("view_*.tiff"):
+        view.rename(pictures / view.name)
+    record = json.loads(done("--json", "import", "grid", pictures, tmp_path / "set", "--no-align").stdout)[
+        "arrangement"
+    ]
+    assert record["told_by"] == "signs"
+    assert record["disparity_range_px"][1] < 0
