@@ -182,10 +182,10 @@ class ElementalSet:
             steps, shift_px = self._steps_and_shifts()
             at_infinity_px = np.sum(steps * shift_px) / max(float(np.sum(steps**2)), 1e-30)
             raise BadValue(
-                f"no plane in front of the cameras has a disparity of {disparity_px:g} px from node to node; give a "
-                f"number below that of infinitely far points, {at_infinity_px:.3g} px (cameras that move right see "
-                "near points move left, by a negative number), or import pictures that were aligned on a plane again, "
-                "with its --disparity-px"
+                f"no plane in front of the cameras has a disparity of {disparity_px:g} px from node to node; "
+                f"give a number below {at_infinity_px:.3g} px, that of infinitely far "
+                "points (cameras that move right see near points move left, by a negative number), or import pictures "
+                "that were aligned on a plane again, with its --disparity-px"
             )
         return 1 / inverse_depth
 
