@@ -23,12 +23,8 @@ extensions = [
     "reference_pages",
     "repository_links",
 ]
-exclude_patterns = [
-    "gallery",
-    "failures",
-    "_extensions",
-    "tutorials/*/*.ipynb",
-]  # sphinx-gallery makes these to download
+# The notebooks in tutorials are made by sphinx-gallery, to download.
+exclude_patterns = ["gallery", "failures", "_extensions", "tutorials/*/*.ipynb"]
 default_role = "code"
 smartquotes = False  # two hyphens are an option
 nitpicky = True

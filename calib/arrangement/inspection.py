@@ -237,13 +237,13 @@ def _direction(
 ) -> tuple[bool, DirectionSource, bool]:
     """Return whether to turn the orientation, what tells so, and whether both are equally likely."""
     least_px, largest_px = range_px
-    natural = largest_px < -no_sign_px  # near points move against the camera, far ones less
-    if natural and not opposed and -_DOUBTFUL_OF_BOTH < side_z <= -_DOUBTFUL_SIDE_Z:
+    least_z = -_DOUBTFUL_SIDE_Z if opposed else -_DOUBTFUL_OF_BOTH
+    if (
+        largest_px < -no_sign_px and least_z < side_z < _MIN_SIDE_Z
+    ):  # near points move against the camera, far ones less
         return False, "signs", False
     if abs(side_z) >= _MIN_SIDE_Z:
         return side_z < 0, "pictures", False
-    if natural and side_z > -_DOUBTFUL_SIDE_Z:
-        return False, "signs", False
     if least_px > no_sign_px and opposed and side_z < _DOUBTFUL_SIDE_Z:
         return True, "signs", False
     # All points move with the camera: the order is reversed, or aligned on the nearest point; the names state neither

@@ -56,8 +56,9 @@ def test_goto_needs_homing(result: Callable[..., Any], faintfield: Command) -> N
 
 
 @pytest.mark.parametrize("name", ["goto", "jog"])
-def test_example_of_help_works(name: str, done: Command) -> None:
-    done(*str(app[name].help_epilogue).removeprefix("Example: faintfield ").split())
+def test_example_of_help_works(name: str, faintfield: Command) -> None:
+    ended = faintfield(*str(app[name].help_epilogue).removeprefix("Example: faintfield ").split())
+    assert ended.returncode == 0, ended.stderr
 
 
 @pytest.mark.parametrize(
