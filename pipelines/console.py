@@ -18,11 +18,15 @@ logger = logging.getLogger("faintfield")
 # Wraps lines: messages in a frame would be cut off otherwise.
 framed_console = Console(stderr=True, highlight=False, emoji=False)
 
-# Off a terminal, seconds until the first line of what takes long, and from one line to the next.
-_FIRST_LINE_S, _NEXT_LINE_S = 2.0, 10.0
+# Off a terminal, seconds until the first line of what takes long, and from one line to the next: more of work that has
+# taken long, by a share of its time.
+_FIRST_LINE_S, _NEXT_LINE_S, _NEXT_LINE_SHARE = 2.0, 10.0, 0.1
 
 # Reports of work under way, each part of the one before: one is silent while a part of it speaks for itself.
 _reports: list["_Report"] = []
+
+# What goes on within a step, the innermost last.
+_stages: list[str] = []
 
 # Labels of the bars that are drawn, and words that no log may hold.
 _bars: list[str] = []
@@ -112,9 +116,19 @@ def working(label: str) -> Iterator[None]:
         yield
 
 
+@contextmanager
+def stage(name: str) -> Iterator[None]:
+    """Name what goes on within a step, for the reports of the work that the step belongs to."""
+    _stages.append(name)
+    try:
+        yield
+    finally:
+        _stages.pop()
+
+
 @dataclass(eq=False)
 class _Report:
-    """Lines about work that takes long: the first after 2 s, then one every 10 s, with the steps done if they count.
+    """Lines about work that takes long: after 2 s, then every 10 s or more, with the steps done if they count.
 
     `total_cost` is what all steps cost, by default one each.
     """
@@ -142,11 +156,12 @@ class _Report:
         self.on_advance()
 
     def state(self) -> str:
-        """Return the steps done, the time since the beginning, and about how long the rest takes."""
+        """Return the steps done, the time since the beginning, about how long the rest takes, and what goes on."""
         steps = "" if self.total is None else f"{self.done} of {self.total}, "
         left_s = self.left_s()
         left = "" if left_s is None else f", about {duration_text(left_s)} to go"
-        return f"{steps}{duration_text(self.clock() - self._started)}{left}"
+        going_on = f" ({_stages[-1]})" if _stages else ""
+        return f"{steps}{duration_text(self.clock() - self._started)}{left}{going_on}"
 
     def left_s(self) -> float | None:
         """Return about how long the remaining steps take, None before it can be known.
@@ -168,7 +183,7 @@ class _Report:
         now = self.clock()
         if now < self._due:
             return None
-        self._due = now + _NEXT_LINE_S
+        self._due = now + max(_NEXT_LINE_S, _NEXT_LINE_SHARE * (now - self._started))
         self.spoke = True
         return f"{self.label}: {self.state()}"
 

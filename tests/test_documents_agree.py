@@ -1,17 +1,17 @@
 """Documents agree with what they describe: links, the figures of docs/quality.md, and the keys of result files."""
 
 import importlib.util
-import inspect
 import json
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from pkgutil import resolve_name
 from types import ModuleType
 from typing import get_origin
 
-import msgspec
 from msgspec import inspect as types
+
+from faintfield.pipelines.formats.key_meanings import key_meanings
+from faintfield.pipelines.workflows.schema import records_of
 
 _ROOT = Path(__file__).parents[1]
 _DOCUMENTS = [*sorted(_ROOT.glob("*.md")), *sorted((_ROOT / "docs").rglob("*.md"))]
@@ -56,23 +56,9 @@ def test_keys_of_result_files_have_meanings() -> None:
     pages = [page.read_text() for page in (_ROOT / "docs" / "reference" / "formats").glob("*.md")]
     files = [resolve_name(name) for page in pages for name in re.findall(r"{json-format} (\S+)", page)]
     assert files
-    for record in _records(types.multi_type_info(files)):
+    for record in records_of(types.multi_type_info(files)):
         kind = get_origin(record.cls) or record.cls
-        texts = [inspect.cleandoc(parent.__doc__ or "") for parent in kind.__mro__[:-1]]
-        entries = re.findall(r"^(\w[\w, ]*)(?: : .*)?\n    \S", "\n".join(texts), flags=re.MULTILINE)
-        described = {name for entry in entries for name in entry.split(", ")}
-        assert not {field.name for field in record.fields} - described, kind
-
-
-def _records(part: object) -> Iterator[types.StructType | types.DataclassType]:
-    """Yield the records in the description of a type, or of several."""
-    if isinstance(part, types.StructType | types.DataclassType):
-        yield part
-        part = [field.type for field in part.fields]
-    elif isinstance(part, types.Type):
-        part = msgspec.structs.astuple(part)
-    for inner in part if isinstance(part, list | tuple) else ():
-        yield from _records(inner)
+        assert not {field.name for field in record.fields} - key_meanings(kind).keys(), kind
 
 
 def _anchors(document: Path) -> set[str]:

@@ -2,16 +2,17 @@
 
 For each set, depths are found in a larger range than that of the true ones. A sample counts with its features, and with
 whether its depth is right; all sets count alike. Coefficients are the maximum of the likelihood, with a weak normal
-prior. The last, of how much of the detail is explained, is fitted on scenes that mislead, given all others: elsewhere
-there is little to learn about it.
+prior. That of how much of the detail is explained is fitted on scenes that mislead, given all others, and that of the
+parallax on scenes from nodes close together, given these: elsewhere there is little to learn about them.
 
-Call `python -m benchmarks.imaging.surface_confidence SET=TRUTH … --misleading SET=TRUTH …`, with a folder of
-elemental.toml and one that holds true_depth_mm.tiff, of several scenes at several levels of light. Report accuracy
-on other scenes.
+Call `python -m benchmarks.imaging.surface_confidence SET=TRUTH … --misleading SET=TRUTH … --close SET=TRUTH …`, with a
+folder of elemental.toml and one that holds true_depth_mm.tiff, of several scenes at several levels of light. Report
+accuracy on other scenes.
 """
 
 import argparse
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +49,7 @@ def samples_of(folder: Path, truth: Path) -> tuple[NDArray[np.float64], NDArray[
     found_mm = 1 / np.interp(index, np.arange(len(depths)), depths)
     right = np.abs(found_mm / true_mm - 1) < RIGHT_WITHIN
     thin = np.s_[..., ::_STRIDE, ::_STRIDE]
-    measured = features(index, costs, depths, explained_share(evidence, index))[thin]
+    measured = features(index, costs, depths, explained_share(evidence, index), float(views.reach.max()))[thin]
     return measured.reshape(len(measured), -1).T, right[thin].ravel()
 
 
@@ -76,14 +77,17 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.imaging.surface_confidence", description=__doc__)
     parser.add_argument("sets", nargs="+", metavar="SET=TRUTH")
     parser.add_argument("--misleading", nargs="*", default=[], metavar="SET=TRUTH")
+    parser.add_argument("--close", nargs="*", default=[], metavar="SET=TRUTH")
     arguments = parser.parse_args(argv)
-    named = [name.split("=") for name in (*arguments.sets, *arguments.misleading)]
-    sets = [samples_of(Path(folder), Path(truth)) for folder, truth in named]
-    plain, misleading = sets[: len(arguments.sets)], sets[len(arguments.sets) :]
-    found = fitted([(x[:, :-1], right) for x, right in plain])
-    found = np.append(found, fitted(misleading, found) if misleading else COEFFICIENTS[-1])
+    groups = (arguments.sets, arguments.misleading, arguments.close)
+    named = [[name.split("=") for name in group] for group in groups]
+    measured = [[samples_of(Path(folder), Path(truth)) for folder, truth in group] for group in named]
+    found = _NOTHING
+    for known, group in zip((4, 5, 6), measured, strict=True):
+        of_group = fitted([(x[:, :known], right) for x, right in group], found) if group else COEFFICIENTS[len(found):known]
+        found = np.append(found, of_group)
     print("fitted", ", ".join(f"{value:.3f}" for value in found))
-    for (folder, _), (x, right) in zip(named, sets, strict=True):
+    for (folder, _), (x, right) in zip(chain(*named), chain(*measured), strict=True):
         for name, coefficients in {"fitted": found, "present": np.array(COEFFICIENTS)}.items():
             sure = 1 / (1 + np.exp(-x @ coefficients)) >= SURE
             share = right[sure].mean() if sure.any() else float("nan")

@@ -7,8 +7,10 @@ from itertools import groupby
 from typing import get_origin
 
 import msgspec
-from docstrings import body, linked, parse_docstring, summary, table
+from docstrings import body, linked, summary, table
 from msgspec import inspect as types
+
+from faintfield.pipelines.formats.key_meanings import key_meanings
 
 type _Record = types.StructType | types.DataclassType
 
@@ -19,8 +21,6 @@ _UNITS = {
 _WORDS = {types.IntType: "whole number", types.FloatType: "number", types.BoolType: "true or false"}
 # Largest number of tables of one type whose names are in a heading.
 _MOST_NAMES = 3
-# First letter of a text that begins with a word, not with a symbol such as k1 or β.
-_LOWER_WORD = re.compile(r"^[a-z](?=[a-z]+\b)")
 _LIMITS = {"ge": "at least {}", "gt": "more than {}", "le": "at most {}", "lt": "less than {}"}
 
 
@@ -86,9 +86,10 @@ def _records(kind: types.Type, repeated: bool = False) -> Iterator[tuple[_Record
 def _keys(record: _Record) -> str:
     """Return the docstring of a type and a table of its fields."""
     kind = get_origin(record.cls) or record.cls
+    meanings = key_meanings(kind)
 
     def cells(field: types.Field) -> tuple[str, ...]:
-        return _value(field), _default(field), _meaning(kind, field.name)
+        return _value(field), _default(field), linked(meanings.get(field.name, ""))
 
     # Keys that share a meaning, such as fx_px and fy_px, share a row.
     rows: list[tuple[str, ...]] = [
@@ -100,21 +101,6 @@ def _keys(record: _Record) -> str:
     else:
         text = table(("key", "value", "default"), "40 40 20", [row[:-1] for row in rows])
     return f"{linked(summary(kind))}\n\n{body(kind)}\n\n{text}"
-
-
-def _meaning(kind: type, name: str) -> str:
-    """Return what the docstring of a type, or of one that it is derived from, says of a field.
-
-    Several fields described together have a part each, or the whole in common.
-    """
-    for parent in (parent for parent in kind.__mro__ if parent.__module__.startswith("faintfield")):
-        sections = parse_docstring(parent)
-        for entry in (*sections["Parameters"], *sections["Attributes"]):
-            if name in (names := entry.name.split(", ")):
-                parts = "\n".join(entry.desc).removesuffix(".").split("; ")
-                text = parts[names.index(name)] if len(parts) == len(names) else "; ".join(parts)
-                return linked(f"{_LOWER_WORD.sub(lambda letter: letter[0].upper(), text)}.")
-    return ""
 
 
 def _default(field: types.Field) -> str:

@@ -1,6 +1,5 @@
 """A light field: the views of a scene with their poses, lens and noise, and the planes reconstructed from them."""
 
-import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from faintfield.calib.lens import Lens
 from faintfield.calib.noise_model import NoiseModel
 from faintfield.pipelines.arguments import PriorName
 from faintfield.pipelines.console import inform
-from faintfield.pipelines.errors import BadValue, WrongUsage, import_optional
+from faintfield.pipelines.errors import BadValue, import_optional
 from faintfield.pipelines.formats.files import exclusive, remove
 from faintfield.pipelines.formats.frames import ChannelLayout
 from faintfield.pipelines.formats.results.surface import SURFACE_FILE
@@ -26,7 +25,7 @@ from faintfield.pipelines.formats.units import Node, StatedUnits
 from faintfield.pipelines.notebook import plotting
 from faintfield.pipelines.notebook.array_set import set_of_arrays
 from faintfield.pipelines.notebook.kept_plane import KeptPlane
-from faintfield.pipelines.notebook.options import PlaneOptions, checked_options, solver_options
+from faintfield.pipelines.notebook.options import PlaneOptions, checked_options, naming_arguments, solver_options
 from faintfield.pipelines.notebook.results import Array, Plane, Planes, Surface, surface_of_folder
 from faintfield.pipelines.reconstruction.channels import keeping_frames, load_channel, view_electrons
 from faintfield.pipelines.reconstruction.depth.autofocus import best_focus
@@ -241,7 +240,7 @@ class LightField:
         if (near is None) != (far is None):
             raise BadValue(f"the range from {near} to {far} has one end; give both or none")
         limits = None if near is None or far is None else (self._depth_mm(near), self._depth_mm(far))
-        with _scratch() as folder:
+        with _scratch() as folder, naming_arguments():
             depths_mm = best_focus(self.elemental_set, folder, limits).depth_mm
         return [self.elemental_set.stated_depth(depth_mm) for depth_mm in depths_mm]
 
@@ -278,7 +277,7 @@ class LightField:
         """
         options = checked_options(options)
         method, progress = options.get("method", "pmlem"), options.get("progress")
-        with _scratch() as folder:
+        with _scratch() as folder, naming_arguments():
             elemental_set = keeping_frames(self.elemental_set, folder)
             request = self._request(depths, options, folder)
             check_request(elemental_set, [], request)
@@ -328,7 +327,7 @@ class LightField:
             if not (ends[0] > 0 or in_px) or ends[0] == ends[1]:
                 raise BadValue(f"depth_range: got {depth_range}; give two different depths in front of the camera")
         solver = solver_options(PlaneOptions() if prior is None else PlaneOptions(prior=prior))
-        with exclusive(folder):
+        with exclusive(folder), naming_arguments():
             if self.elemental_set.in_memory:
                 remove(folder / SURFACE_FILE)  # nothing tells whether it was made of the same arrays
             request = SurfaceRequest(ends, "px" if in_px and ends else "mm", solver)
@@ -364,14 +363,10 @@ class LightField:
         if not asked:
             raise BadValue("depths: none is given; give some, or 'auto'")
         method = options.get("method", "pmlem")
-        try:
-            selection = select_planes(
-                Options(depth=asked, method=[method], solver=solver_options(options), pitch_mm=options.get("pitch"))
-            )
-            request = resolve(selection, self.elemental_set, folder)
-        except WrongUsage as failure:  # which names options of commands
-            text = re.sub(r"--([a-z-]+)", lambda option: option[1].replace("-", "_"), str(failure))
-            raise BadValue(text) from failure
+        selection = select_planes(
+            Options(depth=asked, method=[method], solver=solver_options(options), pitch_mm=options.get("pitch"))
+        )
+        request = resolve(selection, self.elemental_set, folder)
         self._check_depths(request.depths_mm, request.pitch_mm)
         return request
 

@@ -1,15 +1,18 @@
 """Options of planes in Python: checked as those of commands are, and with a penalty and a prior of one's own."""
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from numbers import Integral, Real
 from typing import Any, Literal, TypedDict, cast, get_args
 
 import numpy as np
 
 from faintfield.pipelines.arguments import Method, PriorName
-from faintfield.pipelines.errors import BadValue
+from faintfield.pipelines.errors import BadValue, InputError, WrongUsage
 from faintfield.pipelines.reconstruction.planes.custom import CustomOptions
 from faintfield.pipelines.reconstruction.request import WITH_PRIOR
+from faintfield.recon.errors import ReconstructionError
 from faintfield.recon.names import LikelihoodName, PenaltyName
 from faintfield.recon.prior.denoiser import Denoiser
 from faintfield.recon.solver.custom_penalty import ProximalPenalty
@@ -22,6 +25,13 @@ _WORDS: dict[str, tuple[str, ...]] = {
     "likelihood": ("auto", *get_args(LikelihoodName.__value__)),
 }
 _LEAST = {"penalty_weight": 0.0, "pitch": 1e-9, "passes": 1}
+
+# An option of commands in a message, with the form of its value; arguments that have other names in Python.
+_OPTION = re.compile(r"--([a-z-]+)( [A-Z:]*:[A-Z:]*| NUMBER)?")
+_ARGUMENTS = {
+    **{"depth": "depths", "depth-mm": "depths", "pitch-mm": "pitch", "sweep": "near and far"},
+    **dict.fromkeys(("depth-range-mm", "disparity-range-px"), "depth_range=(near, far)"),
+}
 
 
 class PlaneOptions(TypedDict, total=False):
@@ -97,6 +107,18 @@ def checked_options(options: PlaneOptions) -> PlaneOptions:
     if own and values.get("method", "pmlem") not in WITH_PRIOR:
         raise BadValue(f"{own[0]}: one of your own is for {', '.join(sorted(WITH_PRIOR))}, got {values['method']}")
     return options
+
+
+@contextmanager
+def naming_arguments() -> Iterator[None]:
+    """Name arguments instead of the options of commands in the messages of failures; a wrong usage is a BadValue."""
+    try:
+        yield
+    except (InputError, ReconstructionError, WrongUsage) as failure:
+        text = _OPTION.sub(lambda found: _ARGUMENTS.get(found[1], found[1].replace("-", "_")), str(failure))
+        if text == str(failure) and not isinstance(failure, WrongUsage):
+            raise
+        raise (BadValue if isinstance(failure, WrongUsage) else type(failure))(text) from failure
 
 
 def _is_number(value: object, least: float, *, whole: bool) -> bool:

@@ -1,14 +1,15 @@
 """JSON Schemas of the files that are read and written, from the types that read and write them: `faintfield schema`."""
 
 import json
-import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import msgspec
 from msgspec import Struct
+from msgspec import inspect as types
 
 from faintfield.pipelines.arguments import SchemaKind
+from faintfield.pipelines.formats.key_meanings import SECTION, key_meanings
 from faintfield.pipelines.formats.plane_poses import PlanePoses
 from faintfield.pipelines.formats.provenance import DIGEST_KEY
 from faintfield.pipelines.formats.results.alignment import AlignmentRecord
@@ -27,6 +28,7 @@ from faintfield.rig.cameras.settings import BUILT_IN_BACKENDS
 from faintfield.rig.lights.settings import BUILT_IN_DRIVERS
 from faintfield.rig.session.session import FrozenPlan
 from faintfield.rig.settings import RigSettings
+from faintfield.rig.stages.protocol import WITHOUT_OPTIONS
 
 _DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
@@ -58,10 +60,6 @@ _KINDS = _INPUTS | _RESULTS
 
 # The digest that every record of a result ends with; earlier versions wrote none.
 _DIGEST = {DIGEST_KEY: {"type": "string", "pattern": "^[0-9a-f]{64}$"}}
-
-# Sections of a docstring, and the entries of one that lists fields.
-_SECTION = re.compile(r"\n\n(\w+)\n-+\n(.*?)(?=\n\n\w+\n-+\n|\Z)", re.DOTALL)
-_ENTRY = re.compile(r"^(\w[\w, ]*) : .*\n((?:    .*(?:\n|\Z)|\n)+)", re.MULTILINE)
 
 
 class JsonSchema(Struct, frozen=True):
@@ -101,7 +99,13 @@ def describe_kind(kind: SchemaKind, units: StatedUnits) -> JsonSchema:
     record, sentence = _KINDS[kind]
     content = msgspec.json.encode(msgspec.json.schema(record, schema_hook=_any_value))
     schema = msgspec.json.decode(content.replace(rb"\\Z", b"$"))  # as JSON Schema writes the end of a text
-    definitions = {name: _with_descriptions(part) for name, part in schema["$defs"].items()}
+    # msgspec names a definition in full where two types share a name
+    records = {
+        name: part
+        for part in records_of(types.type_info(record))
+        for name in (part.cls.__name__, f"{part.cls.__module__}.{part.cls.__qualname__}")
+    }
+    definitions = {name: _with_meanings(part, records[name]) for name, part in schema["$defs"].items()}
     if "units" in record.__struct_fields__:
         definitions = {name: _in_units(part, units) for name, part in definitions.items()}
     if kind in _RESULTS:
@@ -117,16 +121,26 @@ def _any_value(_: type) -> dict[str, Any]:
     return {"description": "Any value."}
 
 
-def _with_descriptions(definition: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a definition whose fields have the texts that the docstring of their type has for them."""
-    description = definition.get("description", "")
-    properties = {name: dict(part) for name, part in definition.get("properties", {}).items()}
-    for heading, section in _SECTION.findall(description):
-        for names, text in _ENTRY.findall(section) if heading in ("Parameters", "Attributes") else ():
-            for name in set(names.split(", ")) & properties.keys():
-                properties[name]["description"] = " ".join(text.split())
-    described = {**definition, "description": _SECTION.sub("", description)} if description else dict(definition)
-    return {**described, "properties": properties} if properties else described
+def records_of(part: object) -> Iterator[types.StructType | types.DataclassType]:
+    """Yield the records in the description of a type, or of several, as msgspec has it."""
+    if isinstance(part, types.StructType | types.DataclassType):
+        yield part
+        part = [field.type for field in part.fields]
+    elif isinstance(part, types.Type):
+        part = msgspec.structs.astuple(part)
+    for inner in part if isinstance(part, list | tuple) else ():
+        yield from records_of(inner)
+
+
+def _with_meanings(definition: Mapping[str, Any], record: types.StructType | types.DataclassType) -> dict[str, Any]:
+    """Return the definition of a record with the meanings of its keys."""
+    meanings = key_meanings(record.cls)
+    properties = {name: dict(part) for name, part in definition["properties"].items()}
+    for field in record.fields:
+        if field.name in meanings:
+            properties[field.encode_name]["description"] = meanings[field.name]
+    description = SECTION.sub("", definition["description"])
+    return {**definition, "description": description, "properties": properties}
 
 
 def _in_units(definition: Mapping[str, Any], units: StatedUnits) -> dict[str, Any]:
@@ -147,4 +161,8 @@ def _as_written(definition: Mapping[str, Any]) -> dict[str, Any]:
             properties.pop(name)
             properties[key] = {"type": "string", "not": {"enum": list(built_in)}}
     required = [key for key in definition["required"] if key in properties]
-    return {**definition, "properties": properties, "required": required, "additionalProperties": True}
+    written = {**definition, "properties": properties, "required": required, "additionalProperties": True}
+    if "protocol" in properties:
+        written["if"] = {"properties": {"protocol": {"enum": list(WITHOUT_OPTIONS)}}}
+        written["then"] = {"propertyNames": {"enum": list(properties)}}
+    return written

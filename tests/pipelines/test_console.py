@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from faintfield.pipelines import cli, console
-from faintfield.pipelines.console import _Report, _reports, conceal, inform, progress, working
+from faintfield.pipelines.console import _Report, _reports, conceal, inform, progress, stage, working
 from tests.patience import HANG_S
 from tests.pipelines.conftest import Command, assert_refused
 
@@ -31,6 +31,10 @@ def test_lines_are_due_after_2_and_12_s() -> None:
     assert lines[12.0] == "solving: 2 of 8, 12 s, about 28 s to go"
     assert lines[22.0] == "solving: 2 of 8, 22 s, about 25 s to go"
     assert report.wait_s() == pytest.approx(32 - 24.9)
+    now = 300.0
+    with stage("step"), stage("part of a step"):
+        assert report.line() == "solving: 2 of 8, 3 min, about 25 s to go (part of a step)"
+    assert report.wait_s() == pytest.approx(20.0)
 
 
 @pytest.mark.parametrize("costs", [[1.0] * 6, [1.0, 1.0, 2.0, 2.0, 1.0, 1.0]])

@@ -64,12 +64,18 @@ def _read_grey(path: Path, size_px: tuple[int, int]) -> NDArray[np.float32]:
 
 
 def arrange_grid(
-    grid: ImageGrid, prescribed: Orientation | None, *, white: float, size_px: tuple[int, int], aligned: bool = False
+    grid: ImageGrid,
+    prescribed: Orientation | None,
+    *,
+    white: float,
+    size_px: tuple[int, int],
+    aligned: bool = False,
+    lens: str,
 ) -> tuple[ImageGrid, Arrangement]:
     """Inspect the pictures of a grid, put them in order, and print what they show.
 
     If options prescribe the order, the pictures are only measured. `white` is the value of a white pixel; `aligned`
-    says that a person stated that the pictures are aligned, so that disparities may have any sign.
+    says that a person stated that the pictures are aligned, so that disparities may have any sign; `lens` is printed.
 
     Raises
     ------
@@ -113,7 +119,7 @@ def arrange_grid(
         relative_light=tuple(round(light[path], 4) for path in arranged.paths.values()) if uneven else (),
         irregular=inspection.failure is None and any(_irregularities(inspection)),
     )
-    _print_table(arranged, record, inspection)
+    _print_table(arranged, record, inspection, lens)
     for warning in _warnings(record, inspection, len(paths)):
         inform(warning)
     return arranged, record
@@ -225,7 +231,7 @@ def _options(orientation: Orientation) -> str:
     return " ".join(option for name, option in flags.items() if getattr(orientation, name))
 
 
-def _print_table(grid: ImageGrid, record: Arrangement, inspection: GridInspection) -> None:
+def _print_table(grid: ImageGrid, record: Arrangement, inspection: GridInspection, lens: str) -> None:
     counts = [*zip(grid.size, ("row", "column"), strict=True), (len(grid.paths), "view")]
     rows, columns, views = (f"{count} {noun}{'s' * (count != 1)}" for count, noun in counts)
     lines = {"grid": f"{rows} x {columns}, {views}", "order": "as in the names: the pictures do not tell"}
@@ -247,7 +253,7 @@ def _print_table(grid: ImageGrid, record: Arrangement, inspection: GridInspectio
             lines["pitch"] = f"columns {record.pitch_ratio:.3f} times as far apart as rows"
         if record.relative_light:
             lines["light"] = f"{min(record.relative_light):.2f} … {max(record.relative_light):.2f} of the typical view"
-    lines["lens"] = "taken as ideal: no distortion, centred; undistort pictures before if theirs is not"
+    lines["lens"] = lens
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     for heading, text in lines.items():
         table.add_row(heading, text)

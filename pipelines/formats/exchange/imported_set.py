@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from faintfield.calib.homography import rotation_matrix
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.console import inform, progress
-from faintfield.pipelines.errors import BadValue, MissingFile, WrongBitDepth, WrongSize
+from faintfield.pipelines.errors import BadValue, MissingFile, WrongBitDepth, WrongSize, WrongUsage
 from faintfield.pipelines.formats.exchange.imported_light import (
     NoiseOrigin,
     Pictures,
@@ -26,7 +26,7 @@ from faintfield.pipelines.formats.exchange.imported_light import (
     tone_of,
     without_curve,
 )
-from faintfield.pipelines.formats.exchange.options import GridOptions, ImportOptions
+from faintfield.pipelines.formats.exchange.options import GridOptions, ImportOptions, LensOptions
 from faintfield.pipelines.formats.files import check_free, require_room, sha256, write_json, writing_folder
 from faintfield.pipelines.formats.frames import RAW_SUFFIXES, Frame, exif_exposure_s, picture_kind, read_frame
 from faintfield.pipelines.formats.image_files import write_frame
@@ -173,6 +173,20 @@ def _nodes(images: Sequence[PosedImage]) -> Sequence[tuple[int, int] | None]:
     matches = [re.search(r"r([0-9]{1,5})_c([0-9]{1,5})$", image.path.stem) for image in images]
     nodes = [(int(numbers[1]), int(numbers[2])) for numbers in matches if numbers is not None]
     return nodes if len(set(nodes)) == len(images) else [None] * len(images)
+
+
+def stated_lens(size_px: tuple[int, int], fx_px: float, fy_px: float, options: LensOptions | GridOptions) -> Lens:
+    """Return the lens of the options, whose principal point is the middle of the picture by default.
+
+    Raises WrongUsage for a lens that cannot be.
+    """
+    middle_x, middle_y = ((side - 1) / 2 for side in size_px)
+    cx_px = middle_x if options.cx_px is None else options.cx_px
+    cy_px = middle_y if options.cy_px is None else options.cy_px
+    try:
+        return Lens(size_px, fx_px, fy_px, cx_px, cy_px, options.distortion)
+    except ValueError as failure:
+        raise WrongUsage(f"the lens of the options cannot be: {failure}; correct them") from failure
 
 
 def check_set_free(out: Path, options: ImportOptions | GridOptions, *sources: Path) -> None:

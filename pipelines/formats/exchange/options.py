@@ -79,6 +79,12 @@ class GridOptions:
         --disparity-px, depths are in mm; without, planes are known by their disparity in px.
     fx_px
         Focal length; by default the width of a picture.
+    cx_px
+        Principal point, where the first pixel's centre is 0; the middle of the picture by default.
+    cy_px
+        Likewise, of the other axis.
+    distortion
+        k1, k2, p1, p2, k3 … in OpenCV's order, with --pitch-mm and --fx-px; none by default.
     disparity_px
         For pictures aligned (rectified) on a plane: how many pixels that plane moved from node to node before it was
         aligned, a positive number. With the pitch it sets the plane's depth to fx · pitch / disparity. 0: not aligned.
@@ -121,6 +127,9 @@ class GridOptions:
 
     pitch_mm: Positive | None = None
     fx_px: Positive | None = None
+    cx_px: float | None = None
+    cy_px: float | None = None
+    distortion: tuple[float, ...] = ()
     disparity_px: NotNegative | None = None
     rows: Count | None = None
     columns: Count | None = None

@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.arrangement.views import Orientation
-from faintfield.calib.lens import Lens
 from faintfield.pipelines.console import inform
-from faintfield.pipelines.errors import BadValue, WrongBitDepth
+from faintfield.pipelines.errors import BadValue, WrongBitDepth, WrongUsage
 from faintfield.pipelines.formats.exchange.arranged_grid import arrange_grid
 from faintfield.pipelines.formats.exchange.hci import described_grid, write_true_depth
 from faintfield.pipelines.formats.exchange.image_grid import ImageGrid, find_grid
@@ -28,6 +27,7 @@ from faintfield.pipelines.formats.exchange.imported_set import (
     check_set_free,
     read_picture,
     require_room_for_copies,
+    stated_lens,
     write_imported_set,
 )
 from faintfield.pipelines.formats.exchange.options import GridOptions
@@ -65,6 +65,13 @@ class ImportedGrid(msgspec.Struct, frozen=True):
 def import_pictures(src: Path, out: Path, options: GridOptions) -> ImportedGrid:
     """Make an elemental set of the pictures in a folder or a file, put in order by what they show."""
     check_set_free(out, options, src)
+    if options.distortion and (None in (options.pitch_mm, options.fx_px) or options.disparity_px):
+        raise WrongUsage(
+            "--distortion is that of pictures that were not aligned, in pixels of the focal length; give --pitch-mm and "
+            "--fx-px with it, and no --disparity-px"
+        )
+    own = {options.cx_px, options.cy_px, *options.distortion} != {None}
+    lens_text = "as stated" if own else "ideal, no distortion, centred: state another by --distortion, --cx-px, --cy-px"
     recorded = {name: value for name, value in asdict(options).items() if name not in ("no_align", "overwrite")}
     pitch_mm, fx_px, disparity_px = options.pitch_mm, options.fx_px, options.disparity_px
     described = described_grid(src)
@@ -85,6 +92,7 @@ def import_pictures(src: Path, out: Path, options: GridOptions) -> ImportedGrid:
             white=white if views.dn_per_value is None else np.inf,  # floats state no white
             size_px=(width, height),
             aligned=bool(disparity_px),
+            lens=lens_text,
         )
         stated = disparity_px is not None
         pitch_mm, fx_px, at_infinity_px, in_mm = _scale(arrangement, float(width), pitch_mm, fx_px, disparity_px or 0.0)
@@ -93,7 +101,7 @@ def import_pictures(src: Path, out: Path, options: GridOptions) -> ImportedGrid:
                 "warning: the pictures do not tell whether they are aligned on a plane in the scene; depths in mm hold "
                 "only if they are not: give --disparity-px, 0 if they are not aligned"
             )
-        lens = Lens((width, height), fx_px, fx_px, (width - 1) / 2, (height - 1) / 2)
+        lens = stated_lens((width, height), fx_px, fx_px, options)
         write_imported_set(
             out,
             options,

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from faintfield.calib.lens import Lens
 from faintfield.pipelines.errors import BadValue, WrongUsage
 from faintfield.pipelines.formats.exchange.grid_names import picture_named
 from faintfield.pipelines.formats.exchange.imported_set import (
@@ -19,6 +18,7 @@ from faintfield.pipelines.formats.exchange.imported_set import (
     import_posed,
     pose_of,
     read_picture,
+    stated_lens,
 )
 from faintfield.pipelines.formats.exchange.options import ImportOptions, LensOptions
 from faintfield.pipelines.formats.reading import read_text
@@ -50,13 +50,7 @@ def import_table(src: Path, out: Path, lens_options: LensOptions, options: Impor
         raise WrongUsage(f"{src}: its header states the unit of positions; leave --mm-per-unit out")
     options = replace(options, mm_per_unit=options.mm_per_unit or mm_per_unit)
     height, width = read_picture(next(iter(poses))).pixels_dn.shape[:2]
-    fx_px, cx_px, cy_px = lens_options.fx_px, lens_options.cx_px, lens_options.cy_px
-    cx_px = (width - 1) / 2 if cx_px is None else cx_px
-    cy_px = (height - 1) / 2 if cy_px is None else cy_px
-    try:
-        lens = Lens((width, height), fx_px, lens_options.fy_px or fx_px, cx_px, cy_px, lens_options.distortion)
-    except ValueError as failure:
-        raise WrongUsage(f"the lens of the options cannot be: {failure}; correct them") from failure
+    lens = stated_lens((width, height), lens_options.fx_px, lens_options.fy_px or lens_options.fx_px, lens_options)
     images = [PosedImage(path, lens, pose) for path, pose in poses.items()]
     return import_posed(out, [src], images, options, "import poses")
 

@@ -9,6 +9,7 @@ import numpy as np
 from msgspec import structs
 
 from faintfield.pipelines.arguments import SolverOptions
+from faintfield.pipelines.console import stage
 from faintfield.pipelines.formats.results.records import Certificate, PenaltyRecord, SolveRecord, WeightScore
 from faintfield.pipelines.reconstruction.planes.custom import CustomOptions
 from faintfield.recon.likelihood.images import Image, select_likelihood
@@ -120,7 +121,8 @@ def solve_pmlem(objective: Objective, *, as_pilot: bool = False) -> list[Solutio
     Those from which a prior begins, the pilots, have a certificate of a larger tolerance.
     """
     tolerance = _PILOT_TOLERANCE if as_pilot else _TOLERANCE
-    weight, start, dual, how = _choose_weight(objective)
+    with stage("penalty weight"):
+        weight, start, dual, how = _choose_weight(objective)
     record, samples = certified(objective, start, weight, dual, tolerance)
     record = structs.replace(record, **{"passes_before": 1.0, "penalty_weight_curve": None} | how)
     return [Solution(plane, record) for plane in objective.posed.operator.planes_of(samples)]
@@ -156,7 +158,8 @@ def with_sigma(
     fits = local_fits(operator, objective.posed.fit(objective.level_e), samples)
     found = []
     for solution, local, of_plane in zip(solutions, fits, responses or [None] * len(fits), strict=True):
-        sigma = standard_deviation(local, weight, penalty, generator, of_plane)
+        with stage("standard deviation"):
+            sigma = standard_deviation(local, weight, penalty, generator, of_plane)
         found.append(replace(solution, sidecars=solution.sidecars | {"sigma": sigma}))
     return found
 
@@ -177,7 +180,8 @@ def certified(
         dual=dual,
     )
     del start  # the iterates drop it after the first step
-    iterate = iterate_until(iterates, tolerance, objective.options.passes or MAX_PASSES)
+    with stage("penalised likelihood"):
+        iterate = iterate_until(iterates, tolerance, objective.options.passes or MAX_PASSES)
     record = SolveRecord(
         penalty_weight=weight,
         penalty_weight_chosen="given",

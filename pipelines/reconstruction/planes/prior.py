@@ -8,6 +8,7 @@ import numpy as np
 from msgspec import UNSET, structs
 
 from faintfield.pipelines.arguments import SolverOptions
+from faintfield.pipelines.console import stage
 from faintfield.pipelines.formats.results.records import PriorRecord, SolveRecord
 from faintfield.pipelines.reconstruction.planes.custom import CustomOptions
 from faintfield.pipelines.reconstruction.planes.learned_prior import learned_estimate, outside_range
@@ -47,7 +48,8 @@ def with_prior(objective: Objective, solutions: Sequence[Solution]) -> list[Solu
     found: list[Solution] = list(solutions)
     answers: list[Callable[[LocalProblem], Answers]] = []
     if objective.options.has_prior:
-        made = _about_proposals(objective, solutions)
+        with stage("proposal of the prior"):
+            made = _about_proposals(objective, solutions)
         if isinstance(made, str):
             prior = PriorRecord(name="tv", left_out=made)
             if is_pilot(solutions[0].record):

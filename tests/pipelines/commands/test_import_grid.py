@@ -84,6 +84,17 @@ def test_missing_pictures_are_named_and_done_without(names: list[str], tmp_path:
     assert [int(read_frame(path).pixels_dn[0, 0]) for path in elemental_set.image_paths] == [0, 1, 2, 3, 5]
 
 
+def test_lens_is_that_of_options(tmp_path: Path, done: Command, faintfield: Command) -> None:
+    src, lens = _pictures(tmp_path / "src", _grid_names(range(2), range(3))), ("--distortion", -0.1, "--cx-px", 3)
+    done("import", "grid", src, tmp_path / "out", "--pitch-mm", 50, "--fx-px", 9, "--linear", *lens)
+    camera = load_set(tmp_path / "out").settings.camera
+    assert (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px) == (9, 9, 3, 2.5)
+    assert camera.distortion == (-0.1,)
+    for wrong in (("--fx-px", 9), ("--fx-px", 9, "--pitch-mm", 50, "--disparity-px", 2)):
+        ended = faintfield("import", "grid", src, tmp_path / "no", *wrong, *lens)
+        assert (ended.returncode, "give --pitch-mm and --fx-px with it" in ended.stderr) == (2, True)
+
+
 def test_full_disk_is_found_before_pictures_are_compared(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, faintfield: Command
 ) -> None:

@@ -77,6 +77,10 @@ def test_tables_of_toml_are_valid(simulated_scene: Path, tmp_path: Path, done: C
         content = tomllib.loads(path.read_text())
         assert valid(kind, content)
         assert not any(valid(kind, damaged) for damaged in (*_damaged(content, key), content | {"veiw": []}))
+    rig = tomllib.loads((tmp_path / "rig.toml").read_text())
+    stage = {"protocol": "micromanager", "device": "XY"}
+    assert valid("rig", rig | {"stage": stage})
+    assert not valid("rig", rig | {"stage": stage | {"protocol": "grbl", "port": "/dev/ttyUSB0"}})
     assert valid("truth", json.loads((simulated_scene / "truth.json").read_bytes()))
     documents = Path(__file__).parents[3] / "docs"
     for kind, name in (("boards", "how-to/measure_geometry.md"), ("plane-poses", "how-to/tilt_planes.md")):
@@ -112,3 +116,8 @@ def test_kinds_are_listed_and_fields_explained(done: Command) -> None:
     stage = json.loads(done("--json", "schema", "rig").stdout)["$defs"]["StageSettings"]
     assert stage["properties"]["baud"]["description"] == "Bits per second."
     assert stage["description"] == "Connection and limits of the stage: the `[stage]` table of rig.toml."
+
+
+def test_keys_have_the_meanings_of_fields_that_have_another_name_or_are_derived(done: Command) -> None:
+    definitions = json.loads(done("schema", "noise").stdout)["$defs"]
+    assert all("description" in part for part in definitions["NoiseRecord"]["properties"].values())

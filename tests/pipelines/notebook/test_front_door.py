@@ -280,6 +280,15 @@ def test_depths_of_objects_are_found() -> None:
     assert light_field.find_depths(300.0, 600.0) == pytest.approx([400.0], rel=0.03)
 
 
+def test_failures_name_arguments(folder: Path) -> None:
+    light_field = open_set(folder)
+    dark = LightField.from_arrays(
+        np.zeros((9, 54, 72)), light_field.poses, light_field.lens, faintfield.NoiseModel(0.0, 1.0, 3.0)
+    )
+    with pytest.raises(faintfield.NothingInFocus, match=r"give another range by near and far, more light, or depths$"):
+        dark.find_depths(700.0, 1500.0)
+
+
 def test_grid_is_that_of_plane(folder: Path) -> None:
     light_field = open_set(folder)
     for pitch in (None, 11.0):
