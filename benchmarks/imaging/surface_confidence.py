@@ -75,7 +75,7 @@ def fitted(
 def main(argv: Sequence[str] | None = None) -> None:
     """Print the fitted coefficients, and what they and the present ones say of each set."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.imaging.surface_confidence", description=__doc__)
-    parser.add_argument("sets", nargs="+", metavar="SET=TRUTH")
+    parser.add_argument("sets", nargs="*", metavar="SET=TRUTH")
     parser.add_argument("--misleading", nargs="*", default=[], metavar="SET=TRUTH")
     parser.add_argument("--close", nargs="*", default=[], metavar="SET=TRUTH")
     arguments = parser.parse_args(argv)
@@ -84,7 +84,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     measured = [[samples_of(Path(folder), Path(truth)) for folder, truth in group] for group in named]
     found = _NOTHING
     for known, group in zip((4, 5, 6), measured, strict=True):
-        of_group = fitted([(x[:, :known], right) for x, right in group], found) if group else COEFFICIENTS[len(found):known]
+        of_group = (
+            fitted([(x[:, :known], right) for x, right in group], found) if group else COEFFICIENTS[len(found) : known]
+        )
         found = np.append(found, of_group)
     print("fitted", ", ".join(f"{value:.3f}" for value in found))
     for (folder, _), (x, right) in zip(chain(*named), chain(*measured), strict=True):

@@ -2,10 +2,11 @@
 
 import inspect
 import re
+from typing import get_origin
 
 # Sections of a docstring, and the entries of one that lists fields.
 SECTION = re.compile(r"\n\n(\w+)\n-+\n(.*?)(?=\n\n\w+\n-+\n|\Z)", re.DOTALL)
-_ENTRY = re.compile(r"^(\w[\w, ]*) : .*\n((?:    .*(?:\n|\Z)|\n)+)", re.MULTILINE)
+_ENTRY = re.compile(r"^(\w[\w, ]*)(?: : .*)?\n((?:    .*(?:\n|\Z)|\n)+)", re.MULTILINE)
 
 
 def key_meanings(record: type) -> dict[str, str]:
@@ -18,7 +19,7 @@ def key_meanings(record: type) -> dict[str, str]:
     'Mean of a frame without light at zero exposure.'
     """
     meanings: dict[str, str] = {}
-    for parent in reversed(record.__mro__):
+    for parent in reversed((get_origin(record) or record).__mro__):
         sections = SECTION.findall(inspect.cleandoc(parent.__doc__ or ""))
         for names, text in (
             entry

@@ -59,7 +59,13 @@ _RESULTS: dict[SchemaKind, tuple[type[Struct], str]] = {
 _KINDS = _INPUTS | _RESULTS
 
 # The digest that every record of a result ends with; earlier versions wrote none.
-_DIGEST = {DIGEST_KEY: {"type": "string", "pattern": "^[0-9a-f]{64}$"}}
+_DIGEST = {
+    DIGEST_KEY: {
+        "type": "string",
+        "pattern": "^[0-9a-f]{64}$",
+        "description": "SHA-256 of the other keys, by which `faintfield verify` finds changes.",
+    }
+}
 
 
 class JsonSchema(Struct, frozen=True):
@@ -105,7 +111,10 @@ def describe_kind(kind: SchemaKind, units: StatedUnits) -> JsonSchema:
         for part in records_of(types.type_info(record))
         for name in (part.cls.__name__, f"{part.cls.__module__}.{part.cls.__qualname__}")
     }
-    definitions = {name: _with_meanings(part, records[name]) for name, part in schema["$defs"].items()}
+    definitions = {
+        name: _with_meanings(part, records.get(name) or records.get(part["title"].partition("[")[0]))
+        for name, part in schema["$defs"].items()
+    }
     if "units" in record.__struct_fields__:
         definitions = {name: _in_units(part, units) for name, part in definitions.items()}
     if kind in _RESULTS:
@@ -132,8 +141,12 @@ def records_of(part: object) -> Iterator[types.StructType | types.DataclassType]
         yield from records_of(inner)
 
 
-def _with_meanings(definition: Mapping[str, Any], record: types.StructType | types.DataclassType) -> dict[str, Any]:
-    """Return the definition of a record with the meanings of its keys."""
+def _with_meanings(
+    definition: Mapping[str, Any], record: types.StructType | types.DataclassType | None
+) -> dict[str, Any]:
+    """Return the definition of a record with the meanings of its keys, or that of something else as it is."""
+    if record is None:
+        return dict(definition)
     meanings = key_meanings(record.cls)
     properties = {name: dict(part) for name, part in definition["properties"].items()}
     for field in record.fields:

@@ -51,9 +51,7 @@ def confidence(
     return np.asarray(np.minimum(1 / (1 + np.exp(-logit)), most), np.float32)
 
 
-def features(
-    index: Image, costs: Image, inverse_depths: Image, explained: Image, reach: float
-) -> NDArray[np.float64]:
+def features(index: Image, costs: Image, inverse_depths: Image, explained: Image, reach: float) -> NDArray[np.float64]:
     """Return the features of a depth (feature, row, column), given the parameters of `confidence`.
 
     In order: one; the extra cost of alternatives (logarithm); the distance to the next edge of something nearer, and to

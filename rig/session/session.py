@@ -36,7 +36,17 @@ _MAX_PLAN_BYTES = 32_000_000
 
 
 class FrozenPlan(Struct, frozen=True, forbid_unknown_fields=True):
-    """Content of plan.json: the plan of a capture, the rig that it was made for, and the version of the format."""
+    """Content of plan.json: the plan of a capture, the rig that it was made for, and the version of the format.
+
+    Attributes
+    ----------
+    plan : CapturePlan
+        Frames to take, at which nodes.
+    rig : RigSettings
+        Settings of rig.toml at the beginning.
+    format : int
+        Version of the format of the session.
+    """
 
     plan: CapturePlan
     rig: RigSettings

@@ -67,8 +67,8 @@ def import_pictures(src: Path, out: Path, options: GridOptions) -> ImportedGrid:
     check_set_free(out, options, src)
     if options.distortion and (None in (options.pitch_mm, options.fx_px) or options.disparity_px):
         raise WrongUsage(
-            "--distortion is that of pictures that were not aligned, in pixels of the focal length; give --pitch-mm and "
-            "--fx-px with it, and no --disparity-px"
+            "--distortion is that of pictures that were not aligned, with a scale; give --pitch-mm and --fx-px with "
+            "it, and no --disparity-px"
         )
     own = {options.cx_px, options.cy_px, *options.distortion} != {None}
     lens_text = "as stated" if own else "ideal, no distortion, centred: state another by --distortion, --cx-px, --cy-px"

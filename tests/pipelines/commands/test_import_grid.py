@@ -92,7 +92,7 @@ def test_lens_is_that_of_options(tmp_path: Path, done: Command, faintfield: Comm
     assert camera.distortion == (-0.1,)
     for wrong in (("--fx-px", 9), ("--fx-px", 9, "--pitch-mm", 50, "--disparity-px", 2)):
         ended = faintfield("import", "grid", src, tmp_path / "no", *wrong, *lens)
-        assert (ended.returncode, "give --pitch-mm and --fx-px with it" in ended.stderr) == (2, True)
+        assert (ended.returncode, "give --pitch-mm and --fx-px with it, and" in ended.stderr) == (2, True)
 
 
 def test_full_disk_is_found_before_pictures_are_compared(

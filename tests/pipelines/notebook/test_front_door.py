@@ -17,6 +17,7 @@ from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.options import Options
+from faintfield.recon.errors import NothingInFocus
 from faintfield.recon.likelihood.images import Image
 
 DEPTHS = [800.0, 1250.0]
@@ -285,7 +286,7 @@ def test_failures_name_arguments(folder: Path) -> None:
     dark = LightField.from_arrays(
         np.zeros((9, 54, 72)), light_field.poses, light_field.lens, faintfield.NoiseModel(0.0, 1.0, 3.0)
     )
-    with pytest.raises(faintfield.NothingInFocus, match=r"give another range by near and far, more light, or depths$"):
+    with pytest.raises(NothingInFocus, match=r"make planes at known depths \(depths\)$"):
         dark.find_depths(700.0, 1500.0)
 
 
