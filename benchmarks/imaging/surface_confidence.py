@@ -1,9 +1,9 @@
-"""Fit the probability that a depth is right: the coefficients of `recon.surface.confidence`.
+"""Fit the probability that a depth is right: the coefficients and `MISPLACED` of `recon.surface.confidence`.
 
 For each set, depths are found in a larger range than that of the true ones. A sample counts with its features, and with
 whether its depth is right; all sets count alike. Coefficients are the maximum of the likelihood, with a weak normal
-prior. That of how much of the detail is explained is fitted on scenes that mislead, given all others, and that of the
-parallax on scenes from nodes close together, given these: elsewhere there is little to learn about them.
+prior. The last, of how much of the detail is explained, is fitted on scenes that mislead, given all others: elsewhere
+there is little to learn about it. So is the misplacement on scenes from nodes close together, given the coefficients.
 
 Call `python -m benchmarks.imaging.surface_confidence SET=TRUTH … --misleading SET=TRUTH … --close SET=TRUTH …`, with a
 folder of elemental.toml and one that holds true_depth_mm.tiff, of several scenes at several levels of light. Report
@@ -12,17 +12,18 @@ accuracy on other scenes.
 
 import argparse
 from collections.abc import Sequence
-from itertools import chain
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
-from scipy.optimize import minimize
+from scipy.optimize import minimize, minimize_scalar
+from scipy.special import erf
 
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.depth.search import default_bins, luminance
-from faintfield.recon.surface.confidence import COEFFICIENTS, RIGHT_WITHIN, SURE, features
+from faintfield.recon.surface.confidence import COEFFICIENTS, MISPLACED, RIGHT_WITHIN, SURE, features
 from faintfield.recon.surface.estimate import equal_steps, first_depths, halves, next_depths
 from faintfield.recon.surface.evidence import DepthEvidence
 from faintfield.recon.surface.goodness import explained_share
@@ -30,12 +31,23 @@ from faintfield.recon.surface.goodness import explained_share
 # Rounds of depth and light; every so many samples along each axis are used; weight of the prior.
 _ROUNDS, _STRIDE, _PRIOR = 4, 2, 1e-3
 
-# No coefficients
-_NOTHING = np.zeros(0)
+# No coefficients; the last one, as it is at present.
+_NOTHING, _LAST = np.zeros(0), COEFFICIENTS[-1]
 
 
-def samples_of(folder: Path, truth: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return the features (sample, feature) of a set's depths, and which are right (sample,)."""
+class Samples(NamedTuple):
+    """Depths of a set: features (sample, feature), whether they are right (sample,), and how precise they have to be.
+
+    The `tolerance` (sample,) is the largest right movement of the views, as the root of the sum of their squares.
+    """
+
+    features: NDArray[np.float64]
+    right: NDArray[np.bool_]
+    tolerance: NDArray[np.float64]
+
+
+def samples_of(folder: Path, truth: Path) -> Samples:
+    """Return the depths of a set."""
     elemental_set = load_set(folder)
     bins = default_bins(elemental_set)
     views = luminance(elemental_set, bins)
@@ -46,11 +58,12 @@ def samples_of(folder: Path, truth: Path) -> tuple[NDArray[np.float64], NDArray[
     index = first_depths(evidence)
     for _ in range(_ROUNDS):
         index, costs = next_depths(evidence, evidence.explained(index))
-    found_mm = 1 / np.interp(index, np.arange(len(depths)), depths)
-    right = np.abs(found_mm / true_mm - 1) < RIGHT_WITHIN
+    inverse_depth = np.interp(index, np.arange(len(depths)), depths)
+    right = np.abs(1 / (inverse_depth * true_mm) - 1) < RIGHT_WITHIN
+    tolerance = RIGHT_WITHIN * inverse_depth * float(np.linalg.norm(views.reach))
     thin = np.s_[..., ::_STRIDE, ::_STRIDE]
-    measured = features(index, costs, depths, explained_share(evidence, index), float(views.reach.max()))[thin]
-    return measured.reshape(len(measured), -1).T, right[thin].ravel()
+    measured = features(index, costs, depths, explained_share(evidence, index))[thin]
+    return Samples(measured.reshape(len(measured), -1).T, right[thin].ravel(), tolerance[thin].ravel())
 
 
 def fitted(
@@ -72,6 +85,24 @@ def fitted(
     return np.asarray(minimize(loss, np.zeros(x.shape[1]), jac=True).x)
 
 
+def fitted_misplacement(sets: Sequence[Samples], coefficients: NDArray[np.float64]) -> float:
+    """Return the misplacement that makes sets most likely, all sets counting alike, given the coefficients."""
+
+    def loss(misplaced: float) -> float:
+        losses = []
+        for each in sets:
+            p = probability(each.features, coefficients) * erf(each.tolerance / (np.sqrt(2) * misplaced))
+            losses.append(-np.mean(np.log(np.where(each.right, p, 1 - p))))
+        return float(np.mean(losses))
+
+    return float(minimize_scalar(loss, bounds=(0.01, 2.0), method="bounded").x)
+
+
+def probability(features: NDArray[np.float64], coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the probability of the logistic model."""
+    return np.asarray(np.clip(1 / (1 + np.exp(-features @ coefficients)), 1e-3, 1 - 1e-3))
+
+
 def main(argv: Sequence[str] | None = None) -> None:
     """Print the fitted coefficients, and what they and the present ones say of each set."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.imaging.surface_confidence", description=__doc__)
@@ -79,22 +110,23 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--misleading", nargs="*", default=[], metavar="SET=TRUTH")
     parser.add_argument("--close", nargs="*", default=[], metavar="SET=TRUTH")
     arguments = parser.parse_args(argv)
-    groups = (arguments.sets, arguments.misleading, arguments.close)
-    named = [[name.split("=") for name in group] for group in groups]
-    measured = [[samples_of(Path(folder), Path(truth)) for folder, truth in group] for group in named]
-    found = _NOTHING
-    for known, group in zip((4, 5, 6), measured, strict=True):
-        of_group = (
-            fitted([(x[:, :known], right) for x, right in group], found) if group else COEFFICIENTS[len(found) : known]
-        )
-        found = np.append(found, of_group)
-    print("fitted", ", ".join(f"{value:.3f}" for value in found))
-    for (folder, _), (x, right) in zip(chain(*named), chain(*measured), strict=True):
-        for name, coefficients in {"fitted": found, "present": np.array(COEFFICIENTS)}.items():
-            sure = 1 / (1 + np.exp(-x @ coefficients)) >= SURE
-            share = right[sure].mean() if sure.any() else float("nan")
+    names = [*arguments.sets, *arguments.misleading, *arguments.close]
+    sets = {name: samples_of(*map(Path, name.split("="))) for name in names}
+    plain, misleading = ([sets[name] for name in group] for group in (arguments.sets, arguments.misleading))
+    found = fitted([(each.features[:, :-1], each.right) for each in plain]) if plain else np.array(COEFFICIENTS[:-1])
+    of_misleading = fitted([(each.features, each.right) for each in misleading], found) if misleading else _LAST
+    found = np.append(found, of_misleading)
+    misplaced = fitted_misplacement([sets[name] for name in arguments.close], found) if arguments.close else MISPLACED
+    print("fitted", ", ".join(f"{value:.3f}" for value in found), f"misplaced {misplaced:.3f}")
+    present = np.array(COEFFICIENTS), MISPLACED
+    for name, each in sets.items():
+        for model, (coefficients, of_model) in {"fitted": (found, misplaced), "present": present}.items():
+            p = probability(each.features, coefficients) * erf(each.tolerance / (np.sqrt(2) * of_model))
+            sure = p >= SURE
+            share = each.right[sure].mean() if sure.any() else float("nan")
             print(
-                f"{folder:30} {name:8} {right.mean():6.1%} right, {sure.mean():6.1%} sure, {share:6.1%} of these right"
+                f"{name.partition('=')[0]:30} {model:8} {each.right.mean():6.1%} right, {sure.mean():6.1%} sure, "
+                f"{share:6.1%} of these right"
             )
 
 

@@ -109,7 +109,7 @@ def estimate_surface(views: PinholeViews, inverse_depths: NDArray[np.float64]) -
         prediction = predicted(evidence, candidates[best], left_out, beside)
     final = DepthEvidence(views, inverse_depths, halves(nodes))
     index, costs = next_depths(final, final.explained(candidates[best]))
-    sure = confidence(index, costs, inverse_depths, explained_share(final, index), float(views.reach.max()))
+    sure = confidence(index, costs, inverse_depths, explained_share(final, index), float(np.linalg.norm(views.reach)))
     depths = np.interp(index, np.arange(len(inverse_depths)), inverse_depths)
     lit = lit_samples(views, depths)
     doubtful = (index <= 1) | (index >= len(inverse_depths) - 2) | ~lit
@@ -216,8 +216,7 @@ def found_range(views: PinholeViews, far: float, near: float) -> tuple[float, fl
         depths = equal_steps(coarse, far, near)
         evidence = DepthEvidence(coarse, depths, halves(coarse.nodes))
         index, costs = next_depths(evidence, evidence.explained(first_depths(evidence)))
-        # However coarse the depths: they only have to tell the range
-        likely = confidence(index, costs, depths, explained_share(evidence, index), np.inf) >= _LIKELY
+        likely = confidence(index, costs, depths, explained_share(evidence, index)) >= _LIKELY
         if np.count_nonzero(likely) < _MIN_SAMPLES:
             needed = _MIN_SAMPLES / likely.size
             raise NothingInFocus(

@@ -127,16 +127,17 @@ def nonsense(picture: Image, sigma: Image) -> Image:
     return np.random.default_rng(1).normal(0, 100, picture.shape)
 
 
-def smooth_light_field(light_e: float = 1.0, blur: float = 5.0) -> tuple[LightField, Image]:
+def smooth_light_field(light_e: float = 1.0, blur: float = 5.0, step_px: int = 4) -> tuple[LightField, Image]:
     """Return 25 views of a smooth plane at 400 mm, each some whole pixels further, and its light in the middle one."""
     rng = np.random.default_rng(1)
     wide = gaussian_filter(rng.normal(0, 1, (80, 90)), blur)
     light = light_e * (1.0 + wide / np.abs(wide).max())
     lens = faintfield.Lens(size_px=(64, 48), fx_px=80.0, fy_px=80.0, cx_px=31.5, cy_px=23.5)
     steps = [(row, column) for row in range(-2, 3) for column in range(-2, 3)]
-    # A camera that moves 20 mm to the right sees points move 80 · 20/400 = 4 px to the left
-    views = [light[16 + 4 * row :, 13 + 4 * column :][:48, :64] for row, column in steps]
-    poses = [(0.0, 0.0, 0.0, -20.0 * column, -20.0 * row, 0.0) for row, column in steps]
+    # A camera that moves 5 mm to the right sees points move 80 · 5/400 = 1 px to the left
+    pitch_mm = 5.0 * step_px
+    views = [light[16 + step_px * row :, 13 + step_px * column :][:48, :64] for row, column in steps]
+    poses = [(0.0, 0.0, 0.0, -pitch_mm * column, -pitch_mm * row, 0.0) for row, column in steps]
     images = rng.poisson(views) + rng.normal(0, 3.0, (25, 48, 64))
     noise = faintfield.NoiseModel(offset_dn=0.0, gain_dn_per_e=1.0, read_noise_e=3.0)
     return LightField.from_arrays(images, poses, lens, noise), light[16:, 13:][:48, :64]
@@ -299,7 +300,7 @@ def test_grid_is_that_of_plane(folder: Path) -> None:
 
 
 def test_surface_is_reconstructed_and_opened(tmp_path: Path) -> None:
-    light_field, _ = smooth_light_field(light_e=30.0, blur=1.5)
+    light_field, _ = smooth_light_field(light_e=30.0, blur=1.5, step_px=6)
     surface = light_field.surface(tmp_path / "surface", (300.0, 600.0))
     assert np.median(surface.depth[surface.sure]) == pytest.approx(400.0, rel=0.03)
     assert surface.sure.any()
