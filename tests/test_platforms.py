@@ -15,7 +15,7 @@ from tests.windows import Msvcrt, Sys
 
 _OF_A_SET = """
 simulate scene --rows 3 --columns 3 --size-px 96 72
-reconstruct scene --depth-mm 500 --depth-mm 700 --workers 2 --out out
+reconstruct scene --depth-mm 500 --depth-mm 700 --prior tv --workers 2 --out out
 report out
 verify out
 export nerfstudio scene transforms

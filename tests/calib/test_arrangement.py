@@ -66,7 +66,7 @@ def test_edge_of_brightness_is_no_edge_of_depth() -> None:
     assert abs(inspect(light_field((Layer(0.0),), grid=(4, 4), aligned_px=1.0)).side_z) < 4
 
 
-@pytest.mark.parametrize("aligned_px", [0.0, ALIGNED_PX, ALL_WITH_IT_PX])
+@pytest.mark.parametrize("aligned_px", [pytest.param(0.0, marks=pytest.mark.deep), ALIGNED_PX])
 def test_ground_without_texture_says_nothing(aligned_px: float) -> None:
     result = inspect(light_field(CARDS[1:], grid=(5, 5), aligned_px=aligned_px))
     assert abs(result.side_z) < 4
@@ -82,6 +82,7 @@ def test_pitch_ratio_is_measured() -> None:
     assert result.range_px[0] == pytest.approx(-3.8 * result.ratio, abs=0.7)
 
 
+@pytest.mark.deep
 def test_views_off_the_grid_do_not_make_it_oblong() -> None:
     """Shifts of views against a regular grid must not be taken for another pitch."""
     generator = np.random.default_rng(2)
@@ -139,7 +140,7 @@ def test_noise_leaves_the_range_and_the_axes() -> None:
     assert result.range_px[1] > 1.2
 
 
-@pytest.mark.parametrize("content", ["noise", "scenes"])
+@pytest.mark.parametrize("content", ["noise", pytest.param("scenes", marks=pytest.mark.deep)])
 def test_unrelated_pictures_show_nothing(content: str) -> None:
     generator, nodes = np.random.default_rng(0), list(np.ndindex(4, 4))
     views = {node: generator.random((96, 128), np.float32) for node in nodes}
@@ -189,7 +190,9 @@ def _small(grid: tuple[int, int], seed: int = 21) -> Views:
     return light_field(CARDS, grid=grid, size_px=(128, 96), aligned_px=ALIGNED_PX, seed=seed)
 
 
-@pytest.mark.parametrize(("grid", "snr", "seed"), [((3, 4), np.inf, 0), ((1, 9), 3.0, 2)])
+@pytest.mark.parametrize(
+    ("grid", "snr", "seed"), [((3, 4), np.inf, 0), pytest.param((1, 9), 3.0, 2, marks=pytest.mark.deep)]
+)
 def test_neighbours_fit_unless_shuffled(grid: tuple[int, int], snr: float, seed: int) -> None:
     views = with_noise(_small(grid), snr)
     ordered = inspect(views)
@@ -210,6 +213,7 @@ def test_copies_with_noise_fit_anywhere() -> None:
 
 
 @pytest.mark.parametrize(("grid", "snr", "seed"), [((3, 4), 0.16, 0), ((1, 9), 1.0, 2)])
+@pytest.mark.deep
 def test_dark_views_keep_their_order(grid: tuple[int, int], snr: float, seed: int) -> None:
     result = inspect(with_noise(_small(grid), snr, seed))
     assert result.order.verdict in ("open", "few", "fits")

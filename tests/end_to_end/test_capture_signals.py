@@ -70,7 +70,9 @@ class Controller(Server):
         return b"$J=" in self.received and self._firmware.mechanics.moving
 
 
-@pytest.mark.parametrize("end", [signal.SIGTERM, None], ids=["terminated", "terminal closed"])
+@pytest.mark.parametrize(
+    "end", [signal.SIGTERM, pytest.param(None, marks=pytest.mark.deep)], ids=["terminated", "terminal closed"]
+)
 def test_stage_rests_after_capture_is_ended(tmp_path: Path, end: signal.Signals | None) -> None:
     (tmp_path / "incoming").mkdir()
     with closing(Controller()) as controller:

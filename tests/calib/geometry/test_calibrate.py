@@ -95,6 +95,7 @@ def test_corner_noise_is_measured(many: list[Calibrated]) -> None:
         assert geometry.warnings == []
 
 
+@pytest.mark.deep
 def test_order_of_observations_does_not_matter(many: list[Calibrated]) -> None:
     truth, geometry = many[3]
     shuffled = replace(truth, observations=truth.observations[::-1])

@@ -117,6 +117,7 @@ def test_noise_alone_gives_no_poses_and_removes_earlier_ones(scene: Path, tmp_pa
     assert not (tmp_path / "out").exists() or not list((tmp_path / "out").glob("[ag]*"))
 
 
+@pytest.mark.deep
 def test_true_poses_stay(tmp_path: Path, done: Command) -> None:
     done("simulate", tmp_path / "set", *GRID, "--seed", 3)
     printed = loads(done("align", tmp_path / "set", "--depth-range", "500:1050", "--json").stdout)
@@ -125,6 +126,7 @@ def test_true_poses_stay(tmp_path: Path, done: Command) -> None:
     assert not (tmp_path / "set" / "alignment" / "geometry.json").exists()
 
 
+@pytest.mark.deep
 def test_wrong_depths_and_poses_by_the_same_views_are_refused(tmp_path: Path, faintfield: Command) -> None:
     folder = tmp_path / "set"
     faintfield("simulate", folder, "--rows", 5, "--columns", 5, "--size-px", 320, 240, "--poses", "nominal", "--snr", 1)
@@ -169,6 +171,7 @@ def write_geometry_of_boards(out: Path, elemental_set: ElementalSet, poses: NDAr
     write_json(out / GEOMETRY_FILE, geometry)
 
 
+@pytest.mark.deep
 def test_shift_of_a_homing_since_the_boards_is_taken_out(tmp_path: Path, done: Command) -> None:
     grid = ("--rows", 5, "--columns", 5, "--size-px", 320, 240)
     done("simulate", tmp_path / "set", *grid, "--snr", 4, "--seed", 4)
@@ -200,6 +203,7 @@ def test_shift_of_a_homing_since_the_boards_is_taken_out(tmp_path: Path, done: C
     assert right_mm[later].mean() == pytest.approx(right_mm[~later].mean(), abs=0.15)
 
 
+@pytest.mark.deep
 def test_lens_is_found_beside_the_poses(scene: Path, tmp_path: Path, done: Command) -> None:
     wrong = tmp_path / "wrong"
     shutil.copytree(scene, wrong)

@@ -151,6 +151,7 @@ def test_noisy_copies_and_darkness_are_warned_of(nine_views: Views, tmp_path: Pa
     assert "too dark, or show nothing in common; the order of the names is kept" in ended.stderr
 
 
+@pytest.mark.deep
 def test_objects_before_black_keep_the_order_of_the_names(tmp_path: Path, done: Command) -> None:
     """Nothing is hidden behind an object before black, which the test of hidden parts may misread."""
     size = ("--rows", 5, "--columns", 5, "--pitch-mm", 20, "--size-px", 240, 180)

@@ -114,6 +114,7 @@ def test_boards_in_turn_end_in_geometry_of_command(session: Path, tmp_path: Path
     np.testing.assert_allclose(np.array(last.last.points), corners["pixels"][same], atol=0.006)
 
 
+@pytest.mark.deep
 def test_void_frames_are_judged_again(session: Path, tmp_path: Path) -> None:
     frames = frames_of(session)
     retaken = [*frames[:-1], replace(frames[-1], intent=999)]
@@ -145,6 +146,7 @@ def test_unreadable_frame_is_named_and_passed_over(session: Path, tmp_path: Path
     assert frames[4].file in told[-1].problem
 
 
+@pytest.mark.deep
 def test_frame_of_another_size_that_is_void_does_no_harm(session: Path, tmp_path: Path) -> None:
     shutil.copytree(session, tmp_path / "session")
     odd, *frames = frames_of(session)
@@ -204,6 +206,7 @@ def test_half_a_sweep_predicts_its_end() -> None:
     assert half_px == pytest.approx(judged(_SIX[:3], 0.01)[2], rel=0.2)
 
 
+@pytest.mark.deep
 def test_contradicting_corners_are_no_advice() -> None:
     truth = simulated(16)
     swap = {(0, 0): (0, 1), (0, 1): (0, 0)}

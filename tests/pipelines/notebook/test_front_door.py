@@ -44,9 +44,9 @@ def frames_of(folder: Path) -> Image:
 def test_planes_are_those_of_command_whether_just_made_or_read(folder: Path, tmp_path: Path) -> None:
     steps = list[tuple[int, int]]()
     made = open_set(folder).planes(
-        DEPTHS, prior="patches", uncertainty=True, progress=lambda done, count: steps.append((done, count))
+        DEPTHS, prior="tv", uncertainty=True, progress=lambda done, count: steps.append((done, count))
     )
-    options = Options(depth=[*DEPTHS], solver=SolverOptions(prior="patches", uncertainty=True))
+    options = Options(depth=[*DEPTHS], solver=SolverOptions(prior="tv", uncertainty=True))
     reconstruct_command(folder, out=tmp_path / "planes", options=options)
     read = faintfield.open(tmp_path / "planes")
     assert isinstance(read, Planes)

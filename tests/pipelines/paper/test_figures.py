@@ -80,6 +80,7 @@ def test_table_holds_what_json_holds(number: int, made: Path) -> None:
         assert {name: "" if value is None else str(value) for name, value in row.items()} == cells
 
 
+@pytest.mark.deep
 def test_figures_2_and_3_show_sharpness_and_darkness(made: Path) -> None:
     rows = json.loads((made / "figure2.json").read_text())["planes"]
     assert {(row["plane_depth_mm"], row["object"]) for row in rows} == {

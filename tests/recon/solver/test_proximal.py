@@ -209,7 +209,9 @@ def test_each_plane_has_its_part_of_the_proposal() -> None:
     assert 0 <= 0.7 * slack <= 2e-10
 
 
-@pytest.mark.parametrize(("shape", "about"), [((257, 192), False), ((256, 131), True)])
+@pytest.mark.parametrize(
+    ("shape", "about"), [((257, 192), False), pytest.param((256, 131), True, marks=pytest.mark.deep)]
+)
 def test_coarse_field_is_near_that_of_the_solution(shape: tuple[int, int], about: bool) -> None:
     """A disk in noise: the gap after 100 steps is a quarter of that without, and the solution is the same."""
     generator = np.random.default_rng(14)

@@ -66,6 +66,7 @@ def test_infinity_is_left_out_where_alignment_is_unknown(scene: Path, tmp_path: 
     np.testing.assert_allclose(-1000 / np.array(depths), [-4.0, -2.5], atol=0.1)
 
 
+@pytest.mark.deep
 def test_depths_stand_apart_in_spite_of_misfit(tmp_path: Path) -> None:
     """With poses off by 15 mrad, two peaks of the same samples had depths of 1333 and 1382 mm."""
     words = ("--position-error-mm", 1, "--rotation-error-mrad", 15, "--snr", 20, "--seed", 2, "--size-px", 240, 180)

@@ -50,6 +50,7 @@ def test_mode_is_named_at_end_and_on_page(tmp_path: Path, done: Command) -> None
     assert "depths of this scene are a continuum" in (tmp_path / "out" / "report.html").read_text()
 
 
+@pytest.mark.deep
 def test_depth_map_names_mode_as_often_as_asked(tmp_path: Path, done: Command) -> None:
     words = ("--objects", "surfaces", "--size-px", 96, 72, "--rows", 5, "--columns", 5, "--snr", 300, "--seed", 7)
     run_undrawn("simulate", tmp_path / "set", *words)
