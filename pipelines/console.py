@@ -71,7 +71,7 @@ def progress[T](
     cost: Callable[[T], float] | None = None,
     total_cost: float | None = None,
 ) -> Generator[T]:
-    """Yield `items`; draw a bar with the time left on a terminal, else say every 10 s how many are done.
+    """Yield `items`; draw a bar with the time left on a terminal, else say every 10 s or more how many are done.
 
     `total` is the number of items, if they have no length. Where items differ in what they cost, by a known `cost`, the
     time left follows from that and the `total_cost`.

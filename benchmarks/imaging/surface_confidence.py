@@ -1,9 +1,9 @@
-"""Fit the probability that a depth is right: the coefficients and `MISPLACED` of `recon.surface.confidence`.
+"""Fit the probability that a depth is right: the coefficients and the misplacement of `recon.surface.confidence`.
 
 For each set, depths are found in a larger range than that of the true ones. A sample counts with its features, and with
 whether its depth is right; all sets count alike. Coefficients are the maximum of the likelihood, with a weak normal
 prior. The last, of how much of the detail is explained, is fitted on scenes that mislead, given all others: elsewhere
-there is little to learn about it. So is the misplacement on scenes from nodes close together, given the coefficients.
+there is little to learn about it. The misplacement is fitted on scenes from nodes close together.
 
 Call `python -m benchmarks.imaging.surface_confidence SET=TRUTH … --misleading SET=TRUTH … --close SET=TRUTH …`, with a
 folder of elemental.toml and one that holds true_depth_mm.tiff, of several scenes at several levels of light. Report
@@ -17,13 +17,20 @@ from typing import NamedTuple
 
 import numpy as np
 import tifffile
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize, minimize_scalar
-from scipy.special import erf
 
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.depth.search import default_bins, luminance
-from faintfield.recon.surface.confidence import COEFFICIENTS, MISPLACED, RIGHT_WITHIN, SURE, features
+from faintfield.recon.surface.confidence import (
+    COEFFICIENTS,
+    MISPLACEMENT,
+    RIGHT_WITHIN,
+    SURE,
+    features,
+    found_probability,
+    precise_probability,
+)
 from faintfield.recon.surface.estimate import equal_steps, first_depths, halves, next_depths
 from faintfield.recon.surface.evidence import DepthEvidence
 from faintfield.recon.surface.goodness import explained_share
@@ -31,8 +38,8 @@ from faintfield.recon.surface.goodness import explained_share
 # Rounds of depth and light; every so many samples along each axis are used; weight of the prior.
 _ROUNDS, _STRIDE, _PRIOR = 4, 2, 1e-3
 
-# No coefficients; the last one, as it is at present.
-_NOTHING, _LAST = np.zeros(0), COEFFICIENTS[-1]
+# No coefficients
+_NOTHING = np.zeros(0)
 
 
 class Samples(NamedTuple):
@@ -88,44 +95,49 @@ def fitted(
 def fitted_misplacement(sets: Sequence[Samples], coefficients: NDArray[np.float64]) -> float:
     """Return the misplacement that makes sets most likely, all sets counting alike, given the coefficients."""
 
-    def loss(misplaced: float) -> float:
+    def loss(misplacement: float) -> float:
         losses = []
-        for each in sets:
-            p = probability(each.features, coefficients) * erf(each.tolerance / (np.sqrt(2) * misplaced))
-            losses.append(-np.mean(np.log(np.where(each.right, p, 1 - p))))
+        for samples in sets:
+            p = np.clip(probability(samples, coefficients, misplacement), 1e-3, 1 - 1e-3)
+            losses.append(-np.mean(np.log(np.where(samples.right, p, 1 - p))))
         return float(np.mean(losses))
 
     return float(minimize_scalar(loss, bounds=(0.01, 2.0), method="bounded").x)
 
 
-def probability(features: NDArray[np.float64], coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the probability of the logistic model."""
-    return np.asarray(np.clip(1 / (1 + np.exp(-features @ coefficients)), 1e-3, 1 - 1e-3))
+def probability(samples: Samples, coefficients: ArrayLike, misplacement: float) -> NDArray[np.float64]:
+    """Return the probability (sample,) that depths are right."""
+    found = found_probability(samples.features.T, coefficients)
+    return found * precise_probability(samples.tolerance, misplacement)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Print the fitted coefficients, and what they and the present ones say of each set."""
+    """Print the fitted numbers, and what they and the present ones say of each set."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.imaging.surface_confidence", description=__doc__)
     parser.add_argument("sets", nargs="*", metavar="SET=TRUTH")
     parser.add_argument("--misleading", nargs="*", default=[], metavar="SET=TRUTH")
     parser.add_argument("--close", nargs="*", default=[], metavar="SET=TRUTH")
     arguments = parser.parse_args(argv)
-    names = [*arguments.sets, *arguments.misleading, *arguments.close]
-    sets = {name: samples_of(*map(Path, name.split("="))) for name in names}
-    plain, misleading = ([sets[name] for name in group] for group in (arguments.sets, arguments.misleading))
-    found = fitted([(each.features[:, :-1], each.right) for each in plain]) if plain else np.array(COEFFICIENTS[:-1])
-    of_misleading = fitted([(each.features, each.right) for each in misleading], found) if misleading else _LAST
-    found = np.append(found, of_misleading)
-    misplaced = fitted_misplacement([sets[name] for name in arguments.close], found) if arguments.close else MISPLACED
-    print("fitted", ", ".join(f"{value:.3f}" for value in found), f"misplaced {misplaced:.3f}")
-    present = np.array(COEFFICIENTS), MISPLACED
-    for name, each in sets.items():
-        for model, (coefficients, of_model) in {"fitted": (found, misplaced), "present": present}.items():
-            p = probability(each.features, coefficients) * erf(each.tolerance / (np.sqrt(2) * of_model))
-            sure = p >= SURE
-            share = each.right[sure].mean() if sure.any() else float("nan")
+    groups = (arguments.sets, arguments.misleading, arguments.close)
+    sets = {name: samples_of(*map(Path, name.split("="))) for group in groups for name in group}
+    plain, misleading, close = ([sets[name] for name in group] for group in groups)
+    coefficients = np.array(COEFFICIENTS)
+    if plain:
+        coefficients[:-1] = fitted([(samples.features[:, :-1], samples.right) for samples in plain])
+    if misleading:
+        coefficients[-1:] = fitted([(samples.features, samples.right) for samples in misleading], coefficients[:-1])
+    misplacement = fitted_misplacement(close, coefficients) if close else MISPLACEMENT
+    print("fitted", ", ".join(f"{value:.3f}" for value in coefficients), f"misplacement {misplacement:.3f}")
+    models: dict[str, tuple[ArrayLike, float]] = {
+        "fitted": (coefficients, misplacement),
+        "present": (COEFFICIENTS, MISPLACEMENT),
+    }
+    for name, samples in sets.items():
+        for model, numbers in models.items():
+            sure = probability(samples, *numbers) >= SURE
+            share = samples.right[sure].mean() if sure.any() else float("nan")
             print(
-                f"{name.partition('=')[0]:30} {model:8} {each.right.mean():6.1%} right, {sure.mean():6.1%} sure, "
+                f"{name.partition('=')[0]:30} {model:8} {samples.right.mean():6.1%} right, {sure.mean():6.1%} sure, "
                 f"{share:6.1%} of these right"
             )
 

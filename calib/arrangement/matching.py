@@ -23,9 +23,9 @@ _BLOCK_PX = 16
 # Quantile of chance above which a block's match is sure; its correlation must also be at least this.
 _CHANCE_QUANTILE, _LEAST_MATCH = 0.99, 0.3
 
-# Sure blocks that a range needs, and the quantiles of their disparities that it spans.
+# Sure blocks that a range needs, and the quantiles of their disparities that it spans: up to one in a hundred is wrong.
 MIN_BLOCKS = 12
-_SPAN = (0.005, 0.995)
+_SPAN = (0.01, 0.99)
 
 # Pitch along columns over pitch along rows that are tried; others are found by interpolation.
 _RATIOS = 2.0 ** np.arange(-1.25, 1.3, 0.25)

@@ -323,8 +323,10 @@ class LightField:
         folder, in_px = Path(out), self.units.depth == "disparity_px"
         ends = None
         if depth_range is not None:
+            if len(depth_range) != 2 or not all(isinstance(end, Real) for end in depth_range):
+                raise BadValue(f"depth_range: got {depth_range!r}; give two numbers, (nearest, farthest)")
             ends = min(depth_range), max(depth_range)
-            if not (ends[0] > 0 or in_px) or ends[0] == ends[1]:
+            if not (ends[0] > 0 or in_px) or ends[0] == ends[1] or not np.isfinite(ends).all():
                 raise BadValue(f"depth_range: got {depth_range}; give two different depths in front of the camera")
         solver = solver_options(PlaneOptions() if prior is None else PlaneOptions(prior=prior))
         with exclusive(folder), naming_arguments():

@@ -27,10 +27,10 @@ _WORDS: dict[str, tuple[str, ...]] = {
 _LEAST = {"penalty_weight": 0.0, "pitch": 1e-9, "passes": 1}
 
 # An option of commands in a message, with the form of its value; arguments that have other names in Python.
-_OPTION = re.compile(r"--([a-z-]+)( [A-Z:]*:[A-Z:]*| NUMBER)?")
+_OPTION = re.compile(r"(?<![^\s(])--([a-z-]+)( [A-Z:]*:[A-Z:]*| NUMBER)?")
 _ARGUMENTS = {
-    **{"depth": "depths", "depth-mm": "depths", "pitch-mm": "pitch", "sweep": "near and far"},
-    **dict.fromkeys(("depth-range-mm", "disparity-range-px"), "depth_range=(near, far)"),
+    **{"depth": "depths", "depth-mm": "depths", "pitch-mm": "pitch", "out": "out"},
+    **{"sweep": "find_depths(near, far)", "depth-range-mm": "depth_range", "disparity-range-px": "depth_range"},
 }
 
 
@@ -109,13 +109,19 @@ def checked_options(options: PlaneOptions) -> PlaneOptions:
     return options
 
 
+def _named(option: re.Match[str]) -> str:
+    """Return the argument that takes the place of an option of commands; the option itself where there is none."""
+    name = option[1].replace("-", "_")
+    return _ARGUMENTS.get(option[1], name if name in PlaneOptions.__optional_keys__ else option[0])
+
+
 @contextmanager
 def naming_arguments() -> Iterator[None]:
     """Name arguments instead of the options of commands in the messages of failures; a wrong usage is a BadValue."""
     try:
         yield
     except (InputError, ReconstructionError, WrongUsage) as failure:
-        text = _OPTION.sub(lambda found: _ARGUMENTS.get(found[1], found[1].replace("-", "_")), str(failure))
+        text = _OPTION.sub(_named, str(failure))
         if text == str(failure) and not isinstance(failure, WrongUsage):
             raise
         raise (BadValue if isinstance(failure, WrongUsage) else type(failure))(text) from failure

@@ -152,6 +152,8 @@ def _with_meanings(
     for field in record.fields:
         if field.name in meanings:
             properties[field.encode_name]["description"] = meanings[field.name]
+    if isinstance(record, types.StructType) and record.tag_field:
+        properties[record.tag_field]["description"] = "Kind of this table, which decides about its other keys."
     description = SECTION.sub("", definition["description"])
     return {**definition, "description": description, "properties": properties}
 
@@ -170,9 +172,8 @@ def _as_written(definition: Mapping[str, Any]) -> dict[str, Any]:
     if properties.pop("options", None) is None:
         return dict(definition)
     for key, name, built_in in (("backend", "name", BUILT_IN_BACKENDS), ("driver", "plugin", BUILT_IN_DRIVERS)):
-        if properties.get(key) == {"enum": ["plugin"]}:
-            properties.pop(name)
-            properties[key] = {"type": "string", "not": {"enum": list(built_in)}}
+        if properties.get(key, {}).get("enum") == ["plugin"]:
+            properties[key] = {**properties.pop(name), "type": "string", "not": {"enum": list(built_in)}}
     required = [key for key in definition["required"] if key in properties]
     written = {**definition, "properties": properties, "required": required, "additionalProperties": True}
     if "protocol" in properties:

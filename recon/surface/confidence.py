@@ -1,7 +1,7 @@
 """Confidence of a depth: the probability that it is right within 2 %, from what is known to go wrong."""
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt
 from scipy.special import erf
 
@@ -26,16 +26,16 @@ COEFFICIENTS = (-3.773, 1.015, 1.953, 0.814, 1.967)
 _MAX_CONFIDENCE, _POORLY_EXPLAINED, _MAX_IF_POORLY = 0.95, 0.35, 0.85
 
 # Standard deviation in samples by which interpolation between pixels misplaces each view, fitted by the same program.
-MISPLACED = 0.4
+MISPLACEMENT = 0.4
 
 
 def confidence(
-    index: Image, costs: Image, inverse_depths: Image, explained: Image, parallax: float = np.inf
+    index: Image, costs: Image, inverse_depths: Image, explained: Image, parallax: float | None
 ) -> NDArray[np.float32]:
     """Return the probability (row, column) that depths are right within `RIGHT_WITHIN`.
 
-    A logistic model of `features`, whose coefficients were fitted on rendered scenes of known depth, says whether the
-    depth is the right one. It is multiplied by the probability that the error by interpolation is small enough.
+    The product of two probabilities: that the depth is the right one among others, by a logistic model of `features`,
+    fitted on rendered scenes of known depth; and that the error by interpolation is small enough.
 
     Parameters
     ----------
@@ -45,14 +45,30 @@ def confidence(
         Costs by paths, see `sum_over_paths`.
     explained : float array (row, column)
         Share of the views' detail that the surface explains, see `explained_share`.
-    parallax : float
-        Root of the sum of squares of the views' parallaxes, in samples per unit of 1/depth; no limit by default.
+    parallax : float, optional
+        Root of the sum of squares of the views' parallaxes, in samples per unit of 1/depth; None for the first
+        probability alone.
     """
-    logit = np.tensordot(np.asarray(COEFFICIENTS), features(index, costs, inverse_depths, explained), 1)
-    most = np.where(explained < _POORLY_EXPLAINED, _MAX_IF_POORLY, _MAX_CONFIDENCE)
-    found = np.minimum(1 / (1 + np.exp(-logit)), most)
-    tolerance = RIGHT_WITHIN * parallax * np.interp(index, np.arange(len(inverse_depths)), inverse_depths)
-    return np.asarray(found * erf(tolerance / (np.sqrt(2) * MISPLACED)), np.float32)
+    found = found_probability(features(index, costs, inverse_depths, explained), COEFFICIENTS)
+    if parallax is not None:
+        q = np.interp(index, np.arange(len(inverse_depths)), inverse_depths)
+        found = found * precise_probability(RIGHT_WITHIN * q * parallax, MISPLACEMENT)
+    return np.asarray(found, np.float32)
+
+
+def found_probability(features: NDArray[np.float64], coefficients: ArrayLike) -> NDArray[np.float64]:
+    """Return the probability that depths are the right ones, given their features (feature, …) and the coefficients."""
+    poorly = features[-1] < np.log(_POORLY_EXPLAINED / _EXPLAINED)
+    likely = 1 / (1 + np.exp(-np.tensordot(np.asarray(coefficients), features, 1)))
+    return np.minimum(likely, np.where(poorly, _MAX_IF_POORLY, _MAX_CONFIDENCE))
+
+
+def precise_probability(tolerance: NDArray[np.float64], misplacement: float) -> NDArray[np.float64]:
+    """Return the probability that the error by interpolation is within a tolerance.
+
+    Both are in samples, the tolerance as the root of the sum of squares of the movements of the views.
+    """
+    return np.asarray(erf(tolerance / (np.sqrt(2) * misplacement)))
 
 
 def features(index: Image, costs: Image, inverse_depths: Image, explained: Image) -> NDArray[np.float64]:

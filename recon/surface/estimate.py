@@ -216,7 +216,7 @@ def found_range(views: PinholeViews, far: float, near: float) -> tuple[float, fl
         depths = equal_steps(coarse, far, near)
         evidence = DepthEvidence(coarse, depths, halves(coarse.nodes))
         index, costs = next_depths(evidence, evidence.explained(first_depths(evidence)))
-        likely = confidence(index, costs, depths, explained_share(evidence, index)) >= _LIKELY
+        likely = confidence(index, costs, depths, explained_share(evidence, index), None) >= _LIKELY
         if np.count_nonzero(likely) < _MIN_SAMPLES:
             needed = _MIN_SAMPLES / likely.size
             raise NothingInFocus(

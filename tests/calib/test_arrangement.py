@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from faintfield.calib.arrangement.inspection import GridInspection, inspect_grid, pitch_ratio
-from faintfield.calib.arrangement.matching import Axes, Correlations
+from faintfield.calib.arrangement.matching import Axes, Correlations, disparity_range
 from faintfield.calib.arrangement.neighbours import compare_pair
 from faintfield.calib.arrangement.views import Orientation, prepare_pictures
 from tests.calib.light_fields import CARDS, Layer, Views, light_field, with_noise
@@ -229,6 +229,15 @@ def test_small_disparities_count_in_pixels_of_files() -> None:
     """Pictures above 448 px are halved, and so are disparities: 0.4 px of the files are 0.2 px there."""
     result = inspect(light_field((Layer(-0.4),), grid=(3, 3), size_px=(460, 80)))
     assert (result.direction, result.aligned, result.still) == ("signs", False, False)
+
+
+def test_few_wrong_blocks_do_not_widen_the_range() -> None:
+    shifts_px = np.arange(-3, 3.01, 0.1)
+    moved_px = np.repeat([-2.0, 2.0], [298, 2])
+    scores = np.array(1 - (shifts_px - moved_px[:, np.newaxis]) ** 2, np.float32)[np.newaxis]
+    one_line = {(1, 0): scores}
+    correlations = Correlations(shifts_px, one_line, {key: np.zeros_like(scores) for key in one_line})
+    assert disparity_range(correlations, Axes()) == pytest.approx((-2.0, -2.0))
 
 
 @pytest.mark.parametrize(("no_sign_px", "ratio"), [(0.125, 1.5), (0.25, 1.0)])

@@ -65,11 +65,11 @@ class ImportedGrid(msgspec.Struct, frozen=True):
 def import_pictures(src: Path, out: Path, options: GridOptions) -> ImportedGrid:
     """Make an elemental set of the pictures in a folder or a file, put in order by what they show."""
     check_set_free(out, options, src)
-    if options.distortion and (None in (options.pitch_mm, options.fx_px) or options.disparity_px):
-        raise WrongUsage(
-            "--distortion is that of pictures that were not aligned, with a scale; give --pitch-mm and --fx-px with "
-            "it, and no --disparity-px"
-        )
+    if options.distortion and None in (options.pitch_mm, options.fx_px):
+        lacking = "--pitch-mm" if options.pitch_mm is None else "--fx-px"
+        raise WrongUsage(f"--distortion is that of a lens whose scale is known; give {lacking}, too")
+    if options.distortion and options.disparity_px:
+        raise WrongUsage("--distortion is that of pictures as they were taken, not of aligned ones; leave one out")
     own = {options.cx_px, options.cy_px, *options.distortion} != {None}
     lens_text = "as stated" if own else "ideal, no distortion, centred: state another by --distortion, --cx-px, --cy-px"
     recorded = {name: value for name, value in asdict(options).items() if name not in ("no_align", "overwrite")}
@@ -85,6 +85,7 @@ def import_pictures(src: Path, out: Path, options: GridOptions) -> ImportedGrid:
         first = read_picture(next(iter(views.paths.values())))
         require_room_for_copies(out, first, len(views.paths))
         height, width = first.pixels_dn.shape[:2]
+        lens = stated_lens((width, height), fx_px or width, fx_px or width, options)
         white = float(first.saturation_dn or np.iinfo(first.pixels_dn.dtype).max)
         grid, arrangement = arrange_grid(
             views,
@@ -95,13 +96,18 @@ def import_pictures(src: Path, out: Path, options: GridOptions) -> ImportedGrid:
             lens=lens_text,
         )
         stated = disparity_px is not None
-        pitch_mm, fx_px, at_infinity_px, in_mm = _scale(arrangement, float(width), pitch_mm, fx_px, disparity_px or 0.0)
+        if options.distortion and arrangement.aligned and not stated:
+            raise BadValue(
+                f"{src}: the pictures are aligned on a plane in the scene, and --distortion is that of pictures as "
+                "they were taken; leave it out, give those, or state by --disparity-px 0 that they are not aligned"
+            )
+        pitch_mm, fx_px, at_infinity_px, in_mm = _scale(arrangement, float(width), pitch_mm, fx_px, disparity_px)
         if in_mm and arrangement.aligned is None and arrangement.disparity_range_px is not None and not stated:
             inform(
                 "warning: the pictures do not tell whether they are aligned on a plane in the scene; depths in mm hold "
                 "only if they are not: give --disparity-px, 0 if they are not aligned"
             )
-        lens = stated_lens((width, height), fx_px, fx_px, options)
+        lens = replace(lens, fx_px=fx_px, fy_px=fx_px)
         write_imported_set(
             out,
             options,
@@ -120,21 +126,21 @@ def import_pictures(src: Path, out: Path, options: GridOptions) -> ImportedGrid:
 
 
 def _scale(
-    arrangement: Arrangement, width_px: float, pitch_mm: float | None, fx_px: float | None, disparity_px: float
+    arrangement: Arrangement, width_px: float, pitch_mm: float | None, fx_px: float | None, disparity_px: float | None
 ) -> tuple[float, float, float, bool]:
     """Return pitch in mm, focal length in px, disparity in px of infinitely far points, and whether depths are in mm.
 
     Without a scale a nominal one is made in which all that was found is in front of the cameras.
     """
     focal_px = fx_px or width_px
-    aligned = bool(arrangement.aligned) and not disparity_px
+    aligned = bool(arrangement.aligned) and disparity_px is None
     if (pitch_mm is None) != (fx_px is None) or (pitch_mm is not None and aligned):
         inform(
             "depths are stated as disparities in px: mm need --pitch-mm and --fx-px"
             + (", and --disparity-px as the pictures are aligned on a plane" if aligned else "")
         )
     if pitch_mm is not None and fx_px is not None and not aligned:
-        return pitch_mm, focal_px, disparity_px, True
+        return pitch_mm, focal_px, disparity_px or 0.0, True
     if disparity_px:
         # The plane on which the pictures are aligned gets a depth of its own
         return pitch_mm or _FREE_REFERENCE_DEPTH_MM * disparity_px / focal_px, focal_px, disparity_px, False

@@ -90,9 +90,13 @@ def test_lens_is_that_of_options(tmp_path: Path, done: Command, faintfield: Comm
     camera = load_set(tmp_path / "out").settings.camera
     assert (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px) == (9, 9, 3, 2.5)
     assert camera.distortion == (-0.1,)
-    for wrong in (("--fx-px", 9), ("--fx-px", 9, "--pitch-mm", 50, "--disparity-px", 2)):
+    for wrong, words in (
+        (("--fx-px", 9), "give --pitch-mm, too"),
+        (("--fx-px", 9, "--pitch-mm", 50, "--disparity-px", 2), "not of aligned ones; leave one out"),
+        (("--fx-px", 9, "--pitch-mm", 50, "--distortion", "nan"), "the lens of the options cannot be"),
+    ):
         ended = faintfield("import", "grid", src, tmp_path / "no", *wrong, *lens)
-        assert (ended.returncode, "give --pitch-mm and --fx-px with it, and" in ended.stderr) == (2, True)
+        assert (ended.returncode, words in ended.stderr) == (2, True)
 
 
 def test_full_disk_is_found_before_pictures_are_compared(

@@ -118,6 +118,10 @@ def test_kinds_are_listed_and_fields_explained(done: Command) -> None:
     assert stage["description"] == "Connection and limits of the stage: the `[stage]` table of rig.toml."
 
 
-def test_keys_have_the_meanings_of_fields_that_have_another_name_or_are_derived(done: Command) -> None:
-    definitions = json.loads(done("schema", "noise").stdout)["$defs"]
-    assert all("description" in part for part in definitions["NoiseRecord"]["properties"].values())
+@pytest.mark.parametrize("kind", get_args(SchemaKind.__value__))
+def test_keys_have_meanings(kind: str, done: Command) -> None:
+    definitions = json.loads(done("schema", kind).stdout)["$defs"]
+    keys = [
+        (name, key, part) for name, record in definitions.items() for key, part in record.get("properties", {}).items()
+    ]
+    assert [(name, key) for name, key, part in keys if not part.get("description")] == []

@@ -16,6 +16,7 @@ from faintfield.pipelines.commands.reconstruction import reconstruct as reconstr
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.sets.elemental_set import load_set
+from faintfield.pipelines.notebook.options import naming_arguments
 from faintfield.pipelines.reconstruction.options import Options
 from faintfield.recon.errors import NothingInFocus
 from faintfield.recon.likelihood.images import Image
@@ -289,6 +290,8 @@ def test_failures_name_arguments(folder: Path) -> None:
     )
     with pytest.raises(NothingInFocus, match=r"make planes at known depths \(depths\)$"):
         dark.find_depths(700.0, 1500.0)
+    with pytest.raises(NothingInFocus, match=r"^/a--depth: give depths, passes or --flip-rows$"), naming_arguments():
+        raise NothingInFocus("/a--depth: give --depth, --passes or --flip-rows")
 
 
 def test_grid_is_that_of_plane(folder: Path) -> None:

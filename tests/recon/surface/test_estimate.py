@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from faintfield.recon.surface import estimate
-from faintfield.recon.surface.confidence import MISPLACED, RIGHT_WITHIN, SURE, confidence
+from faintfield.recon.surface.confidence import MISPLACEMENT, RIGHT_WITHIN, SURE, confidence
 from faintfield.recon.surface.estimate import SurfaceEstimate, estimate_surface
 from faintfield.recon.surface.evidence import DepthEvidence, Halves
 from faintfield.recon.surface.pinhole_views import UNKNOWN, PinholeViews
@@ -168,13 +168,13 @@ def test_wrong_poses_make_depths_less_sure() -> None:
     assert wrong < 0.05
 
 
-def test_confidence_is_that_of_error_of_views_in_small_parallax() -> None:
+def test_confidence_falls_with_parallax() -> None:
     rng = np.random.default_rng(1)
     index, inverse_depths = np.full((24, 24), 10.0, np.float32), np.linspace(1e-3, 2e-3, 64)
     costs = np.abs(np.arange(64) - index[:, :, np.newaxis]).astype(np.float32) * 100
     known = (index, costs, inverse_depths, np.ones((24, 24), np.float32))
-    draws = rng.normal(0, MISPLACED, 100_000)
+    draws = rng.normal(0, MISPLACEMENT, 100_000)
     for parallax in (5e3, 2e4, 1e5):
         tolerated = RIGHT_WITHIN * inverse_depths[10] * parallax
-        expected = confidence(*known) * np.mean(np.abs(draws) < tolerated)
+        expected = confidence(*known, None) * np.mean(np.abs(draws) < tolerated)
         np.testing.assert_allclose(confidence(*known, parallax), expected, atol=0.005)
