@@ -238,9 +238,8 @@ def _direction(
     """Return whether to turn the orientation, what tells so, and whether both are equally likely."""
     least_px, largest_px = range_px
     least_z = -_DOUBTFUL_SIDE_Z if opposed else -_DOUBTFUL_OF_BOTH
-    if (
-        largest_px < -no_sign_px and least_z < side_z < _MIN_SIDE_Z
-    ):  # near points move against the camera, far ones less
+    # Near points move against the camera, far ones less
+    if largest_px < -no_sign_px and least_z < side_z < _MIN_SIDE_Z:
         return False, "signs", False
     if abs(side_z) >= _MIN_SIDE_Z:
         return side_z < 0, "pictures", False

@@ -86,7 +86,7 @@ def _records(kind: types.Type, repeated: bool = False) -> Iterator[tuple[_Record
 def _keys(record: _Record) -> str:
     """Return the docstring of a type and a table of its fields."""
     kind = get_origin(record.cls) or record.cls
-    meanings = key_meanings(kind)
+    meanings = key_meanings(record.cls)
 
     def cells(field: types.Field) -> tuple[str, ...]:
         return _value(field), _default(field), linked(meanings.get(field.name, ""))

@@ -27,11 +27,11 @@ def key_meanings(record: type) -> dict[str, str]:
             if heading in ("Parameters", "Attributes")
             for entry in _ENTRY.findall(section)
         ):
-            meanings |= _shared(names.split(", "), " ".join(text.split()))
+            meanings |= _text_of_each(names.split(", "), " ".join(text.split()))
     return meanings
 
 
-def _shared(names: list[str], text: str) -> dict[str, str]:
+def _text_of_each(names: list[str], text: str) -> dict[str, str]:
     """Return the part of a text for each of the names, as a sentence."""
     parts = text.removesuffix(".").split("; ")
     if len(parts) != len(names):

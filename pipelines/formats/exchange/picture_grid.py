@@ -70,8 +70,8 @@ def import_pictures(src: Path, out: Path, options: GridOptions) -> ImportedGrid:
         raise WrongUsage(f"--distortion is that of a lens whose scale is known; give {lacking}, too")
     if options.distortion and options.disparity_px:
         raise WrongUsage("--distortion is that of pictures as they were taken, not of aligned ones; leave one out")
-    own = {options.cx_px, options.cy_px, *options.distortion} != {None}
-    lens_text = "as stated" if own else "ideal, no distortion, centred: state another by --distortion, --cx-px, --cy-px"
+    is_ideal = not options.distortion and options.cx_px is None and options.cy_px is None
+    ideal = "ideal, no distortion, centred: state another by --distortion, --cx-px, --cy-px"
     recorded = {name: value for name, value in asdict(options).items() if name not in ("no_align", "overwrite")}
     pitch_mm, fx_px, disparity_px = options.pitch_mm, options.fx_px, options.disparity_px
     described = described_grid(src)
@@ -93,7 +93,7 @@ def import_pictures(src: Path, out: Path, options: GridOptions) -> ImportedGrid:
             white=white if views.dn_per_value is None else np.inf,  # floats state no white
             size_px=(width, height),
             aligned=bool(disparity_px),
-            lens=lens_text,
+            lens=ideal if is_ideal else "as stated",
         )
         stated = disparity_px is not None
         if options.distortion and arrangement.aligned and not stated:
