@@ -25,8 +25,9 @@ COEFFICIENTS = (-3.773, 1.015, 1.953, 0.814, 1.967)
 # detail: other surfaces may explain as much.
 _MAX_CONFIDENCE, _POORLY_EXPLAINED, _MAX_IF_POORLY = 0.95, 0.35, 0.85
 
-# Standard deviation in samples by which interpolation between pixels misplaces each view: the same program fits 0.36.
-MISPLACEMENT = 0.4
+# Standard deviation in samples by which each view is misplaced: the same program fits 0.05 where poses are exact, and
+# those of a rig, or of a grid of photographs, are not.
+MISPLACEMENT = 0.2
 
 
 def confidence(
@@ -35,7 +36,7 @@ def confidence(
     """Return the probability (row, column) that depths are right within `RIGHT_WITHIN`.
 
     The product of two probabilities: that the depth is the right one among others, by a logistic model of `features`,
-    fitted on rendered scenes of known depth; and that the error by interpolation is small enough.
+    fitted on rendered scenes of known depth; and that it is precise, although views are misplaced.
 
     Parameters
     ----------
@@ -64,7 +65,7 @@ def found_probability(features: NDArray[np.float64], coefficients: ArrayLike) ->
 
 
 def precise_probability(tolerance: NDArray[np.float64], misplacement: float) -> NDArray[np.float64]:
-    """Return the probability that the error by interpolation is within a tolerance.
+    """Return the probability that the error by misplaced views is within a tolerance.
 
     Both are in samples, the tolerance as the root of the sum of squares of the movements of the views.
     """

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.recon.likelihood.images import Image, binned
-from faintfield.recon.numba_tools import compiled, index, pointer
+from faintfield.recon.numba_tools import compiled, index, inlined, pointer
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.surface_operator import SurfaceOperator
 
-# Light of a pixel without a valid number; a sum with any such light lies below the second.
-UNKNOWN, _SURELY_UNKNOWN = np.float32(-1e30), np.float32(-1e20)
+# Light of a pixel without a valid number; a sum with any share of such light lies below the second.
+UNKNOWN, _ANY_UNKNOWN = np.float32(-1e30), np.float32(-1e9)
 
 # Steps by which the change of a lens is undone: enough while the change b of distortion moves rays r by b r² < 0.1.
 _INVERSION_STEPS = 6
@@ -93,7 +93,7 @@ class PinholeViews:
         if bins == 1:
             return self
         light = np.stack([binned(picture, bins) for picture in self.light_e]) * np.float32(bins**2)
-        light[light < _SURELY_UNKNOWN] = UNKNOWN
+        light[light < _ANY_UNKNOWN] = UNKNOWN
         (fx, fy), (cx, cy) = self.focal_px, self.centre_px
         response, share = (
             binned(np.broadcast_to(n, self.light_e.shape[1:]), bins) for n in (self.response, self.noise_share)
@@ -126,7 +126,10 @@ def gather(
 ) -> Image:
     """Return sums over the views of what they show of the samples, were these all at one depth.
 
-    Pixels are interpolated between their four neighbours. A view does not count where something nearer hides it.
+    A view shows at each place the mean of the nine pixels around it, weighted by a quadratic B-spline. It blurs alike
+    everywhere, and sums bend as a place moves: those of bilinear interpolation are straight between pixels, where views
+    on opposite sides then cancel, and a range of depths looks alike. A view does not count where something nearer hides
+    it.
 
     Parameters
     ----------
@@ -156,8 +159,8 @@ def _gather(pictures, relief, tolerance, half, matrices, q, lattice, sums):
     """Add what views show to `sums` (half, count and numbers, row, column)."""
     count, rows, columns, numbers = pictures.shape
     x0, y0, pitch = lattice
-    zero, one, nearest = np.float32(0), np.float32(1), np.float32(0.5)
-    last_row, last_column = np.float32(rows - 1), np.float32(columns - 1)
+    one, half_px = np.float32(1), np.float32(0.5)
+    last_row, last_column = np.float32(rows) - np.float32(1.5), np.float32(columns) - np.float32(1.5)
     row_step, column_step = index(columns * numbers), index(numbers)
     width, size = index(sums.shape[3]), index(sums.shape[2] * sums.shape[3])
     for view in range(count):
@@ -172,24 +175,38 @@ def _gather(pictures, relief, tolerance, half, matrices, q, lattice, sums):
                 x = x0 + pitch * np.float32(j)
                 scale = one / (c + m[2, 0] * x)
                 column, row = (a + m[0, 0] * x) * scale, (b + m[1, 0] * x) * scale
-                if not (zero <= row < last_row and zero <= column < last_column):
+                if not (half_px <= row < last_row and half_px <= column < last_column):
                     continue
-                if seen[index(np.int32(row + nearest)) * index(columns) + index(np.int32(column + nearest))] > hidden:
+                r, k = np.int32(row + half_px), np.int32(column + half_px)
+                if seen[index(r) * index(columns) + index(k)] > hidden:
                     continue
-                r, k = np.int32(row), np.int32(column)
-                upper = index(r) * row_step + index(k) * column_step
-                lower = upper + row_step
-                least = min(picture[upper], picture[upper + column_step])
-                if min(least, min(picture[lower], picture[lower + column_step])) == UNKNOWN:
-                    continue
-                down, right = row - np.float32(r), column - np.float32(k)
+                above, here, below = spline_weights(row - np.float32(r))
+                left, middle, right = spline_weights(column - np.float32(k))
+                first = index(r - 1) * row_step + index(k - 1) * column_step
                 at = index(i) * width + index(j)
-                total[at] += one
                 for n in range(numbers):
-                    above, below = upper + index(n), lower + index(n)
-                    high = picture[above] + right * (picture[above + column_step] - picture[above])
-                    low = picture[below] + right * (picture[below + column_step] - picture[below])
-                    total[at + index(n + 1) * size] += high + down * (low - high)
+                    upper = first + index(n)
+                    value = above * across(picture, upper, column_step, left, middle, right)
+                    value += here * across(picture, upper + row_step, column_step, left, middle, right)
+                    value += below * across(picture, upper + row_step + row_step, column_step, left, middle, right)
+                    if n == 0:
+                        if value < _ANY_UNKNOWN:
+                            break
+                        total[at] += one
+                    total[at + index(n + 1) * size] += value
+
+
+@inlined
+def spline_weights(x):
+    """Return the quadratic B-spline at distances -1, 0 and 1 from a point `x` between -1/2 and 1/2."""
+    before, after = np.float32(0.5) - x, np.float32(0.5) + x
+    return np.float32(0.5) * before * before, np.float32(0.75) - x * x, np.float32(0.5) * after * after
+
+
+@inlined
+def across(picture, at, step, left, middle, right):
+    """Return the weighted sum of three numbers of a picture, the first of which is `at`."""
+    return left * picture[at] + middle * picture[at + step] + right * picture[at + step + step]
 
 
 def gaussian(image: Image, scale: float) -> NDArray[np.float32]:

@@ -20,7 +20,7 @@ from faintfield.pipelines.formats.frames import Lattice
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.channels import lattice_noise, view_electrons
 from faintfield.pipelines.reconstruction.depth.autofocus import searched_range_mm, views_of_search
-from faintfield.pipelines.reconstruction.depth.comparison import BETWEEN_PIXELS, between_pixels, check_places
+from faintfield.pipelines.reconstruction.depth.comparison import check_places
 from faintfield.pipelines.reconstruction.depth.shared_range import overlap, remedy
 from faintfield.pipelines.reconstruction.operators import plane_grid, principal_shift, response_of
 from faintfield.recon.errors import GeometryMismatch, NothingInFocus
@@ -58,7 +58,6 @@ def default_bins(elemental_set: ElementalSet) -> int:
 def luminance(elemental_set: ElementalSet, bins: int) -> PinholeViews:
     """Return the light of all views, in bins of `bins` by `bins` detector pixels, with distortion undone.
 
-    The samples of the surface lie between the bins, see `between_pixels`.
     Each view is read by one thread. Raises WrongSize, WrongBitDepth or UnreadableImage for a frame that does not match.
     """
     layouts = elemental_set.layouts
@@ -95,7 +94,7 @@ def luminance(elemental_set: ElementalSet, bins: int) -> PinholeViews:
         ray_from_surface(elemental_set.poses_rt_cam_ref, principal_shift(elemental_set)),
         (camera.fx_px / bins, camera.fy_px / bins),
         ((camera.cx_px + 0.5) / bins - 0.5, (camera.cy_px + 0.5) / bins - 0.5),
-        between_pixels(plane_grid(elemental_set, 1.0).binned(bins)),
+        plane_grid(elemental_set, 1.0).binned(bins),
         np.array(elemental_set.nodes),
         _mean_response(responses, undistorted),
         _noise_share(undistorted),
@@ -278,16 +277,10 @@ def _check_steps(views: PinholeViews, depths: NDArray[np.float64]) -> None:
         inform(f"warning: {apart}; a narrower range would find more")
 
 
-def enlarged[Number: np.floating](
-    part: NDArray[Number], shape: tuple[int, int], bins: int, *, moved: float = BETWEEN_PIXELS
-) -> NDArray[Number]:
-    """Return a map of bins on the samples of a picture (rows, columns), each with the nearest value.
-
-    The samples of the map lie right of and below the middles of the bins by `moved` bins.
-    """
+def enlarged[Number: np.floating](part: NDArray[Number], shape: tuple[int, int], bins: int) -> NDArray[Number]:
+    """Return a map of bins on the samples of a picture (rows, columns), each with the value of the nearest bin."""
     rows, columns = (
-        np.clip(np.floor((np.arange(size) + 0.5) / bins - moved), 0, count - 1).astype(np.intp)
-        for size, count in zip(shape, part.shape, strict=True)
+        np.minimum(np.arange(size) // bins, count - 1) for size, count in zip(shape, part.shape, strict=True)
     )
     return part[np.ix_(rows, columns)]
 

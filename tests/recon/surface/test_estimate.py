@@ -8,10 +8,12 @@ import numba
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, map_coordinates
 
+from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.surface import estimate
 from faintfield.recon.surface.confidence import MISPLACEMENT, RIGHT_WITHIN, SURE, confidence
-from faintfield.recon.surface.estimate import SurfaceEstimate, estimate_surface
+from faintfield.recon.surface.estimate import SurfaceEstimate, estimate_surface, first_depths, halves
 from faintfield.recon.surface.evidence import DepthEvidence, Halves
 from faintfield.recon.surface.pinhole_views import UNKNOWN, PinholeViews
 from tests.recon import surface_scene
@@ -166,6 +168,31 @@ def test_wrong_poses_make_depths_less_sure() -> None:
     assert right > 0.1
     assert wrong <= 0.2 * (right + wrong)
     assert wrong < 0.05
+
+
+@pytest.mark.parametrize("bins_per_node", [1.0, 1.5])
+def test_depths_are_right_where_views_move_by_few_bins(bins_per_node: float) -> None:
+    """Texture as fine as bins, whole or half bins per node: views on opposite sides must not cancel between bins."""
+    rng = np.random.default_rng(5)
+    fine = gaussian_filter(rng.normal(size=(160, 200)), 1.0)
+    fine = 100 * np.maximum(1 + 0.4 * fine / fine.std(), 0.1)
+    rows, columns = np.indices((60, 80), np.float64)
+    moved = bins_per_node * (NODES - 2)
+    light = [map_coordinates(fine, [rows + 50 + down, columns + 60 + right], order=3) for down, right in moved]
+    true = 0.002
+    ray_from_surface = np.tile(np.eye(3, 4), (25, 1, 1))
+    ray_from_surface[:, :2, 3] = -moved[:, ::-1] / (200 * true)
+    views = PinholeViews(
+        rng.poisson(np.maximum(light, 0)).astype(np.float32),
+        1.0,
+        ray_from_surface,
+        (200.0, 200.0),
+        (39.5, 29.5),
+        PlaneGrid((60, 80), 1 / 200, (-39.5 / 200, -29.5 / 200)),
+        NODES,
+    )
+    index = first_depths(DepthEvidence(views, np.linspace(0.6 * true, 1.4 * true, 65), halves(NODES)))
+    assert np.median(index) == pytest.approx(32, abs=0.5)  # steps of 1.25 %
 
 
 def test_confidence_falls_with_parallax() -> None:

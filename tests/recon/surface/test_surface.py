@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.interpolate import BSpline
 from scipy.optimize import minimize
 from scipy.sparse import csr_array
 
@@ -97,6 +98,10 @@ SHAPE = (8, 11)
 Q = 0.002
 
 
+# The quadratic B-spline of unit knots around zero
+_SPLINE = BSpline.basis_element([-1.5, -0.5, 0.5, 1.5], extrapolate=False)
+
+
 def _views(light: NDArray[np.floating] | None = None, count: int = 6) -> PinholeViews:
     """Return views that are turned, moved, and of different scale; their pictures cut samples off on every side."""
     generator = np.random.default_rng(7)
@@ -105,7 +110,7 @@ def _views(light: NDArray[np.floating] | None = None, count: int = 6) -> Pinhole
     matrices[:, :, 3] = generator.uniform(-90, 90, (count, 3)) * [1, 1, 0.3]
     if light is None:
         light = generator.uniform(1, 9, (count, *SHAPE))
-        light[generator.random(light.shape) < 0.1] = UNKNOWN
+        light[generator.random(light.shape) < 0.03] = UNKNOWN
     nodes = np.argwhere(np.ones((1, count)))
     return PinholeViews(light.astype(np.float32), 1.5, matrices, (11.0, 10.0), (5.2, 3.4), GRID, nodes)
 
@@ -128,17 +133,15 @@ def _summed(
     sums = np.zeros((2, 1 + pictures.shape[3], *GRID.shape))
     for view, row, column in np.ndindex(len(pictures), *GRID.shape):
         down, right = _place(views, view, row, column)
-        if not (0 <= down < SHAPE[0] - 1 and 0 <= right < SHAPE[1] - 1):
+        i, j = round(down), round(right)
+        if not (1 <= i < SHAPE[0] - 1 and 1 <= j < SHAPE[1] - 1) or relief[view, i, j] > Q + tolerance[view]:
             continue
-        if relief[view, round(down), round(right)] > Q + tolerance[view]:
+        around = pictures[view, i - 1 : i + 2, j - 1 : j + 2].astype(float)
+        if (around[:, :, 0] == UNKNOWN).any():
             continue
-        i, j = int(down), int(right)
-        corners = pictures[view, i : i + 2, j : j + 2].astype(float)
-        if (corners[:, :, 0] == UNKNOWN).any():
-            continue
-        rows, columns = [1 - (down - i), down - i], [1 - (right - j), right - j]
+        rows, columns = (_SPLINE(np.arange(-1, 2) - off) for off in (down - i, right - j))
         sums[half[view], 0, row, column] += 1
-        sums[half[view], 1:, row, column] += np.einsum("i,j,ijn->n", rows, columns, corners)
+        sums[half[view], 1:, row, column] += np.einsum("i,j,ijn->n", rows, columns, around)
     return sums
 
 

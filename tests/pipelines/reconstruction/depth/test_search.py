@@ -158,17 +158,15 @@ def test_deviation_without_images_is_that_of_plane(simulated_scene: Path) -> Non
 
 
 @pytest.mark.parametrize("bins", [2, 3])
-@pytest.mark.parametrize("moved", [0.0, BETWEEN_PIXELS])
-def test_each_sample_has_value_of_nearest_bin(bins: int, moved: float) -> None:
+def test_each_sample_has_value_of_nearest_bin(bins: int) -> None:
     generator = np.random.default_rng(1)
     part, shape = generator.normal(size=(6, 8)), (6 * bins + bins // 2, 8 * bins + bins - 1)
-    # The middle of bin k lies at pixel bins (k + ½) − ½; its sample lies further right and below
-    middles = [bins * (np.arange(count) + 0.5 + moved) - 0.5 for count in part.shape]
+    middles = [bins * (np.arange(count) + 0.5) - 0.5 for count in part.shape]
     expected = np.empty(shape)
     for row, column in np.ndindex(shape):
         i, j = (int(np.abs(middle - at).argmin()) for middle, at in zip(middles, (row, column), strict=True))
         expected[row, column] = part[i, j]
-    np.testing.assert_array_equal(enlarged(part, shape, bins, moved=moved), expected)
+    np.testing.assert_array_equal(enlarged(part, shape, bins), expected)
 
 
 def test_samples_between_pixels_have_mean_blur() -> None:
