@@ -235,7 +235,13 @@ class Surface:
 
     def __repr__(self) -> str:
         rows, columns = self.result.surface.shape
-        return f"<surface of {columns} x {rows} samples, {self.result.surface.sure_share:.0%} of the depths sure>"
+        sure = f"{self.result.surface.sure_share:.0%} of the depths sure"
+        return "\n".join(filter(None, (f"<surface of {columns} x {rows} samples, {sure}>", self.warning)))
+
+    @property
+    def warning(self) -> str | None:
+        """Words on a surface that does not explain its views, or of which no depth is sure; None for others."""
+        return self.result.surface.warning or self.result.surface.remark
 
     @cached_property
     def picture(self) -> Array:

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt
-from scipy.special import erf
+from scipy.special import erf, erfinv
 
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.surface.edges import near_side, values_at
@@ -70,6 +70,18 @@ def precise_probability(tolerance: NDArray[np.float64], misplacement: float) -> 
     Both are in samples, the tolerance as the root of the sum of squares of the movements of the views.
     """
     return np.asarray(erf(tolerance / (np.sqrt(2) * misplacement)))
+
+
+def spacing_needed(inverse_depth: float, parallax: float) -> float:
+    """Return the factor by which views must be farther apart for a depth to be sure, however well they show it.
+
+    Parameters
+    ----------
+    inverse_depth, parallax : float
+        1/depth, and the root of the sum of squares of the views' parallaxes, see `confidence`.
+    """
+    tolerance = np.sqrt(2) * MISPLACEMENT * erfinv(SURE / _MAX_CONFIDENCE)
+    return float(tolerance / (RIGHT_WITHIN * inverse_depth * parallax))
 
 
 def features(index: Image, costs: Image, inverse_depths: Image, explained: Image) -> NDArray[np.float64]:

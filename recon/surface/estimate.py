@@ -9,7 +9,7 @@ from faintfield.recon.errors import NothingInFocus
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.numba_tools import compiled
 from faintfield.recon.solver.penalty_weight import MIN_VIEWS, validation_views
-from faintfield.recon.surface.confidence import confidence
+from faintfield.recon.surface.confidence import confidence, spacing_needed
 from faintfield.recon.surface.edges import moved_edges
 from faintfield.recon.surface.evidence import DepthEvidence, Explained, Halves
 from faintfield.recon.surface.goodness import (
@@ -75,6 +75,8 @@ class SurfaceEstimate:
         Of views that were left out; None if there are too few views to leave some out.
     lit_share : float
         Share of the samples whose light stands out of the noise.
+    spacing_needed : float
+        Factor by which views must be farther apart for the median depth to be sure.
     """
 
     inverse_depth: NDArray[np.float64]
@@ -82,6 +84,7 @@ class SurfaceEstimate:
     rounds: int
     prediction: Prediction | None
     lit_share: float
+    spacing_needed: float
 
 
 def estimate_surface(views: PinholeViews, inverse_depths: NDArray[np.float64]) -> SurfaceEstimate:
@@ -110,12 +113,14 @@ def estimate_surface(views: PinholeViews, inverse_depths: NDArray[np.float64]) -
         prediction = predicted(evidence, candidates[best], left_out, beside)
     final = DepthEvidence(views, inverse_depths, halves(nodes))
     index, costs = next_depths(final, final.explained(candidates[best]))
-    sure = confidence(index, costs, inverse_depths, explained_share(final, index), float(np.linalg.norm(views.reach)))
+    parallax = float(np.linalg.norm(views.reach))
+    sure = confidence(index, costs, inverse_depths, explained_share(final, index), parallax)
     depths = np.interp(index, np.arange(len(inverse_depths)), inverse_depths)
     lit = lit_samples(views, depths)
     doubtful = (index <= 1) | (index >= len(inverse_depths) - 2) | ~lit
     sure[doubtful] = np.minimum(sure[doubtful], _DOUBTFUL)
-    return SurfaceEstimate(depths, sure, best + 1, prediction, float(lit.mean()))
+    spacing = spacing_needed(float(np.median(depths)), parallax)
+    return SurfaceEstimate(depths, sure, best + 1, prediction, float(lit.mean()), spacing)
 
 
 def _errors(evidence: DepthEvidence, known: Explained, views: NDArray[np.intp]) -> NDArray[np.float32]:

@@ -23,7 +23,7 @@ from faintfield.recon.surface.pinhole_views import PinholeViews
 type Searches = list[tuple[PinholeViews, NDArray[np.float64]]]
 
 # What the search that stands in for the slow one finds everywhere.
-FOUND_MM, FOUND_CONFIDENCE = 600.0, 0.5
+FOUND_MM, FOUND_CONFIDENCE, FOUND_SPACING = 600.0, 0.5, 1.0
 
 SHAPE, PITCH = (90, 120), 1 / 150
 GRID = PlaneGrid(SHAPE, PITCH, (-59.5 * PITCH, -44.5 * PITCH))
@@ -99,4 +99,4 @@ def found_at_once(views: PinholeViews) -> SurfaceEstimate:
     """Return one depth everywhere, with one probability."""
     shape = views.grid.shape
     depths, confidence = np.full(shape, 1 / FOUND_MM), np.full(shape, FOUND_CONFIDENCE, np.float32)
-    return SurfaceEstimate(depths, confidence, rounds=2, prediction=None, lit_share=1.0)
+    return SurfaceEstimate(depths, confidence, rounds=2, prediction=None, lit_share=1.0, spacing_needed=FOUND_SPACING)

@@ -6,6 +6,7 @@ of disparity from one node to the next.
 """
 
 from dataclasses import dataclass
+from math import ceil
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -177,6 +178,8 @@ class SurfaceFacts(Struct, frozen=True, kw_only=True):
         Share of the sure samples at each depth that stands out.
     sure_of_lit : float, optional
         Share of the samples with light whose depth is sure.
+    spacing_needed : float, optional
+        Factor by which nodes must be farther apart for the median depth to be sure; at most 1 if they are far enough.
     channels : list of SurfaceChannel
         Solution of each colour of the picture.
     wall_time_s : float
@@ -193,6 +196,7 @@ class SurfaceFacts(Struct, frozen=True, kw_only=True):
     held_out: HeldOutRecord | None = None
     share_of_sure: list[float] | UnsetType = UNSET
     sure_of_lit: Share | UnsetType = UNSET
+    spacing_needed: Annotated[float, Meta(gt=0)] | UnsetType = UNSET
     channels: Annotated[list[SurfaceChannel], Meta(min_length=1)]
     wall_time_s: float
 
@@ -274,10 +278,13 @@ class SurfaceRecord(SurfaceFacts, frozen=True, kw_only=True):
         """Words on a surface of which no depth is sure, or too few to show as 1 %; None if there are more."""
         if self.sure_share >= _MIN_SURE_SHARE:
             return None
-        return (
-            f"{'Almost no' if self.sure_share else 'No'} depth of this surface is sure: do not measure in it; use more "
-            "light, more views or nodes farther apart, or check poses and range of depths"
-        )
+        few = f"{'Almost no' if self.sure_share else 'No'} depth of this surface is sure: do not measure in it; "
+        if self.spacing_needed is not UNSET and self.spacing_needed > 1:
+            return few + (
+                f"its nodes are too close together, use {ceil(10 * self.spacing_needed) / 10:.1f} times their distance "
+                "at least, or more views"
+            )
+        return few + "use more light, more views or nodes farther apart, or check poses and range of depths"
 
     @property
     def maps(self) -> list[str]:

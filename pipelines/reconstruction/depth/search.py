@@ -237,6 +237,7 @@ def depths_of_set(
                 far, near = found_range(views, far, near)
         depths = equal_steps(views, far, near)
         _check_steps(views, depths)
+    range_mm = 1 / near, 1 / far  # of the scene: all orders agree alike elsewhere, which would hide the difference
     check_places(views_of_search(elemental_set, range_mm, out), range_mm)
     with naming_range(elemental_set, far, near, purpose):
         inform(f"{purpose} {_between(elemental_set, far, near)}: comparing {len(depths)} depths")

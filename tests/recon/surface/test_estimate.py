@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.surface import estimate
-from faintfield.recon.surface.confidence import MISPLACEMENT, RIGHT_WITHIN, SURE, confidence
+from faintfield.recon.surface.confidence import MISPLACEMENT, RIGHT_WITHIN, SURE, confidence, spacing_needed
 from faintfield.recon.surface.estimate import SurfaceEstimate, estimate_surface, first_depths, halves
 from faintfield.recon.surface.evidence import DepthEvidence, Halves
 from faintfield.recon.surface.pinhole_views import UNKNOWN, PinholeViews
@@ -205,3 +205,5 @@ def test_confidence_falls_with_parallax() -> None:
         tolerated = RIGHT_WITHIN * inverse_depths[10] * parallax
         expected = confidence(*known, None) * np.mean(np.abs(draws) < tolerated)
         np.testing.assert_allclose(confidence(*known, parallax), expected, atol=0.005)
+    enough = 5e3 * spacing_needed(inverse_depths[10], 5e3)
+    assert confidence(*known, 0.99 * enough).max() < SURE < confidence(*known, 1.01 * enough).max()

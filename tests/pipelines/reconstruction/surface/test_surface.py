@@ -11,6 +11,7 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
+import faintfield
 from faintfield.pipelines.formats import frames as frames_module
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import write_frame
@@ -68,14 +69,33 @@ def test_unexplained_surface_is_told_of_at_the_end(
     assert read_record(scene / "out", "overview.json")["brightness"]["snr"] is not None
 
 
-@pytest.mark.parametrize(("confidence", "remark"), [(0.5, "No depth of this surface is sure: "), (0.95, None)])
+@pytest.mark.parametrize(
+    ("confidence", "spacing", "remark"),
+    [
+        (0.5, 1.0, "No depth of this surface is sure: do not measure in it; use more light"),
+        (
+            0.5,
+            1.61,
+            "No depth of this surface is sure: do not measure in it; its nodes are too close together, use 1.7",
+        ),
+        (0.95, 1.0, None),
+    ],
+)
 def test_surface_without_sure_depths_says_so(
-    confidence: float, remark: str | None, seen: Searches, scene: Path, monkeypatch: pytest.MonkeyPatch, done: Command
+    confidence: float,
+    spacing: float,
+    remark: str | None,
+    seen: Searches,
+    scene: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    done: Command,
 ) -> None:
     monkeypatch.setattr("tests.pipelines.surfaces.FOUND_CONFIDENCE", confidence)
+    monkeypatch.setattr("tests.pipelines.surfaces.FOUND_SPACING", spacing)
     last = done("reconstruct", scene, "--surface", *FAST, "--out", scene / "out").stderr.splitlines()[-1]
     shown = "depth of this surface is sure" in (scene / "out" / "report.html").read_text()
     assert (last.startswith(remark or "a surface in"), shown) == (True, remark is not None), last
+    assert (remark or "% of the depths sure>") in repr(faintfield.open(scene / "out"))
 
 
 def test_maps_follow_from_depth_and_confidence(seen: Searches, scene: Path, done: Command) -> None:
