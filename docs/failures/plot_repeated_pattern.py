@@ -22,7 +22,7 @@ views = light_field(Layer(0.2 + 0.6 * squares, true_depth_mm).seen_from)
 # The search for depths is refused: the views agree no better than in shuffled places.
 
 try:
-    views.find_depths(300.0, 1000.0)
+    views.find_depths((300.0, 1000.0))
 except faintfield.ReconstructionError as failure:
     print(failure)
 

@@ -229,17 +229,23 @@ class LightField:
         factory = OperatorFactory(self.elemental_set, self._layout(channel), self.data(channel))
         return factory.at(self._depth_mm(depth), self.grid(depth, pitch), dtype=dtype)
 
-    def find_depths(self, near: float | None = None, far: float | None = None) -> list[float]:
-        """Return the depths of objects, found by comparing the views, in a range or at all depths that they share.
+    def find_depths(self, depth_range: tuple[float, float] | None = None) -> list[float]:
+        """Return the depths of objects, found by comparing the views.
+
+        Parameters
+        ----------
+        depth_range : (float, float), optional
+            Nearest and farthest depth, in the unit of the set; by default all depths that the views share.
 
         Raises
         ------
+        BadValue
+            The range is none.
         NothingInFocus
             The views agree on nothing, or no better than shuffled ones.
         """
-        if (near is None) != (far is None):
-            raise BadValue(f"the range from {near} to {far} has one end; give both or none")
-        limits = None if near is None or far is None else (self._depth_mm(near), self._depth_mm(far))
+        ends = self._ends(depth_range)
+        limits = ends and (self._depth_mm(ends[0]), self._depth_mm(ends[1]))
         with _scratch() as folder, naming_arguments():
             depths_mm = best_focus(self.elemental_set, folder, limits).depth_mm
         return [self.elemental_set.stated_depth(depth_mm) for depth_mm in depths_mm]
@@ -320,14 +326,8 @@ class LightField:
         OutputExists, OutputBusy
             The folder holds a depth map, or another command is writing into it.
         """
-        folder, in_px = Path(out), self.units.depth == "disparity_px"
-        ends = None
-        if depth_range is not None:
-            if len(depth_range) != 2 or not all(isinstance(end, Real) for end in depth_range):
-                raise BadValue(f"depth_range: got {depth_range!r}; give two numbers, (nearest, farthest)")
-            ends = min(depth_range), max(depth_range)
-            if not (ends[0] > 0 or in_px) or ends[0] == ends[1] or not np.isfinite(ends).all():
-                raise BadValue(f"depth_range: got {depth_range}; give two different depths in front of the camera")
+        folder, ends = Path(out), self._ends(depth_range)
+        in_px = self.units.depth == "disparity_px"
         solver = solver_options(PlaneOptions() if prior is None else PlaneOptions(prior=prior))
         with exclusive(folder), naming_arguments():
             if self.elemental_set.in_memory:
@@ -399,6 +399,19 @@ class LightField:
         if channel not in layouts:
             raise BadValue(f"channel {channel!r}: the views have {', '.join(layouts)}; name one of these")
         return layouts[channel]
+
+    def _ends(self, depth_range: tuple[float, float] | None) -> tuple[float, float] | None:
+        """Return the smaller and the larger end of a range of depths; BadValue if it is none."""
+        if depth_range is None:
+            return None
+        pair = isinstance(depth_range, Sequence) and len(depth_range) == 2
+        if not (pair and all(isinstance(end, Real) for end in depth_range)):
+            raise BadValue(f"depth_range: got {depth_range!r}; give two numbers, (nearest, farthest)")
+        least, most = min(depth_range), max(depth_range)
+        possible = least > 0 or self.units.depth == "disparity_px"
+        if not possible or least == most or not np.isfinite([least, most]).all():
+            raise BadValue(f"depth_range: got {depth_range}; give two different depths in front of the camera")
+        return least, most
 
     def _depth_mm(self, depth: float) -> float:
         return self.elemental_set.depth_in_mm(depth)

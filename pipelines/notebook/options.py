@@ -30,7 +30,7 @@ _LEAST = {"penalty_weight": 0.0, "pitch": 1e-9, "passes": 1}
 _OPTION = re.compile(r"(?<![^\s(])--([a-z-]+)( [A-Z:]*:[A-Z:]*| NUMBER)?")
 _ARGUMENTS = {
     **{"depth": "depths", "depth-mm": "depths", "pitch-mm": "pitch", "out": "out"},
-    **{"sweep": "find_depths(near, far)", "depth-range-mm": "depth_range", "disparity-range-px": "depth_range"},
+    **{"sweep": "find_depths(depth_range)", "depth-range-mm": "depth_range", "disparity-range-px": "depth_range"},
 }
 
 

@@ -25,7 +25,7 @@ _MAX_SAMPLES_PER_PIXEL = 16
 def check_in_front(depth_mm: float) -> None:
     """Refuse a plane that is not in front of the reference camera (GeometryMismatch)."""
     if not (np.isfinite(depth_mm) and depth_mm > 0):
-        raise GeometryMismatch(f"a plane at {depth_mm} mm is not in front of the camera; depth_mm must be positive")
+        raise GeometryMismatch(f"a plane at {depth_mm} mm is not in front of the camera; give a positive depth")
 
 
 def default_pitch_px(elemental_set: ElementalSet) -> int:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -200,8 +201,10 @@ def test_contradictions_are_refused(folder: Path) -> None:
         planes("atuo")
     with pytest.raises(BadValue, match="channel 'infrared'"):
         light_field.operator(800.0, "infrared")
-    with pytest.raises(BadValue, match="give both or none"):
-        light_field.find_depths(near=500.0)
+    ranges: list[tuple[Any, str]] = [(500.0, "two numbers"), ((-5.0, 500.0), "two different depths in front")]
+    for depth_range, message in ranges:
+        with pytest.raises(BadValue, match=f"depth_range: got .*; give {message}"):
+            light_field.find_depths(depth_range)
 
 
 class Tikhonov:
@@ -281,7 +284,7 @@ def test_xarray_and_plots_have_places_and_units(folder: Path) -> None:
 
 def test_depths_of_objects_are_found() -> None:
     light_field, _ = smooth_light_field(light_e=30.0, blur=1.5)
-    assert light_field.find_depths(300.0, 600.0) == pytest.approx([400.0], rel=0.03)
+    assert light_field.find_depths((300.0, 600.0)) == pytest.approx([400.0], rel=0.03)
 
 
 def test_failures_name_arguments(folder: Path) -> None:
@@ -290,7 +293,7 @@ def test_failures_name_arguments(folder: Path) -> None:
         np.zeros((9, 54, 72)), light_field.poses, light_field.lens, faintfield.NoiseModel(0.0, 1.0, 3.0)
     )
     with pytest.raises(NothingInFocus, match=r"make planes at known depths \(depths\)$"):
-        dark.find_depths(700.0, 1500.0)
+        dark.find_depths((700.0, 1500.0))
     with pytest.raises(NothingInFocus, match=r"^/a--depth: give depths, passes or --flip-rows$"), naming_arguments():
         raise NothingInFocus("/a--depth: give --depth, --passes or --flip-rows")
 
