@@ -88,14 +88,21 @@ def progress[T](
 def _drawn(report: "_Report") -> Iterator[None]:
     """Draw the bar of a report."""
     from rich import progress as parts  # help loads this module, and draws no bar
+    from rich.table import Column
 
     class State(parts.ProgressColumn):
         def render(self, task: parts.Task) -> Text:
             return Text(report.state())
 
-    columns = (parts.TextColumn("{task.description}", markup=False), parts.BarColumn(), State())
-    with parts.Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task(visible(report.label), total=report.total)
+    one_line = Column(no_wrap=True)
+    columns = (
+        parts.TextColumn("{task.description}", markup=False, table_column=one_line),
+        parts.BarColumn(bar_width=None, table_column=Column(ratio=1, max_width=40)),
+        State(table_column=one_line),
+    )
+    with parts.Progress(*columns, console=console, transient=True, expand=True) as bar:
+        # A single step has no share that is done: its bar pulses
+        task = bar.add_task(visible(report.label), total=None if report.total == 1 else report.total)
         report.on_advance = lambda: bar.advance(task)
         _bars.append(report.label)
         try:
@@ -157,7 +164,7 @@ class _Report:
 
     def state(self) -> str:
         """Return the steps done, the time since the beginning, about how long the rest takes, and what goes on."""
-        steps = "" if self.total is None else f"{self.done} of {self.total}, "
+        steps = "" if self.total in (None, 1) else f"{self.done} of {self.total}, "
         left_s = self.left_s()
         left = "" if left_s is None else f", about {duration_text(left_s)} to go"
         going_on = f" ({_stages[-1]})" if _stages else ""

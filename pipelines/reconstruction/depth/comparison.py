@@ -149,7 +149,7 @@ def check_places(views: BinnedViews, range_mm: tuple[float, float]) -> Significa
         raise NothingInFocus(
             f"{views.elemental_set.folder}: the views agree no better than shuffled ones (p = {found.p_value:.2g} of "
             f"{found.shuffles} shuffles, at most {largest:g} is needed): nothing moves between them as their places "
-            "say; correct order and places of the pictures, use more light, or make planes at known depths (--depth)"
+            "say; use more light, correct order and places of the pictures, or make planes at known depths (--depth)"
         )
     return found if count >= _FEWEST_VIEWS else None
 
