@@ -295,7 +295,7 @@ class SurfaceRecord(SurfaceFacts, frozen=True, kw_only=True):
 
 
 class SurfaceFileRecord(Provenance[SurfaceOptions], frozen=True):
-    """`surface.json`, which vouches for its `files`.
+    """`surface.json`, with the SHA-256 of its files.
 
     Attributes
     ----------
