@@ -23,7 +23,7 @@ class Estimate(Struct, frozen=True, omit_defaults=True):
     Attributes
     ----------
     value : float, optional
-        Measured value; None if the frames do not determine it.
+        Measured value; none if the frames do not determine it.
     se, ci95 : float, tuple of float, optional
         Standard error; lower and upper end of the 95 % interval.
     why : str, optional
@@ -52,9 +52,10 @@ class SeriesGoodness(Struct, frozen=True, omit_defaults=True):
     left_out : str, optional
         Reason why the series was left out; absent if it was used.
     noise_excess, noise_se : float, optional
-        Variance over that of the model, minus 1, absent for one frame; standard error of it under Gaussian noise.
+        Variance over that of the model, minus 1, absent for one frame; standard error of `noise_excess` under Gaussian
+        noise.
     level_residual_dn : float, optional
-        Level minus that of the model; None where the light of a flat is not known.
+        Level minus that of the model; none if the light of a flat is not known.
     blocks, rows, columns, by_frame : float, optional
         Deviance of the noise over blocks of pixels, rows, columns and frames, per degree of freedom: 1 where the noise
         is Gaussian.
@@ -101,14 +102,14 @@ class StageReport(Struct, frozen=True):
         Angle between the axes minus a right angle.
     backlash_x_mm, backlash_y_mm : StageFigure
         Distance along the axis from the position of a node approached in the positive direction to its position when
-        approached in the negative direction. The stage falls short by half of it either way.
+        approached in the negative direction. The stage falls short by half of it in each direction.
     tilt_rad : StageFigure
         Angle between the reference camera's axis and the normal of the grid.
     node_residual_rms_mm, residuals_mm : StageFigure, list of (float, float, float)
-        Rms distance of the nodes from the regular grid that fits best, in three dimensions; the residual of each node
-        along the grid's x, y and normal.
+        Rms distance of the nodes from the regular grid that fits best, in three dimensions; residual of each node along
+        the grid's x, y and normal.
     warnings : list of str
-        Nodes far from their places; otherwise scale errors too large for a stage.
+        Problems: nodes far from their places, or scale errors that are too large for a stage.
     """
 
     pitch_x_mm: StageFigure

@@ -111,11 +111,11 @@ class SolverOptions:
         Save the standard deviation of each sample beside the planes of pmlem, joint and occlusion; see
         docs/quality.md for how often its intervals hold.
     prior
-        What is expected of a picture. tv: little, and total variation alone decides. patches: that small patches of it
-        repeat. learned: what a small network was trained with. auto: whichever of these predicts held-out views best,
-        mixed. Less noise and more detail remain, and the data keep the last word: see docs/explanation/priors.md. By
-        default auto for pmlem, joint and occlusion, but tv for sweeps, which take several times as long with auto. A
-        surface without this option has the picture of tv with detail added by a filter of patches.
+        Prior of the picture. tv: total variation alone. patches: small patches repeat. learned: a small trained
+        network. auto: the mixture of these that predicts held-out views best. Priors other than tv leave less noise and
+        more detail, and the data keep the last word: see docs/explanation/priors.md. By default auto for pmlem, joint
+        and occlusion, but tv for sweeps, which take several times as long with auto. A surface without this option has
+        the picture of tv with detail added by a filter of patches.
     proposal
         Save, beside each plane or the picture of a surface, what the prior proposed, and in standard deviations how far
         the data moved it.

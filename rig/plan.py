@@ -165,8 +165,7 @@ class CaptureStep(Struct, frozen=True, forbid_unknown_fields=True):
     at : {"grid", "centre"}
         All nodes, or the centre node only.
     lights : tuple of str, optional
-        Of the lights that the rig switches, the names of those that are on; all others are off. By default a person
-        sees to the light.
+        Names of the lights that are on, while all others are off. By default a person switches the light.
     until : Until, optional
         End of a step in rounds, which repeat the whole grid; for "dark_scene" at the grid.
 
@@ -212,7 +211,7 @@ class CaptureStep(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class CapturePlan(Struct, frozen=True, forbid_unknown_fields=True):
-    """A whole capture; it does not change once it is made.
+    """Plan of a whole capture. It does not change once it is made.
 
     `CapturePlan.of` makes it from a `Grid` and its steps.
 
@@ -225,7 +224,7 @@ class CapturePlan(Struct, frozen=True, forbid_unknown_fields=True):
     steps : tuple of CaptureStep
         The steps in order.
     approach_mm : float
-        Distance below a position at which an axis turns to arrive upwards.
+        Distance below a position at which an axis turns, so that it arrives from below.
     frame_bytes : int
         Size of a frame on disk.
     settle_s : float

@@ -77,12 +77,12 @@ class SettleSettings(Struct, frozen=True, forbid_unknown_fields=True):
     measure, exposure_s : bool, float
         Measure the rest once per session, from short frames after a move; exposure time of the short frames.
     limit_px, board_limit_px : float
-        Largest shift of the picture that does no harm; largest shift in board sweeps, whose corners fit to some
+        Largest shift of the picture that does no harm; largest shift in board sweeps, whose corners are found to some
         thousandths of a pixel.
     longest_s : float
         Duration of the measurement; there is a warning if the rig still swings at its end.
     wait_s : float
-        Rest for which the plan allows, and which is used if it is not measured.
+        Rest that the plan assumes, and that is used if it is not measured.
     """
 
     measure: bool = True
@@ -151,7 +151,7 @@ class DriftSettings(Struct, frozen=True, forbid_unknown_fields=True):
     Parameters
     ----------
     check, every_nodes : bool, int
-        Check for drift after every step over the grid; and after this many nodes as well, 0 means not.
+        Check for drift after every step over the grid; number of nodes after which to check as well, 0 for never.
     limit_mm : float
         Smallest drift that counts.
     """
@@ -178,8 +178,7 @@ class StepSettings(Struct, frozen=True, forbid_unknown_fields=True):
         Measured light of a flat step in photons per pixel and second, mean over the detector; it gives the quantum
         efficiency.
     lights : tuple of str, optional
-        Names of the lights that are on, while all others are off; by default a person sees to the light, and the rig
-        switches nothing.
+        Names of the lights that are on, while all others are off; by default a person switches the light, not the rig.
     until : Until, optional
         Repeat the whole grid until the planes will have this noise at the light that was measured; for `dark_scene`.
     """
@@ -225,7 +224,7 @@ class SceneSettings(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class RigSettings(Struct, frozen=True, forbid_unknown_fields=True):
-    """Content of a rig.toml, which describes the rig and its capture (docs/how-to/run_a_capture.md).
+    """`rig.toml`: the rig and its capture (docs/how-to/run_a_capture.md).
 
     Parameters
     ----------

@@ -132,8 +132,9 @@ def schema(
 ) -> Description:
     """Print the JSON Schema of a file that is read or written, or list the kinds of files.
 
-    A schema of a TOML file is that of its tables as JSON. Results name depths and light by their units: state these for
-    the results of a set without a scale or without photons.
+    A schema of a TOML file is that of its tables as JSON. Limits of the numbers in rig.toml are not in its schema: they
+    are checked when the file is read. Results name depths and light by their units: state these for the results of a
+    set without a scale or without photons.
 
     Parameters
     ----------

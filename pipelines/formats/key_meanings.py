@@ -14,9 +14,9 @@ def key_meanings(record: type) -> dict[str, str]:
 
     Fields described together have a part of the text each, between semicolons, or the whole in common.
 
-    >>> from faintfield import Noise
-    >>> key_meanings(Noise)["offset_dn"]
-    'Mean of a frame without light at zero exposure.'
+    >>> from faintfield import Grid
+    >>> key_meanings(Grid)["pitch_mm"]
+    'Distance of neighbouring nodes along both axes.'
     """
     meanings: dict[str, str] = {}
     for parent in reversed((get_origin(record) or record).__mro__):

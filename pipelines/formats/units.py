@@ -78,11 +78,11 @@ class Units(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
     Parameters
     ----------
     depth : {"mm", "relative", "disparity_px"}
-        What depths are stated in. "relative": poses are to scale, but the scale is not known. "disparity_px": only how
-        many pixels a point moves from one node to the next is known, right or down; lengths in the poses mean nothing.
+        Unit of depths. "relative": that of the poses, whose length is not known. "disparity_px": pixels by which a
+        point moves from one node to the next, right or down; lengths in the poses mean nothing.
     light : {"electrons", "dn", "relative"}
-        What light is stated in. "dn": values of the files, above the dark level, because the gain is not known or only
-        estimated. "relative": linear in light up to an unknown factor, 1 is white; the files had a tone curve.
+        Unit of light. "dn": values of the files above the dark level, as the gain is not known or only estimated.
+        "relative": proportional to light, with 1 for white, as the files had a tone curve.
     tone : {"srgb"}, optional
         Tone curve of the photographs that the views were made from; pictures are shown with it. Relative light always
         has that of sRGB.

@@ -290,7 +290,7 @@ def _surface_sources(
     what, length = "disparity" if surface.unit == "px" else "depth", "" if surface.unit == "relative" else surface.unit
     entries: tuple[tuple[Kind, str, str, str], ...] = (
         ("light", surface.picture, "picture", units.light_per_pixel),
-        ("sigma", surface.picture_sigma, "σ of the picture", units.light_per_pixel),
+        ("sigma", surface.picture_sigma, "σ of the light", units.light_per_pixel),
         ("depth", surface.depth, what, length),
         ("depth_sigma", surface.depth_sigma, f"σ of the {what}", length),
         ("confidence", surface.depth_confidence, f"probability of the {what}", ""),

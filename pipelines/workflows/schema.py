@@ -144,9 +144,12 @@ def records_of(part: object) -> Iterator[types.StructType | types.DataclassType]
 def _with_meanings(
     definition: Mapping[str, Any], record: types.StructType | types.DataclassType | None
 ) -> dict[str, Any]:
-    """Return the definition of a record with the meanings of its keys, or that of something else as it is."""
+    """Return a definition without the sections of a docstring, and that of a record with the meanings of its keys."""
+    definition = dict(definition)
+    if "description" in definition:
+        definition["description"] = SECTION.sub("", definition["description"])
     if record is None:
-        return dict(definition)
+        return definition
     meanings = key_meanings(record.cls)
     properties = {name: dict(part) for name, part in definition["properties"].items()}
     for field in record.fields:
@@ -154,8 +157,7 @@ def _with_meanings(
             properties[field.encode_name]["description"] = meanings[field.name]
     if isinstance(record, types.StructType) and record.tag_field:
         properties[record.tag_field]["description"] = "Kind of this table, which decides about its other keys."
-    description = SECTION.sub("", definition["description"])
-    return {**definition, "description": description, "properties": properties}
+    return {**definition, "properties": properties}
 
 
 def _in_units(definition: Mapping[str, Any], units: StatedUnits) -> dict[str, Any]:

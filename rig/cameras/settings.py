@@ -29,7 +29,7 @@ class CoolingSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         Temperature of the sensor that a capture waits for before the first frame of each step; by default it does not
         wait. The camera's own settings make it cool.
     settle_tolerance_c, settle_limit_s : float
-        Largest difference from it, and time limit for the wait.
+        Largest difference from `settle_temperature_c` that counts as reached; time limit for the wait.
     """
 
     settle_temperature_c: float | None = None
@@ -133,7 +133,8 @@ class AravisSettings(CoolingSettings, frozen=True, forbid_unknown_fields=True, t
     packet_bytes : int, optional
         Size of a network packet; by default as it is set in the camera.
     packet_socket : bool
-        Whether a network camera may be read through a packet socket, which loses fewer packets and needs rights.
+        True if a network camera may be read through a packet socket, which loses fewer packets and needs special
+        rights.
     answer_s : float
         Time limit for every operation, in addition to the exposure.
     """
@@ -176,7 +177,7 @@ class PluginSettings(MosaicSettings, frozen=True, forbid_unknown_fields=True, ta
     ----------
     name, options : str, dict
         Name of the entry point in the group `faintfield.cameras`, which is `backend` in rig.toml; the other keys of the
-        table, which the plug-in's own settings type checks.
+        table, which the plug-in checks.
     """
 
     name: str
@@ -197,12 +198,12 @@ class FolderSettings(MosaicSettings, frozen=True, forbid_unknown_fields=True, ta
     quiet_s : float
         Time without a change after which a file that cannot be decoded here, or that ends in zeros, is complete.
     silence_s : float
-        Time without a file, in addition to the exposure, that is waited for at each node before a frame: a program that
-        takes frames by itself, at intervals up to this, betrays itself meanwhile, and is refused.
+        Time without a new file, in addition to the exposure, for which the capture waits at each node before a frame. A
+        program that takes frames by itself, at intervals up to this time, is detected and refused.
     delay_s : float, optional
-        Of a program that takes frames by itself: longest time from the end of an exposure until its file appears. Files
-        that come sooner after a request are passed over, and no silence is waited for. By default the program is
-        triggered.
+        For a program that takes frames by itself: longest time from the end of an exposure until its file appears.
+        Files that come sooner after a request are ignored, and the capture does not wait for silence. By default the
+        program is triggered.
     file_times : bool
         Refuse a file that was last changed before the exposure could end; switch this off for a program that gives its
         files the camera's own time.
@@ -236,13 +237,15 @@ class SimulatedSettings(MosaicSettings, frozen=True, forbid_unknown_fields=True,
     size_px : (int, int)
         Width and height of a frame.
     lit_photons_per_s, unlit_photons_per_s : float
-        Photons on a pixel that sees a white object, with the lights on and almost off.
+        Photons per second on a pixel that sees a white object, with the lights on; the same with the lights almost off.
     read_noise_e, gain_dn_per_e, saturation_dn : float, float, int
-        Read noise, gain and highest value of the sensor; by default those of the paper.
+        Read noise of the sensor, by default that of the paper; its gain, by default that of the paper; its highest
+        value, by default that of the paper.
     position_error_mm, rotation_error_mrad : float
-        Standard deviation, per axis, of the camera's pose from where the motors are.
+        Standard deviation per axis of the camera's position about that of the motors; standard deviation per axis of
+        its rotation.
     scale_error, squareness_mrad : float
-        Relative error of distances along x, and the angle by which y deviates from a right angle.
+        Relative error of distances along x; angle between the axes less a right angle.
     start_temperature_c : float, optional
         Temperature of the sensor when the camera is switched on, from which it cools; by default it is cool already.
     cooling_s : float

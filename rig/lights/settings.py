@@ -23,7 +23,7 @@ class _LightSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     name : str
         Name by which steps list the light.
     steady_s : float
-        Time after switching it until its light is steady, or until a shutter is open or closed.
+        Time after switching until the light is steady, or until a shutter is open or closed.
     """
 
     name: str
@@ -44,7 +44,7 @@ class ControllerSettings(_LightSettings, frozen=True, forbid_unknown_fields=True
     output, number : str, int
         `flood`, `mist` or `spindle` with GRBL and grblHAL, `pin` or `fan` with Marlin; number of the pin or fan.
     level : float, optional
-        Value (S) that switches it on; by default 1000 for the spindle, and 255 for pins and fans.
+        Value (S) that switches the light on; by default 1000 for the spindle, and 255 for pins and fans.
     """
 
     output: OutputKind
@@ -69,11 +69,12 @@ class CommandSettings(_LightSettings, frozen=True, forbid_unknown_fields=True, t
     Parameters
     ----------
     on, off : tuple of str
-        Program and arguments that switch the light on; those that switch it off. There is no shell.
+        Program and arguments that switch the light on; program and arguments that switch the light off, without a
+        shell.
     state : tuple of str
         Program and arguments that print `on` or `off`, or 1 or 0; by default the light is not read back.
     limit_s : float
-        Time limit of each.
+        Time limit of each of these programs.
     """
 
     on: tuple[str, ...]

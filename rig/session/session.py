@@ -36,7 +36,7 @@ _MAX_PLAN_BYTES = 32_000_000
 
 
 class FrozenPlan(Struct, frozen=True, forbid_unknown_fields=True):
-    """Content of plan.json: the plan of a capture, the rig that it was made for, and the version of the format.
+    """`plan.json`: the plan of a capture, the rig that it was made for, and the version of the format.
 
     Attributes
     ----------

@@ -16,7 +16,7 @@ MIN_HOMING_BOUND_S = 240.0
 
 
 class Point(NamedTuple):
-    """A position on the stage, in machine coordinates.
+    """A position (x, y) on the stage in mm, in machine coordinates.
 
     Parameters
     ----------
@@ -297,15 +297,15 @@ class StageSettings(Struct, frozen=True, forbid_unknown_fields=True):
     feed_mm_per_min : float, optional
         Speed of motions; by default the highest rate of the slower axis.
     approach_mm : float
-        How far an axis goes past a position to arrive from below; must exceed the play of the drive.
+        Distance by which an axis goes past a position to arrive from below; it must exceed the play of the drive.
     travel_mm : Box, optional
         Allowed positions, if the controller allows more or does not report its travel.
     keep_out : tuple of Box
         Boxes that the stage must neither enter nor cross.
     reconnect_s : float
-        How long to wait for a port that was lost, such as one that USB lists anew.
+        Time to wait for a port that was lost, such as one that USB lists anew.
     options : dict
-        The other keys of the table, for "micromanager" and plug-ins, whose settings types check them.
+        The other keys of the table, for "micromanager" and plug-ins, which check them.
 
     Raises
     ------

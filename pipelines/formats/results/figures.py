@@ -215,7 +215,7 @@ class Metrics(Struct, frozen=True, kw_only=True):
     snr : SnrRecord, optional
         Signal-to-noise ratio of the set.
     photons_per_px : PhotonsRecord, optional
-        Photons of the set.
+        Photons per pixel of the set.
     """
 
     geometry: GeometryErrors | UnsetType = UNSET

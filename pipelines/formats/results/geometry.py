@@ -59,7 +59,7 @@ class LensRecord(Struct, frozen=True):
     fx_px, fy_px : float
         Focal length along x and y.
     cx_px, cy_px : float
-        Principal point; the centre of the first pixel is (0, 0).
+        Principal point along x and y, where the centre of the first pixel is (0, 0).
     distortion : tuple of float
         Distortion coefficients in OpenCV's order: k1, k2, p1, p2, k3, k4, k5, k6, as many as the model has.
     sigma : tuple of float
@@ -198,7 +198,7 @@ class PosesOfSession(CameraPoses, frozen=True, kw_only=True):
 
 
 class BoardRecord(Struct, frozen=True):
-    """A board as it stood during a sweep.
+    """A board during one sweep.
 
     Attributes
     ----------
@@ -213,13 +213,13 @@ class BoardRecord(Struct, frozen=True):
     first_marker_id : int
         Number of the first marker in the dictionary.
     sweep : int
-        Number of the sweep in which it stood there.
+        Number of the sweep.
     rt_ref_board : tuple of float
         Rodrigues vector in rad and translation in mm, from the board's frame to the reference camera's.
     warp_mm : (float, float)
         Height of the bulge at the middle of the board, along x and along y.
     homing : int, optional
-        Number of the homing that came before, if a homing shifted the cameras within the sweep.
+        Number of the last homing before, if a homing shifted the cameras within the sweep.
     """
 
     name: str
@@ -254,9 +254,9 @@ class GeometryOptions(Struct, frozen=True):
 
 
 class GeometryRecord(CameraPoses, frozen=True, kw_only=True):
-    """`geometry.json` whole: the lens and the poses, how well they are known, and how they were found.
+    """`geometry.json`: lens and poses, how well they are known, and how they were found.
 
-    It vouches for the files beside it, by SHA-256; those of earlier versions do not.
+    It holds the SHA-256 of the files beside it; records of earlier versions do not.
 
     Attributes
     ----------

@@ -120,7 +120,7 @@ class FitRecord(Struct, frozen=True):
 
 
 class EmvaImageRecord(Struct, frozen=True):
-    """Series whose mean image shows DSNU or PRNU.
+    """Series whose mean image gives DSNU or PRNU.
 
     Attributes
     ----------
@@ -198,7 +198,7 @@ class NoiseFrame(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=
     file : str
         Name of the image.
     kind : {"dark", "flat"}
-        A dark has the lens covered, a flat is evenly lit.
+        Kind of the frame: a dark has the lens covered, a flat is evenly lit.
     exposure_s : float, optional
         Exposure time; that of a raw file may come from its EXIF.
     temperature_c : float, optional
@@ -353,7 +353,7 @@ class NoiseRecord(_StandardQuantities, frozen=True, kw_only=True):
     likelihood : str
         Name of the likelihood that was maximised; with a mosaic, the names of all phases.
     saturation_dn : Estimate or float, optional
-        Value from which a pixel is saturated, stated or found; of the phase that saturates first.
+        Value from which a pixel is saturated, stated or found; with a mosaic, that of the phase that saturates first.
     size_px : (int, int), optional
         Width and height of the frames.
     mosaic : tuple of str, optional

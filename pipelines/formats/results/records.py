@@ -228,7 +228,7 @@ class PlaneRecord(Struct, frozen=True, kw_only=True):
     likelihood : str, optional
         Name of the noise model of a pixel.
     occlusion : bool, optional
-        True if planes hide those behind them. False: that explained the images no better.
+        True if planes hide those behind them; false if this did not explain the images better.
     occlusion_left_out : str, optional
         Reason why no plane hides another.
     prior : PriorRecord, optional
@@ -336,7 +336,7 @@ class FocusCurve(Struct, frozen=True, kw_only=True):
 
 
 class BestFocusRecord(Struct, frozen=True):
-    """Search by `--depth-mm auto` for depths of best focus.
+    """Search by `--depth auto` for depths of best focus.
 
     Attributes
     ----------
@@ -357,7 +357,7 @@ class BestFocusRecord(Struct, frozen=True):
     z_shuffled : float, optional
         Standard deviations of the shuffled views by which the stated places agree better than their mean.
     shuffles : int, optional
-        Number of times that views were exchanged between their places.
+        Number of times that the views were shuffled among their places.
     """
 
     depth_mm: list[float]
@@ -456,7 +456,7 @@ class ReconstructionOptions(SolverOptions, _Planes):
 
 
 class PlaneFileRecord(Provenance[ReconstructionOptions], frozen=True):
-    """The record beside a plane (`plane_00500.0.json`), which vouches for its files.
+    """The record beside a plane (`plane_00500.0.json`), with the SHA-256 of its files.
 
     Attributes
     ----------
@@ -485,7 +485,7 @@ class PlaneFileRecord(Provenance[ReconstructionOptions], frozen=True):
 
 
 class DepthMapFileRecord(Provenance[ReconstructionOptions], frozen=True):
-    """`depth_map.json`, which vouches for the maps beside it.
+    """`depth_map.json`, with the SHA-256 of the maps beside it.
 
     Attributes
     ----------

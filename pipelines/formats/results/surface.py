@@ -207,13 +207,14 @@ class SurfaceRecord(SurfaceFacts, frozen=True, kw_only=True):
     Attributes
     ----------
     picture, picture_sigma : str
-        Name of the TIFF with the light of each sample; name of the TIFF with the standard deviation of that light.
+        Name of the TIFF with the light of each sample; name of the TIFF with the standard deviation of that light, for
+        known depths and total variation.
     picture_proposal, picture_moved : str, optional
         Name of the TIFF with the light that the prior proposed; name of the TIFF with picture less proposal, in
         standard deviations of the noise.
     depth, depth_sigma : str
         Name of the TIFF with the depth of each sample in `unit`, NaN where it is not known; name of the TIFF with the
-        standard deviation of that depth.
+        standard deviation of that depth in `unit`, by `depth_confidence`.
     depth_confidence : str
         Name of the TIFF with the probability that each depth is right within 2 %.
     visibility : str
@@ -301,7 +302,7 @@ class SurfaceRecord(SurfaceFacts, frozen=True, kw_only=True):
 
 
 class SurfaceFileRecord(Provenance[SurfaceOptions], frozen=True):
-    """`surface.json`, which vouches for its `files`.
+    """`surface.json`, with the SHA-256 of its files.
 
     Attributes
     ----------

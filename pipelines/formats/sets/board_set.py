@@ -32,7 +32,7 @@ type _Index = Annotated[int, Meta(ge=0, le=MAX_NODE)]
 
 
 class BoardEntry(BoardSettings, frozen=True, kw_only=True):
-    """One `[[board]]`, which states its dictionary: another one than that printed would be found nowhere."""
+    """One `[[board]]`. Its dictionary must be the printed one: markers of another are not found."""
 
     dictionary: str
 
@@ -49,7 +49,7 @@ class ImageEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sweep : int
         Number of the sweep, during which no board moves.
     homing : int
-        Number of homings of the stage before; frames before and after one may be shifted.
+        Number of homings of the stage before the image; a homing may shift all later images.
     """
 
     file: str

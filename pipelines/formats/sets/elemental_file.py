@@ -27,13 +27,14 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defau
     size_px : (int, int)
         Width and height of the detector.
     fx_px, fy_px, cx_px, cy_px : float
-        Focal lengths and principal point; the centre of the first pixel is (0, 0).
+        Focal length along x; focal length along y; column of the principal point, where the centre of the first pixel
+        is 0; row of the principal point, likewise.
     distortion : tuple of float
         k1, k2, p1, p2, k3, k4, k5, k6 in OpenCV's order; may be shorter.
     mosaic : tuple of str, optional
         Colour filters, row by row, such as ["RG", "GB"]; raw files state their own.
     flat : str, optional
-        Image of the relative response of each pixel, a file in the folder.
+        Name of the image with the relative response of each pixel, in the folder of the set.
     """
 
     size_px: tuple[int, int]
@@ -57,7 +58,7 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defau
 
 
 class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """The `[noise]` table: noise of the sensor. In its place may stand the name of a `noise.json`.
+    """The `[noise]` table: noise of the sensor. The name of a `noise.json` may take its place.
 
     Parameters
     ----------
@@ -66,13 +67,13 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
     offset_dn : float, optional
         Dark level; by default that of the masked pixels of a raw file.
     dark_current_e_per_s : float
-        Dark electrons of a pixel and second.
+        Dark current of a pixel in electrons per second.
     quantum_efficiency : float, optional
         Electrons per photon; without it no result is given in photons.
     saturation_dn : float, optional
         Value from which a pixel is saturated; by default that of a raw file, and none for other images.
     estimated : bool
-        Nobody measured gain or read noise: an import estimated them from the views, or assumed them.
+        True if gain or read noise was not measured: an import estimated it from the views, or assumed it.
     """
 
     gain_dn_per_e: float
@@ -100,7 +101,7 @@ class View(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
     repeats : tuple of str
         Further frames of the view, added to the first.
     homing : int
-        Number of homings of the stage before; measured poses are shifted by what `faintfield geometry` found of each.
+        Number of homings of the stage before the view; measured poses are shifted as `faintfield geometry` found.
     """
 
     image: str
@@ -113,32 +114,34 @@ class View(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
 
 
 class Arrangement(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """The `[arrangement]` table: what an import found in the pictures of a grid.
+    """The `[arrangement]` table: arrangement of a grid of pictures, as an import found it.
 
     Parameters
     ----------
     disparity_range_px : (float, float), optional
-        Least and largest disparity of the scene: how far points move from one node to the next, right, and
-        down, too, unless rows are nearer or farther from one another than columns.
+        Least and largest disparity of the scene: pixels by which points move from one node to the next, right or down.
     told_by : {"pictures", "signs", "names", "options"}
-        What told where rows and columns begin: parts that near objects hide; the sign of all disparities, negative
-        where pictures are not aligned; only the names of the files; options of the command.
+        Source of the order of rows and columns. "pictures": parts that near objects hide. "signs": the sign of all
+        disparities, negative where pictures are not aligned. "names": only the names of the files. "options": options
+        of the command.
     transposed, rows_flipped, columns_flipped : bool
-        The first number of a name is the column; rows were reversed to run down; columns were reversed to run right.
+        True if the first number of a name is the column; true if rows were reversed to run down; true if columns were
+        reversed to run right.
     aligned : bool, optional
-        The pictures are aligned (rectified) on a plane in the scene; None where nothing was seen.
+        True if the pictures are aligned (rectified) on a plane in the scene; left out if this is not known.
     pitch_ratio : float
-        Pitch along columns over pitch along rows. The range of disparities is that down a column of the grid.
+        Pitch along columns over pitch along rows. If it is not 1, the range of disparities is that down a column of the
+        grid.
     missing : tuple of (int, int)
         Nodes without a view.
     odd_views : tuple of str
-        Pictures that fit none of their neighbours, and were left out.
+        Pictures that were left out, as they fit none of their neighbours.
     turn_deg : float
-        Largest rotation of a view about its axis, against the others.
+        Largest rotation of a view about its axis, relative to the others.
     relative_light : tuple of float
-        Mean of each view's picture over their median, where they differ.
+        Mean light of each view over the median of all views; empty if they do not differ.
     irregular : bool
-        Views are shifted, turned or magnified against those of a regular grid.
+        True if views are shifted, turned or magnified, compared with a regular grid.
     """
 
     disparity_range_px: tuple[float, float] | None = None
@@ -156,7 +159,7 @@ class Arrangement(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
 
 
 class ElementalSetFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """The whole of `elemental.toml`.
+    """`elemental.toml`: views with lens, poses and noise.
 
     Parameters
     ----------
@@ -167,7 +170,7 @@ class ElementalSetFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     reference_view : int
         Number of the view whose camera is the reference frame, from 0.
     units, arrangement, camera, view : Units, Arrangement, Camera, list of View
-        Units of the set; what an import found about the grid; camera and lens; the views.
+        Units of the set; arrangement of the grid, as an import found it; camera and lens; the views.
     noise : Noise or str
         A table, or the name of a `noise.json` in the folder.
     """

@@ -60,7 +60,7 @@ class TrueSurface(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Truth(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """`truth.json`; file names are relative to the set. A scene consists of flat objects or is one surface.
+    """`truth.json`: the simulated scene, flat objects or one surface; file names are relative to the set.
 
     Attributes
     ----------

@@ -46,7 +46,7 @@ class Region(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Parameters
     ----------
     rows, columns : (int, int)
-        First number and end, which is not part of it.
+        First row and the row after the last; first column and the column after the last.
     """
 
     rows: tuple[int, int]
@@ -54,7 +54,7 @@ class Region(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class NoiseSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """`noise.toml`; what follows the frames states what the image files do not.
+    """`noise.toml`: frames, and facts that the image files do not state.
 
     Parameters
     ----------
@@ -69,7 +69,8 @@ class NoiseSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
     region : Region, optional
         Part of the image that is measured; all of it by default.
     dark_current_doubling_k : float, optional
-        Kelvins over which dark current doubles; the dark current is then that at the mean temperature of the frames.
+        Temperature difference in kelvin that doubles the dark current; with it, the dark current is that at the mean
+        temperature of the frames.
     """
 
     format: Literal[1]

@@ -308,7 +308,7 @@ def test_viewer_shows_surface_with_its_uncertainty(surface: Path, done: Command)
     pictures = {picture["label"]: picture for picture in viewer["pictures"]}
     depth, picture = pictures["depth"], pictures["picture"]
     assert viewer["pictures"][viewer["first"][1]] == picture
-    assert viewer["pictures"][picture["sigma"]]["label"] == "σ of the picture"
+    assert viewer["pictures"][picture["sigma"]]["label"] == "σ of the light"
     assert viewer["pictures"][depth["sigma"]]["label"] == "σ of the depth"
     assert viewer["pictures"][depth["confidence"]]["label"] == "probability of the depth"
     assert (depth["unit"], depth["sure_above"]) == ("mm", 0.9)
