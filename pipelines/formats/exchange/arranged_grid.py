@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
@@ -11,6 +12,7 @@ from rich.table import Table
 from faintfield.calib.arrangement.inspection import MIN_SIDE_PX, GridInspection, inspect_grid
 from faintfield.calib.arrangement.matching import SURE, Array
 from faintfield.calib.arrangement.views import Node, Orientation, prepare_pictures
+from faintfield.calib.lens import Lens
 from faintfield.pipelines.console import console, inform
 from faintfield.pipelines.errors import AmbiguousOrder, CameraTurned, CopiedPicture, NotOneScene, ShuffledPictures
 from faintfield.pipelines.formats.exchange.image_grid import ImageGrid
@@ -64,19 +66,30 @@ def _read_grey(path: Path, size_px: tuple[int, int]) -> NDArray[np.float32]:
     return np.asarray(np.repeat(np.repeat(periods.mean(axis=(1, 3)), rows, 0), columns, 1), np.float32)
 
 
+def _undistorter(lens: Lens) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
+    """Return a function that shows pictures as a pinhole of the lens's focal length and principal point sees them."""
+    if not any(lens.distortion):
+        return lambda picture: picture
+    matrix, distortion = lens.camera_matrix(), np.pad(lens.distortion, (0, 8 - len(lens.distortion)))
+    maps = cv2.initUndistortRectifyMap(matrix, distortion, None, matrix, lens.size_px, cv2.CV_32FC1)
+    return lambda picture: np.asarray(
+        cv2.remap(picture, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32
+    )
+
+
 def arrange_grid(
     grid: ImageGrid,
     prescribed: Orientation | None,
     *,
     white: float,
-    size_px: tuple[int, int],
     aligned: bool = False,
-    lens: str,
+    lens: Lens,
 ) -> tuple[ImageGrid, Arrangement]:
     """Inspect the pictures of a grid, put them in order, and print what they show.
 
     If options prescribe the order, the pictures are only measured. `white` is the value of a white pixel; `aligned`
-    says that a person stated that the pictures are aligned, so that disparities may have any sign; `lens` is printed.
+    says that a person stated that the pictures are aligned, so that disparities may have any sign; the distortion of
+    the lens is undone before pictures are compared.
 
     Raises
     ------
@@ -84,7 +97,8 @@ def arrange_grid(
         The pictures are no views of one scene from a grid, or do not tell which.
     """
     paths = list(grid.paths.values())
-    pictures = prepare_pictures(_read_grey(path, size_px) for path in paths)
+    undistort = _undistorter(lens)
+    pictures = prepare_pictures(undistort(_read_grey(path, lens.size_px)) for path in paths)
     if copies := pictures.copies():
         first, second = (paths[index] for index in copies[0])
         count = len({index for pair in copies for index in pair})
@@ -232,7 +246,7 @@ def _options(orientation: Orientation) -> str:
     return " ".join(option for name, option in flags.items() if getattr(orientation, name))
 
 
-def _print_table(grid: ImageGrid, record: Arrangement, inspection: GridInspection, lens: str) -> None:
+def _print_table(grid: ImageGrid, record: Arrangement, inspection: GridInspection, lens: Lens) -> None:
     counts = [*zip(grid.size, ("row", "column"), strict=True), (len(grid.paths), "view")]
     rows, columns, views = (f"{count} {noun}{'s' * (count != 1)}" for count, noun in counts)
     lines = {"grid": f"{rows} x {columns}, {views}", "order": "as in the names: the pictures do not tell"}
@@ -254,7 +268,9 @@ def _print_table(grid: ImageGrid, record: Arrangement, inspection: GridInspectio
             lines["pitch"] = f"columns {record.pitch_ratio:.3f} times as far apart as rows"
         if record.relative_light:
             lines["light"] = f"{min(record.relative_light):.2f} … {max(record.relative_light):.2f} of the typical view"
-    lines["lens"] = lens
+    centred = [lens.cx_px, lens.cy_px] == [(side - 1) / 2 for side in lens.size_px]
+    ideal = "ideal, no distortion, centred: state another by --distortion, --cx-px, --cy-px"
+    lines["lens"] = ideal if centred and not any(lens.distortion) else "as stated"
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     for heading, text in lines.items():
         table.add_row(heading, text)
