@@ -119,16 +119,21 @@ def compare_neighbours(pictures: Mapping[Node, Picture], range_px: tuple[float, 
     offset, turn, magnification = zip(quantities[:3], quantities[3:], strict=True)
 
     def per_view(quantity: tuple[Array, Array], chosen: NDArray[np.bool_]) -> tuple[Array, Array]:
-        """Return a value (view,) for each view, and its error, from those of pairs; the median value is zero."""
+        """Return a value (view,) for each view, and its error, from those of pairs.
+
+        Pairs tell nothing of the typical value of views that they link: its median is zero.
+        """
         first, second = table[chosen, :2].astype(int).T
         views = np.arange(len(pictures))
         design = (second[:, np.newaxis] == views) * 1.0 - (first[:, np.newaxis] == views)
         value, sigma = (column[chosen] for column in quantity)
         solution = _fit_robustly(design, value, 1 / sigma)
         normal = (design / sigma[:, np.newaxis] ** 2).T @ design
-        # Free are the means of parts that no pair links; their least norm has no error
         variance = np.diag(np.linalg.pinv(normal, rcond=1e-9, hermitian=True))
-        return solution - np.median(solution), np.sqrt(np.maximum(variance, 0.0))
+        part = _parts(len(views), first, second)
+        for linked in part == np.unique(part)[:, np.newaxis]:
+            solution[linked] -= np.median(solution[linked])
+        return solution, np.sqrt(np.maximum(variance, 0.0))
 
     # Pairs of a column tell of x, pairs of a row of y
     (x_px, x_sigma_px), (y_px, y_sigma_px) = (per_view(offset, good & (axes == axis)) for axis in (1, 0))
@@ -209,12 +214,17 @@ def _find_odd(count: int, pairs: Array) -> tuple[NDArray[np.bool_], list[int]]:
     ends, score, chance = pairs[:, :2].astype(int), pairs[:, 3], pairs[:, 4]
     if len(pairs) and np.quantile(score, 0.75) - np.median(chance) >= _LEAST_WAY:
         good = score > (1 - _FITS) * np.median(chance) + _FITS * np.quantile(score, 0.75)
-        links = coo_matrix((np.ones(good.sum()), ends[good].T), shape=(count, count))
-        part = connected_components(links, directed=False)[1]
+        part = _parts(count, *ends[good].T)
         largest = int(np.argmax(np.bincount(part)))
         odd = [int(view) for view in np.unique(ends) if part[view] != largest]
         good &= part[ends[:, 0]] == largest
     return good, odd
+
+
+def _parts(count: int, first: NDArray[np.intp], second: NDArray[np.intp]) -> NDArray[np.int32]:
+    """Return the number (view,) of the part to which each view is linked by pairs."""
+    links = coo_matrix((np.ones(len(first)), (first, second)), shape=(count, count))
+    return np.asarray(connected_components(links, directed=False)[1], np.int32)
 
 
 @dataclass(frozen=True)

@@ -215,14 +215,14 @@ def _refuse_unfit(inspection: GridInspection, paths: Sequence[Path], *, prescrib
         raise ShuffledPictures(
             f"{folder}: the neighbours of a picture, by the names, fit it better than {inspection.order.share:.0%} of "
             "the others do, and in a light field better than nearly all do; give views of one scene in the order of "
-            "the grid, by their names, by --pattern, or by --rows and --columns"
+            "the grid, by their names, by --pattern, or by --rows and --columns; if you are sure of it, --keep-order"
         )
     (least, largest), orientation = inspection.range_px, inspection.orientation
     if inspection.undecided and not (aligned and not orientation.opposed):
         options, other = _options(orientation), _options(orientation.turned())
-        remedy = f"{other}, or --disparity-px if they are aligned on a plane nearer than the scene"
-        if orientation.opposed:
-            remedy = f"{options} or {other}"
+        remedy = f"{options or '--keep-order'} or {other or '--keep-order'}"
+        if not orientation.opposed:
+            remedy = f"{remedy}, or --disparity-px if they are aligned on a plane nearer than the scene"
         by_name = "the order of the names"
         raise AmbiguousOrder(
             f"{folder}: two orders of the views are equally likely: disparities of {least:.2f} … {largest:.2f} px with "

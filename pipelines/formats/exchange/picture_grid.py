@@ -87,7 +87,7 @@ def import_pictures(src: Path, out: Path, options: GridOptions) -> ImportedGrid:
         white = float(first.saturation_dn or np.iinfo(first.pixels_dn.dtype).max)
         grid, arrangement = arrange_grid(
             views,
-            prescribed if prescribed != Orientation() else None,
+            prescribed if options.keep_order or prescribed != Orientation() else None,
             white=white if views.dn_per_value is None else np.inf,  # floats state no white
             aligned=bool(disparity_px),
             lens=lens,
