@@ -185,8 +185,8 @@ class Lens:
         if not miss_px <= _ROUND_TRIP_PX:
             raise LensNotInvertible(
                 f"distortion {self.distortion} cannot be undone over the {self.size_px[0]} x {self.size_px[1]} px "
-                f"detector: off by {miss_px:.3g} px, limit {_ROUND_TRIP_PX} px; calibrate with boards that reach the "
-                "corners, or crop"
+                f"detector: off by {miss_px:.3g} px, limit {_ROUND_TRIP_PX} px; correct signs and order (k1, k2, p1, "
+                "p2, k3 …) of numbers typed by hand, calibrate with boards that reach the corners, or crop"
             )
         return rays
 

@@ -160,7 +160,11 @@ def inspect_grid(
         contradicted=prescribed is not None and _contradict(prescribed, axes, side_z),
         disparity_px=(least_px * pictures.fine_scale, largest_px * pictures.fine_scale),
         ratio=ratio,
-        fits=replace(fits, shift_px=fits.shift_px * pictures.fine_scale),
+        fits=replace(
+            fits,
+            shift_px=fits.shift_px * pictures.fine_scale,
+            shift_sigma_px=fits.shift_sigma_px * pictures.fine_scale,
+        ),
         order=check_order(fitting, axes, coarse_px),
     )
 

@@ -27,6 +27,12 @@ _MOST_STEPS = 3
 # Every so many blocks the match by chance is measured, too.
 _CHANCE_BLOCKS = 8
 
+# Least mean error of a block's displacement, px: interpolated peaks are no better.
+_LEAST_ERROR_PX = 0.02
+
+# Standard deviation of normal errors over the mean of their absolute values, and of a median over that of a mean.
+_SIGMA_OF_MEAN, _SIGMA_OF_MEDIAN = 1.25, 1.25
+
 # Rounds of reweighting, in which pairs and blocks that disagree lose their weight.
 _ROUNDS = 8
 
@@ -61,12 +67,17 @@ class NeighbourFits:
         Rotation and magnification of each view against the typical one.
     shift_px : array (view, 2)
         Displacement x, y of each view against its neighbours, beyond what disparities explain.
+    turn_sigma_rad, magnification_sigma, shift_sigma_px : array (view,), array (view,), array (view, 2)
+        Their standard errors, which blocks without detail enlarge.
     """
 
     odd: list[int] = field(default_factory=list)
     turn_rad: Array = field(default_factory=lambda: np.zeros(1))
     magnification: Array = field(default_factory=lambda: np.ones(1))
     shift_px: Array = field(default_factory=lambda: np.zeros((1, 2)))
+    turn_sigma_rad: Array = field(default_factory=lambda: np.zeros(1))
+    magnification_sigma: Array = field(default_factory=lambda: np.zeros(1))
+    shift_sigma_px: Array = field(default_factory=lambda: np.zeros((1, 2)))
 
     @property
     def shift_rms_px(self) -> float:
@@ -75,13 +86,16 @@ class NeighbourFits:
 
 
 class PairFit(NamedTuple):
-    """Median correlation of the blocks of two neighbours, and how displacements across the step run."""
+    """Median correlation of the blocks of two neighbours, and how displacements across the step run, with errors."""
 
     score: float
     chance: float
     offset_px: float
     turn_rad: float
     magnification: float
+    offset_sigma_px: float
+    turn_sigma_rad: float
+    magnification_sigma: float
 
 
 def compare_neighbours(pictures: Mapping[Node, Picture], range_px: tuple[float, float], ratio: float) -> NeighbourFits:
@@ -101,19 +115,32 @@ def compare_neighbours(pictures: Mapping[Node, Picture], range_px: tuple[float, 
             pairs.append((places[node], places[other], axis, *fit))
     table = np.array(pairs).reshape(-1, 3 + len(PairFit._fields))
     good, odd = _find_odd(len(pictures), table)
-    _, _, axes, _, _, offset_px, turn_rad, magnification = table.T
+    _, _, axes, _, _, *quantities = table.T
+    offset, turn, magnification = zip(quantities[:3], quantities[3:], strict=True)
 
-    def per_view(values: Array, chosen: NDArray[np.bool_]) -> Array:
-        """Return a value (view,) for each view from the differences of pairs; the median is zero."""
+    def per_view(quantity: tuple[Array, Array], chosen: NDArray[np.bool_]) -> tuple[Array, Array]:
+        """Return a value (view,) for each view, and its error, from those of pairs.
+
+        Pairs tell nothing of the typical value of views that they link: its median is zero.
+        """
         first, second = table[chosen, :2].astype(int).T
         views = np.arange(len(pictures))
         design = (second[:, np.newaxis] == views) * 1.0 - (first[:, np.newaxis] == views)
-        solution = _fit_robustly(design, values[chosen], np.ones(len(design)))
-        return np.asarray(solution - np.median(solution), np.float64)
+        value, sigma = (column[chosen] for column in quantity)
+        solution = _fit_robustly(design, value, 1 / sigma)
+        normal = (design / sigma[:, np.newaxis] ** 2).T @ design
+        variance = np.diag(np.linalg.pinv(normal, rcond=1e-9, hermitian=True))
+        part = _parts(len(views), first, second)
+        for linked in part == np.unique(part)[:, np.newaxis]:
+            solution[linked] -= np.median(solution[linked])
+        return solution, np.sqrt(np.maximum(variance, 0.0))
 
     # Pairs of a column tell of x, pairs of a row of y
-    shift_px = np.column_stack([per_view(offset_px, good & (axes == axis)) for axis in (1, 0)])
-    return NeighbourFits(odd, per_view(turn_rad, good), 1 + per_view(magnification, good), shift_px)
+    (x_px, x_sigma_px), (y_px, y_sigma_px) = (per_view(offset, good & (axes == axis)) for axis in (1, 0))
+    turn_rad, turn_sigma_rad = per_view(turn, good)
+    growth, growth_sigma = per_view(magnification, good)
+    shift_px, shift_sigma_px = np.column_stack([x_px, y_px]), np.column_stack([x_sigma_px, y_sigma_px])
+    return NeighbourFits(odd, turn_rad, 1 + growth, shift_px, turn_sigma_rad, growth_sigma, shift_sigma_px)
 
 
 def compare_pair(view: Picture, other: Picture, axis: int, range_px: tuple[float, float]) -> PairFit | None:
@@ -146,9 +173,23 @@ def compare_pair(view: Picture, other: Picture, axis: int, range_px: tuple[float
         return None
     score, offset_px, along_px, across_px = np.array(matches).T
     design = np.column_stack([np.ones_like(along_px), along_px, across_px])
-    constant, turn, magnification = map(float, _fit_robustly(design, offset_px, np.maximum(score, 0.0)))
+    weight = np.maximum(score, 0.0)
+    solution = _fit_robustly(design, offset_px, weight)
+    constant, turn, magnification = solution.tolist()
     turn = turn if axis == 0 else -turn
-    return PairFit(float(np.median(score)), float(np.median(chance)), constant, turn, magnification)
+    sigmas = _standard_errors(design, np.abs(offset_px - design @ solution), weight)
+    return PairFit(float(np.median(score)), float(np.median(chance)), constant, turn, magnification, *sigmas)
+
+
+def _standard_errors(design: Array, residual: Array, weight: Array) -> list[float]:
+    """Return the standard errors of the solution by the mean size of the residuals; large where it is free."""
+    count, parameters = design.shape
+    relative = weight / (weight.mean() or 1.0)
+    per_equation = max(float(np.mean(relative * residual)), _LEAST_ERROR_PX) * _SIGMA_OF_MEAN * _SIGMA_OF_MEDIAN
+    normal = design.T @ (design * relative[:, np.newaxis])
+    normal += 1e-9 * (float(np.trace(normal)) + 1.0) * np.eye(parameters)
+    variance = per_equation**2 * count / max(count - parameters, 1) * np.diag(np.linalg.inv(normal))
+    return list(np.sqrt(variance).tolist())
 
 
 def _fit_robustly(design: Array, value: Array, weight: Array) -> Array:
@@ -173,12 +214,17 @@ def _find_odd(count: int, pairs: Array) -> tuple[NDArray[np.bool_], list[int]]:
     ends, score, chance = pairs[:, :2].astype(int), pairs[:, 3], pairs[:, 4]
     if len(pairs) and np.quantile(score, 0.75) - np.median(chance) >= _LEAST_WAY:
         good = score > (1 - _FITS) * np.median(chance) + _FITS * np.quantile(score, 0.75)
-        links = coo_matrix((np.ones(good.sum()), ends[good].T), shape=(count, count))
-        part = connected_components(links, directed=False)[1]
+        part = _parts(count, *ends[good].T)
         largest = int(np.argmax(np.bincount(part)))
         odd = [int(view) for view in np.unique(ends) if part[view] != largest]
         good &= part[ends[:, 0]] == largest
     return good, odd
+
+
+def _parts(count: int, first: NDArray[np.intp], second: NDArray[np.intp]) -> NDArray[np.int32]:
+    """Return the number (view,) of the part to which each view is linked by pairs."""
+    links = coo_matrix((np.ones(len(first)), (first, second)), shape=(count, count))
+    return np.asarray(connected_components(links, directed=False)[1], np.int32)
 
 
 @dataclass(frozen=True)

@@ -139,7 +139,7 @@ def _light_in_found_range(folds: Folds, posed: PosedViews, searched: tuple[float
         with working("searching the range of depths"):
             limits = found_range(posed.binned(_RANGE_BINS).views, *searched)
     except NothingInFocus as failure:
-        raise NothingInFocus(f"{failure}; or give the range by --depth-range NEAR:FAR") from failure
+        raise NothingInFocus(f"{failure}; or give the range by `faintfield align --depth-range NEAR:FAR`") from failure
     return SurfaceLight(folds, limits, searched)
 
 

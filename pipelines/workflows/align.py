@@ -141,11 +141,12 @@ def _refusal(alignment: Alignment, gain: HeldOutGain, plausible: PoseErrors, opt
             f"the poses stay as they are: they would be wrong by {1e3 * prior.sigma_rad:.3g} mrad and "
             f"{prior.sigma_mm:.3g} in the unit of the poses, {excess:.0f} times what is plausible; the depths may be "
             "wrong, or the pictures show what does not move with the scene, such as a vignette or stray light; if "
-            "errors are that large, state --rotation-error-mrad and --position-error"
+            "errors are that large, state them by `faintfield align --rotation-error-mrad … --position-error …`"
         )
     if alignment.gain.sure:
         return None
-    advice = "" if options.depth_mm else ", and --depth helps where planes at known depths hold all of the scene"
+    advice = "`faintfield align --depth …` helps where planes at known depths hold all of the scene"
+    advice = "" if options.depth_mm else f", and {advice}"
     return (
         "the poses stay as they are: the new ones do not predict held-out pixels better, beyond chance (gain of "
         f"{gain.text}; more than 3 are needed); they may be right, or light or views too few{advice}"

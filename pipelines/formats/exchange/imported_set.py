@@ -178,15 +178,17 @@ def _nodes(images: Sequence[PosedImage]) -> Sequence[tuple[int, int] | None]:
 def stated_lens(size_px: tuple[int, int], fx_px: float, fy_px: float, options: LensOptions | GridOptions) -> Lens:
     """Return the lens of the options, whose principal point is the middle of the picture by default.
 
-    Raises WrongUsage for a lens that cannot be.
+    Raises WrongUsage for a lens that cannot be, and LensNotInvertible for one that folds the corners of the picture.
     """
     middle_x, middle_y = ((side - 1) / 2 for side in size_px)
     cx_px = middle_x if options.cx_px is None else options.cx_px
     cy_px = middle_y if options.cy_px is None else options.cy_px
     try:
-        return Lens(size_px, fx_px, fy_px, cx_px, cy_px, options.distortion)
+        lens = Lens(size_px, fx_px, fy_px, cx_px, cy_px, options.distortion)
     except ValueError as failure:
         raise WrongUsage(f"the lens of the options cannot be: {failure}; correct them") from failure
+    lens.rays(step=(max(size_px[1] - 1, 1), max(size_px[0] - 1, 1)))
+    return lens
 
 
 def check_set_free(out: Path, options: ImportOptions | GridOptions, *sources: Path) -> None:

@@ -95,8 +95,10 @@ class GridOptions:
     pattern
         What names say, such as `{name}_{row}_{column}_{y}_{x}.png`: {name} and * are anything, {row}, {column} and
         {index} whole numbers ({row:2} of two digits), {x} and {y} the camera's position in any unit.
+    keep_order
+        The order is that of the names. With one of these four options the pictures correct nothing.
     flip_rows
-        The first row of the names is the bottom one. With one of these three options the order is the one they state.
+        The first row of the names is the bottom one.
     flip_columns
         The first column of the names is the right one.
     transpose
@@ -134,6 +136,7 @@ class GridOptions:
     rows: Count | None = None
     columns: Count | None = None
     pattern: str | None = None
+    keep_order: bool = False
     flip_rows: bool = False
     flip_columns: bool = False
     transpose: bool = False

@@ -70,8 +70,6 @@ def import_pictures(src: Path, out: Path, options: GridOptions) -> ImportedGrid:
         raise WrongUsage(f"--distortion is that of a lens whose scale is known; give {lacking}, too")
     if options.distortion and options.disparity_px:
         raise WrongUsage("--distortion is that of pictures as they were taken, not of aligned ones; leave one out")
-    is_ideal = not options.distortion and options.cx_px is None and options.cy_px is None
-    ideal = "ideal, no distortion, centred: state another by --distortion, --cx-px, --cy-px"
     recorded = {name: value for name, value in asdict(options).items() if name not in ("no_align", "overwrite")}
     pitch_mm, fx_px, disparity_px = options.pitch_mm, options.fx_px, options.disparity_px
     described = described_grid(src)
@@ -89,11 +87,10 @@ def import_pictures(src: Path, out: Path, options: GridOptions) -> ImportedGrid:
         white = float(first.saturation_dn or np.iinfo(first.pixels_dn.dtype).max)
         grid, arrangement = arrange_grid(
             views,
-            prescribed if prescribed != Orientation() else None,
+            prescribed if options.keep_order or prescribed != Orientation() else None,
             white=white if views.dn_per_value is None else np.inf,  # floats state no white
-            size_px=(width, height),
             aligned=bool(disparity_px),
-            lens=ideal if is_ideal else "as stated",
+            lens=lens,
         )
         stated = disparity_px is not None
         if options.distortion and arrangement.aligned and not stated:

@@ -114,6 +114,7 @@ def test_noise_alone_gives_no_poses_and_removes_earlier_ones(scene: Path, tmp_pa
     assert ended.returncode == 0
     assert not loads(ended.stdout)["accepted"]
     assert "the views tell no poses" in ended.stderr
+    assert "give the range by `faintfield align --depth-range NEAR:FAR`" in ended.stderr
     assert not (tmp_path / "out").exists() or not list((tmp_path / "out").glob("[ag]*"))
 
 

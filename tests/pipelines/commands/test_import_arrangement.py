@@ -8,8 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
+from faintfield.calib.lens import Lens
 from faintfield.pipelines.formats.exchange.image_grid import ImageGrid, measured_steps
 from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.sets.elemental_file import Arrangement
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
 from tests.calib.light_fields import Layer, Views, light_field, with_noise
 from tests.pipelines.conftest import Command, assert_refused
@@ -122,8 +124,47 @@ def test_two_likely_orders_are_refused_with_both(tmp_path: Path, faintfield: Com
     plane = light_field((Layer(1.5),), grid=(3, 3), size_px=SMALL_PX)
     src = _write(tmp_path / "src", plane)
     _check_refused(faintfield, src, "AmbiguousOrder", "--flip-rows --flip-columns, or --disparity-px")
-    assert faintfield("import", "grid", src, tmp_path / "set", "--disparity-px", 3).returncode == 0
-    _assert_as_rendered(load_set(tmp_path / "set"), plane)
+    for stated in (("--disparity-px", 3), ("--keep-order",)):
+        assert faintfield("import", "grid", src, tmp_path / "set", *stated, "--overwrite").returncode == 0
+        _assert_as_rendered(load_set(tmp_path / "set"), plane)
+    arrangement = load_set(tmp_path / "set").settings.arrangement
+    assert (arrangement and arrangement.told_by) == "options"
+
+
+def _arrangement(done: Command, src: Path, *options: object) -> Arrangement:
+    done("import", "grid", src, src.parent / "set", "--no-align", *options)
+    arrangement = load_set(src.parent / "set").settings.arrangement
+    assert arrangement is not None
+    return arrangement
+
+
+def test_displaced_view_is_irregular(tmp_path: Path, done: Command) -> None:
+    disparity_px, share = -14.0, 0.08  # 1.1 px
+    regular, displaced = (
+        light_field((Layer(disparity_px, (px, px)),), (3, 3), SMALL_PX) for px in (0, share * disparity_px)
+    )
+    assert not _arrangement(done, _write(tmp_path / "src", regular)).irregular
+    src = _write(tmp_path / "displaced", {**regular, (0, 1): displaced[0, 1]})
+    assert _arrangement(done, src, "--overwrite").irregular
+
+
+def test_uncertain_magnification_is_not_irregular(tmp_path: Path, done: Command) -> None:
+    """Few blocks of cards before black hold detail: the views seem to be magnified by up to 0.9 %."""
+    cards = (Layer(-8.0, (-20, 5), (10, 24)), Layer(-12.0, (22, -8), (9, 12)))
+    views = with_noise(light_field(cards, (2, 3), (112, 84), detail=3, seed=2), 7)
+    assert not _arrangement(done, _write(tmp_path / "src", views)).irregular
+
+
+def test_stated_distortion_is_undone_before_pictures_are_compared(tmp_path: Path, done: Command) -> None:
+    (width, height), focal_px, distortion = SMALL_PX, 96.0, -0.3
+    lens = Lens(SMALL_PX, focal_px, focal_px, (width - 1) / 2, (height - 1) / 2, (distortion,))
+    places = (focal_px * lens.rays() + (lens.cx_px, lens.cy_px)).astype(np.float32)
+    views = light_field((Layer(-6.0),), (3, 3), SMALL_PX)
+    for node, view in views.items():
+        views[node] = cv2.remap(view, places, None, cv2.INTER_LINEAR).astype(np.float32)
+    options = ("--pitch-mm", 10, "--fx-px", focal_px, "--distortion", distortion)
+    disparities_px = _arrangement(done, _write(tmp_path / "src", views), *options).disparity_range_px
+    assert disparities_px == pytest.approx((-6.0, -6.0), abs=0.7)  # as they are, -6.5 to 0.7
 
 
 @pytest.mark.deep

@@ -97,6 +97,9 @@ def test_lens_is_that_of_options(tmp_path: Path, done: Command, faintfield: Comm
     ):
         ended = faintfield("import", "grid", src, tmp_path / "no", *wrong, *lens)
         assert (ended.returncode, words in ended.stderr) == (2, True)
+    folding = ("--pitch-mm", 50, "--fx-px", 9, "--distortion", -5)
+    ended = faintfield("import", "grid", src, tmp_path / "no", *folding)
+    assert_refused(ended, "LensNotInvertible", "correct signs and order (k1, k2, p1, p2, k3 …)")
 
 
 def test_full_disk_is_found_before_pictures_are_compared(
