@@ -1,9 +1,10 @@
 """A process in which Python offers what it offers on Windows, for the commands that do without a rig.
 
 `python -m tests.windows FOLDER COMMANDS` loads all modules of faintfield, then runs commands in the folder, a line
-each. Modules and names of POSIX alone are missing. Within the folder, what is open can be neither removed nor renamed,
-folders cannot be opened, links cannot be made, and names are those that Windows allows. The module `msvcrt` locks by
-Linux's locks of open file descriptions, which are as exclusive. What else differs on Windows is not tested.
+each, with empty drawings. Modules and names of POSIX alone are missing. Within the folder, what is open can be neither
+removed nor renamed, folders cannot be opened, links cannot be made, and names are those that Windows allows. The module
+`msvcrt` locks by Linux's locks of open file descriptions, which are as exclusive. What else differs on Windows is not
+tested.
 """
 
 import errno
@@ -26,10 +27,13 @@ from inspect import currentframe
 from pathlib import Path
 from threading import local
 from types import ModuleType
+from unittest import mock
 
 import psutil
+from matplotlib.figure import Figure
 
 import faintfield
+from tests.drawings import save_empty
 
 _MODULES = ("fcntl", "grp", "posix", "pty", "pwd", "resource", "syslog", "termios", "tty")
 _NAMES: dict[ModuleType, tuple[str, ...]] = {
@@ -167,6 +171,7 @@ def main() -> None:
     """Run the commands."""
     folder = Path(sys.argv[1]).resolve()
     os.chdir(folder)
+    mock.patch.object(Figure, "savefig", save_empty).start()
     _load_all()
     _become_windows(folder)
     vars(sys)["modules"]["sys"] = Sys("sys")

@@ -7,9 +7,11 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from matplotlib.figure import Figure
 
 from faintfield.pipelines.cli import run
 from faintfield.pipelines.formats.sets.elemental_file import ElementalSetFile
+from tests.drawings import save_empty
 
 _ROOT = Path(__file__).parents[2]
 _SKIPPED = ("make ", "git clone ")
@@ -54,6 +56,7 @@ def _run_examples(blocks: list[tuple[str, str]]) -> None:
 
 def test_examples_of_readme_run_with_smaller_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(Figure, "savefig", save_empty)
     blocks = _blocks("README.md", "sh", "python")
     for old, new in SMALLER.items():
         assert any(old in content for _, content in blocks), old

@@ -79,7 +79,8 @@ def content(folder: Path) -> dict[str, bytes]:
 
 def test_boards_in_turn_end_in_geometry_of_command(session: Path, tmp_path: Path) -> None:
     before, frames = content(session), frames_of(session)
-    told = followed(session, tmp_path, *(BoardNews(tuple(frames[: count + 1])) for count in range(len(frames))))
+    counts = [1, *(_NODES * sweep + more for sweep in range(1, _SWEEPS) for more in (-1, 0, 1)), len(frames)]
+    told = followed(session, tmp_path, *(BoardNews(tuple(frames[:count])) for count in counts))
     assert content(session) == before
     first_verdicts = [next(it for it in told if it.after_sweep == sweep) for sweep in range(1, _SWEEPS + 1)]
     assert [it.frames for it in first_verdicts] == [_NODES, 2 * _NODES, 3 * _NODES]
@@ -221,7 +222,8 @@ def test_contradicting_corners_are_no_advice() -> None:
         judge(boards, views, OPTICS.size_px, SweepPlan({}, (1, 1), (500.0,), 0.5, {}, 0))
 
 
-def test_live_planes_take_poses_of_boards(session: Path, tmp_path: Path) -> None:
+def test_live_planes_take_poses_of_boards(session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(LivePlanes, "_refine", lambda *_: None)  # PMLEM takes long
     told = followed(session, tmp_path, BoardNews(tuple(frames_of(session))))
     dark = tuple(
         LiveFrame(taken.intent, taken.file, planned.stop.node, planned.exposure_s)
