@@ -20,11 +20,11 @@ _COMMAND = re.compile(r"^(.+<< *'?(\w+)'?.*\n[\s\S]*?^\2$|.+)$", re.MULTILINE)
 
 # Smaller numbers for the examples of the README, so that all of them run with the quick tests.
 SMALLER = {
-    "--size-px 480 360": "--size-px 160 120 --rows 3 --columns 3",
-    "--fx-px 600": "--fx-px 200",
+    "--size-px 480 360": "--size-px 96 72 --rows 3 --columns 3",
+    "--fx-px 600": "--fx-px 120 --no-align",
     "--depth auto": "--depth 500 --method backprojection",
-    "--surface --out": "--surface --depth-range-mm 400:900 --out",
-    "plane(500.0, uncertainty=True)": "plane(500.0, uncertainty=True, prior='tv')",
+    "--surface --out": "--surface --depth-range-mm 400:900 --passes 3 --penalty-weight 1 --out",
+    "plane(500.0, uncertainty=True)": "plane(500.0, uncertainty=True, prior='tv', passes=3, penalty_weight=1.0)",
 }
 
 

@@ -225,7 +225,8 @@ def test_view_of_another_node_is_named() -> None:
 
 def test_nodes_swapped_in_a_sweep_are_named() -> None:
     swap = {(0, 0): (0, 1), (0, 1): (0, 0)}
-    swapped = changed(simulated(16), "board-0", lambda view: replace(view, node=swap.get(view.node, view.node)))
+    truth = simulated(16, standing=six_boards(6, 8, 40.0)[:5])
+    swapped = changed(truth, "board-0", lambda view: replace(view, node=swap.get(view.node, view.node)))
     with pytest.raises(
         PoorFit, match=r"% of the corners disagree .*node \(0, [01]\).*check that every image has its right"
     ):
