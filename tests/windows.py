@@ -111,7 +111,7 @@ class _FileRules:
             raise PermissionError(errno.EACCES, "Permission denied", str(path))
         if event in ("os.remove", "os.rename", "os.rmdir"):
             whole = path.resolve()
-            if any(used.is_relative_to(whole) for used in _files_in_use()):
+            if any(used.is_relative_to(whole) for used in _files_in_use(str(whole))):
                 raise PermissionError(errno.EACCES, "The file is used by another process", str(path))
 
 
@@ -126,13 +126,14 @@ def _caller() -> str:
     return "" if frame is None else str(frame.f_globals["__name__"])
 
 
-def _files_in_use() -> Iterator[Path]:
-    """Yield the files that are open or mapped."""
+def _files_in_use(words: str) -> Iterator[Path]:
+    """Yield the files that are open or mapped and whose paths contain these words."""
     for descriptor in os.listdir("/proc/self/fd"):
         with suppress(OSError):
-            yield Path(os.readlink(f"/proc/self/fd/{descriptor}"))
-    with open("/proc/self/maps", encoding="utf-8") as maps:
-        yield from (Path(line.split(maxsplit=5)[-1].strip()) for line in maps if line.count("/"))
+            if words in (name := os.readlink(f"/proc/self/fd/{descriptor}")):
+                yield Path(name)
+    with open("/proc/self/maps", encoding="utf-8") as maps:  # thousands of lines, of libraries
+        yield from (Path(line.split(maxsplit=5)[-1].strip()) for line in maps if words in line)
 
 
 def _rename(source: str, target: str) -> None:
