@@ -14,8 +14,8 @@ from tests.pipelines.sessions import rig_toml
 from tests.windows import Msvcrt, Sys
 
 _OF_A_SET = """
-simulate scene --rows 3 --columns 3 --size-px 96 72
-reconstruct scene --depth-mm 500 --depth-mm 700 --prior tv --workers 2 --out out
+simulate scene --rows 2 --columns 2 --size-px 96 72
+reconstruct scene --depth-mm 500 --prior tv --passes 3 --penalty-weight 2 --workers 1 --out out
 report out
 verify out
 export nerfstudio scene transforms

@@ -1,9 +1,10 @@
 """A process in which Python offers what it offers on Windows, for the commands that do without a rig.
 
 `python -m tests.windows FOLDER COMMANDS` loads all modules of faintfield, then runs commands in the folder, a line
-each. Modules and names of POSIX alone are missing. Within the folder, what is open can be neither removed nor renamed,
-folders cannot be opened, links cannot be made, and names are those that Windows allows. The module `msvcrt` locks by
-Linux's locks of open file descriptions, which are as exclusive. What else differs on Windows is not tested.
+each, with empty drawings. Modules and names of POSIX alone are missing. Within the folder, what is open can be neither
+removed nor renamed, folders cannot be opened, links cannot be made, and names are those that Windows allows. The module
+`msvcrt` locks by Linux's locks of open file descriptions, which are as exclusive. What else differs on Windows is not
+tested.
 """
 
 import errno
@@ -26,10 +27,13 @@ from inspect import currentframe
 from pathlib import Path
 from threading import local
 from types import ModuleType
+from unittest import mock
 
 import psutil
+from matplotlib.figure import Figure
 
 import faintfield
+from tests.drawings import save_empty
 
 _MODULES = ("fcntl", "grp", "posix", "pty", "pwd", "resource", "syslog", "termios", "tty")
 _NAMES: dict[ModuleType, tuple[str, ...]] = {
@@ -107,7 +111,7 @@ class _FileRules:
             raise PermissionError(errno.EACCES, "Permission denied", str(path))
         if event in ("os.remove", "os.rename", "os.rmdir"):
             whole = path.resolve()
-            if any(used.is_relative_to(whole) for used in _files_in_use()):
+            if any(used.is_relative_to(whole) for used in _files_in_use(str(whole))):
                 raise PermissionError(errno.EACCES, "The file is used by another process", str(path))
 
 
@@ -122,13 +126,14 @@ def _caller() -> str:
     return "" if frame is None else str(frame.f_globals["__name__"])
 
 
-def _files_in_use() -> Iterator[Path]:
-    """Yield the files that are open or mapped."""
+def _files_in_use(words: str) -> Iterator[Path]:
+    """Yield the files that are open or mapped and whose paths contain these words."""
     for descriptor in os.listdir("/proc/self/fd"):
         with suppress(OSError):
-            yield Path(os.readlink(f"/proc/self/fd/{descriptor}"))
-    with open("/proc/self/maps", encoding="utf-8") as maps:
-        yield from (Path(line.split(maxsplit=5)[-1].strip()) for line in maps if line.count("/"))
+            if words in (name := os.readlink(f"/proc/self/fd/{descriptor}")):
+                yield Path(name)
+    with open("/proc/self/maps", encoding="utf-8") as maps:  # thousands of lines, of libraries
+        yield from (Path(line.split(maxsplit=5)[-1].strip()) for line in maps if words in line)
 
 
 def _rename(source: str, target: str) -> None:
@@ -167,6 +172,7 @@ def main() -> None:
     """Run the commands."""
     folder = Path(sys.argv[1]).resolve()
     os.chdir(folder)
+    mock.patch.object(Figure, "savefig", save_empty).start()
     _load_all()
     _become_windows(folder)
     vars(sys)["modules"]["sys"] = Sys("sys")

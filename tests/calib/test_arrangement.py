@@ -38,7 +38,7 @@ def aligned() -> Views:
 
 @pytest.mark.parametrize(
     "wanted",
-    [Orientation(False, True, True), Orientation(True, True), Orientation(True, False, True)],
+    [Orientation(False, True, True), Orientation(True, True)],
     ids=str,
 )
 def test_order_is_read_from_aligned_pictures(wanted: Orientation, aligned: Views) -> None:
@@ -68,7 +68,7 @@ def test_edge_of_brightness_is_no_edge_of_depth() -> None:
 
 @pytest.mark.parametrize("aligned_px", [pytest.param(0.0, marks=pytest.mark.deep), ALIGNED_PX])
 def test_ground_without_texture_says_nothing(aligned_px: float) -> None:
-    result = inspect(light_field(CARDS[1:], grid=(5, 5), aligned_px=aligned_px))
+    result = inspect(light_field(CARDS[1:], grid=(4, 4), aligned_px=aligned_px))
     assert abs(result.side_z) < 4
     assert result.orientation == Orientation()
 
@@ -102,9 +102,7 @@ def test_reversed_single_line_is_put_in_order(grid: tuple[int, int], transpose: 
     assert result.direction == "pictures"
 
 
-@pytest.mark.parametrize(
-    "wanted", [Orientation(), Orientation(flip_rows=True), Orientation(flip_columns=True)], ids=str
-)
+@pytest.mark.parametrize("wanted", [Orientation(flip_rows=True), Orientation(flip_columns=True)], ids=str)
 def test_plane_moving_against_the_camera_shows_order(wanted: Orientation) -> None:
     result = inspect(_misnamed(light_field((Layer(-1.5),), grid=(3, 3)), wanted))
     assert (result.orientation, result.direction, result.undecided) == (wanted, "signs", False)
@@ -142,7 +140,7 @@ def test_noise_leaves_the_range_and_the_axes() -> None:
 
 @pytest.mark.parametrize("content", ["noise", pytest.param("scenes", marks=pytest.mark.deep)])
 def test_unrelated_pictures_show_nothing(content: str) -> None:
-    generator, nodes = np.random.default_rng(0), list(np.ndindex(4, 4))
+    generator, nodes = np.random.default_rng(0), list(np.ndindex(3, 3))
     views = {node: generator.random((96, 128), np.float32) for node in nodes}
     if content == "scenes":
         views = {(r, c): light_field(grid=(1, 1), size_px=(128, 96), seed=5 * r + c)[0, 0] for r, c in nodes}
@@ -208,7 +206,7 @@ def test_line_of_views_is_no_square() -> None:
 
 
 def test_copies_with_noise_fit_anywhere() -> None:
-    result = inspect(with_noise(dict.fromkeys(np.ndindex(3, 4), _small((1, 1))[0, 0]), 50))
+    result = inspect(with_noise(dict.fromkeys(np.ndindex(3, 3), _small((1, 1))[0, 0]), 50))
     assert (result.failure, result.order.verdict, result.still) == (None, "open", True)
 
 

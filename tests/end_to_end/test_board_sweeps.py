@@ -88,6 +88,7 @@ def test_terminal_says_verdict_and_poses(
     }
 
 
+@pytest.mark.deep  # test_live_planes.py kills a process of the same class
 def test_capture_survives_death_of_boards(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 
 from faintfield.pipelines.cli import run
 from faintfield.pipelines.formats.frames import read_frame
-from faintfield.pipelines.formats.image_files import encoded
 from faintfield.pipelines.workflows import demo as workflow
+from tests.drawings import save_empty
 
 DEPTHS_MM = (500.0, 700.0)
 MOST_BYTES_OF_THE_REPORT = 5_000_000
@@ -51,10 +51,6 @@ def _check_light(metrics: dict[str, Any], out: Path) -> None:
     assert metrics["photons_per_px"]["from_moments"] == pytest.approx(1.92, abs=0.01)
 
 
-def _save_nothing(_: Figure, file: Any, format: str, **__: object) -> None:
-    file.write("<svg></svg>" if format == "svg" else encoded(np.zeros((4, 4), np.uint8), ".png"))
-
-
 def test_small_demo_from_capture_to_report(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -64,7 +60,7 @@ def test_small_demo_from_capture_to_report(
     monkeypatch.setattr(workflow, "_METHODS", methods)
     monkeypatch.setattr(workflow, "DEFAULT_METHOD", "pmlem-osl")
     monkeypatch.setattr(workflow, "select_surface", lambda _: None)
-    monkeypatch.setattr(Figure, "savefig", _save_nothing)  # text takes most of the time of a page
+    monkeypatch.setattr(Figure, "savefig", save_empty)
     out = tmp_path / "demo"
     assert run(["demo", str(out), "--quick", "--json"]) == 0
     metrics = _metrics(out)

@@ -7,9 +7,11 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from matplotlib.figure import Figure
 
 from faintfield.pipelines.cli import run
 from faintfield.pipelines.formats.sets.elemental_file import ElementalSetFile
+from tests.drawings import save_empty
 
 _ROOT = Path(__file__).parents[2]
 _SKIPPED = ("make ", "git clone ")
@@ -18,11 +20,11 @@ _COMMAND = re.compile(r"^(.+<< *'?(\w+)'?.*\n[\s\S]*?^\2$|.+)$", re.MULTILINE)
 
 # Smaller numbers for the examples of the README, so that all of them run with the quick tests.
 SMALLER = {
-    "--size-px 480 360": "--size-px 160 120 --rows 3 --columns 3",
-    "--fx-px 600": "--fx-px 200",
+    "--size-px 480 360": "--size-px 96 72 --rows 3 --columns 3",
+    "--fx-px 600": "--fx-px 120 --no-align",
     "--depth auto": "--depth 500 --method backprojection",
-    "--surface --out": "--surface --depth-range-mm 400:900 --out",
-    "plane(500.0, uncertainty=True)": "plane(500.0, uncertainty=True, prior='tv')",
+    "--surface --out": "--surface --depth-range-mm 400:900 --passes 3 --penalty-weight 1 --out",
+    "plane(500.0, uncertainty=True)": "plane(500.0, uncertainty=True, prior='tv', passes=3, penalty_weight=1.0)",
 }
 
 
@@ -54,6 +56,7 @@ def _run_examples(blocks: list[tuple[str, str]]) -> None:
 
 def test_examples_of_readme_run_with_smaller_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(Figure, "savefig", save_empty)
     blocks = _blocks("README.md", "sh", "python")
     for old, new in SMALLER.items():
         assert any(old in content for _, content in blocks), old

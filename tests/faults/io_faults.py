@@ -23,8 +23,10 @@ from typing import Literal, NamedTuple
 from unittest import mock
 
 import cv2
+from matplotlib.figure import Figure
 
 from faintfield.pipelines.cli import run
+from tests.drawings import save_empty
 from tests.faults.contained import ONE_THREAD, Ended, contained
 from tests.patience import HANG_S
 
@@ -121,6 +123,7 @@ def try_command(words: list[str], folder: Path, fault: Fault, diary: Path | None
 
 def _warm_up(commands: Sequence[Sequence[str]]) -> None:
     cv2.setNumThreads(1)
+    mock.patch.object(Figure, "savefig", save_empty).start()
     for place in _COMPUTATIONS:
         _remember(*place.rsplit(".", 1))
     for words in commands:

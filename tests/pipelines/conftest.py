@@ -27,6 +27,7 @@ from faintfield.pipelines.reconstruction.planes import penalised
 from faintfield.pipelines.reconstruction.surface import files as surface_files
 from faintfield.pipelines.reconstruction.surface import reconstruct as surface
 from faintfield.recon.surface.estimate import SurfaceEstimate
+from tests.drawings import save_empty
 from tests.pipelines.by_hand import View, write_set
 from tests.pipelines.sessions import captured, rig_toml, steps_run
 from tests.pipelines.surfaces import Searches, found_at_once, write_example
@@ -107,12 +108,8 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
 @contextmanager
 def drawing_nothing() -> Iterator[pytest.MonkeyPatch]:
     """Leave drawings empty, and pictures as they are: text and compression take most of the time of a page."""
-
-    def save(_: Figure, file: Any, format: str, **__: object) -> None:
-        file.write("<svg></svg>" if format == "svg" else encoded(np.zeros((4, 4), np.uint8), ".png"))
-
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Figure, "savefig", save)
+        patch.setattr(Figure, "savefig", save_empty)
         for module in (report_sets, viewer_data):
             patch.setattr(module, "smaller_uri", lambda content, quality=LOSSLESS: data_uri(content, ".png"))
         yield patch

@@ -12,6 +12,7 @@ from faintfield.calib.estimate import Estimate
 from faintfield.pipelines.commands.calibration import noise
 from faintfield.pipelines.formats.results.noise import NOISE_PAGE, EmvaRecord, NoiseRecord
 from tests.calib.noise.darkroom import specimen
+from tests.pipelines.conftest import drawing_nothing
 from tests.pipelines.noise_sets import measure_sensor, take_set, write_frames
 
 GAIN, READ_E, CURRENT, EFFICIENCY, TOP_DN = 0.5, 8.0, 0.2, 0.5, 4095
@@ -27,7 +28,8 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, NoiseRecor
         (np.minimum(pixels, TOP_DN).astype(np.uint16), keys) for pixels, keys in take_set(chip, rng, photons=light)
     ]
     write_frames(folder, frames, saturation_dn=float(TOP_DN))
-    return folder, noise(folder)
+    with drawing_nothing():  # tests/pipelines/pages/test_noise_plots.py draws
+        return folder, noise(folder)
 
 
 def emva_of(record: NoiseRecord) -> EmvaRecord:

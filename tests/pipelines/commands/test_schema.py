@@ -21,15 +21,23 @@ jsonschema = pytest.importorskip("jsonschema")
 type Check = Callable[[str, Any], bool]
 
 
+@pytest.fixture(scope="module")
+def validators() -> dict[str, Any]:
+    """The validators that the tests have made so far, by kind."""
+    return {}
+
+
 @pytest.fixture
-def valid(done: Command) -> Check:
+def valid(validators: dict[str, Any], done: Command) -> Check:
     """Return whether a content is valid by the schema of a kind, which must be sound itself; words may follow it."""
 
     def check(kind: str, content: Any) -> bool:
-        schema = json.loads(done("schema", *kind.split()).stdout)
-        validator = jsonschema.validators.validator_for(schema)
-        validator.check_schema(schema)
-        return bool(validator(schema).is_valid(content))
+        if kind not in validators:
+            schema = json.loads(done("schema", *kind.split()).stdout)
+            validator = jsonschema.validators.validator_for(schema)
+            validator.check_schema(schema)
+            validators[kind] = validator(schema)
+        return bool(validators[kind].is_valid(content))
 
     return check
 

@@ -113,13 +113,17 @@ def without_scale(folder: Path, depth: DepthUnit, light: LightUnit) -> Path:
 
 
 @pytest.fixture
-def imported(with_scale: Path, tmp_path: Path, done: Command) -> tuple[Path, str]:
-    """Return a set of the pictures alone, by disparity and with 1 = white, and the words of its import."""
+def imported(with_scale: Path, tmp_path: Path, done: Command, request: pytest.FixtureRequest) -> tuple[Path, str]:
+    """Return a set of the pictures alone, by disparity and with 1 = white, and the words of its import.
+
+    Only deep tests find the poses by the views.
+    """
+    quick = () if request.node.get_closest_marker("deep") else ("--no-align",)
     pictures = tmp_path / "pictures"
     pictures.mkdir()
     for path in with_scale.glob("view_*.tiff"):
         shutil.copy(path, pictures)
-    ended = done("import", "grid", pictures, tmp_path / "set", "--offset-dn", 100, "--read-noise-e", 3)
+    ended = done("import", "grid", pictures, tmp_path / "set", "--offset-dn", 100, "--read-noise-e", 3, *quick)
     return without_scale(tmp_path / "set", "disparity_px", "relative"), ended.stdout + ended.stderr
 
 

@@ -77,10 +77,17 @@ def content(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_boards_in_turn_end_in_geometry_of_command(session: Path, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def told(session: Path, tmp_path_factory: pytest.TempPathFactory) -> list[BoardProgress]:
+    """What is told of a whole session, whose news come around the end of each sweep."""
     before, frames = content(session), frames_of(session)
-    told = followed(session, tmp_path, *(BoardNews(tuple(frames[: count + 1])) for count in range(len(frames))))
+    counts = [1, *(_NODES * sweep + more for sweep in range(1, _SWEEPS) for more in (-1, 0, 1)), len(frames)]
+    told = followed(session, tmp_path_factory.mktemp("told"), *(BoardNews(tuple(frames[:count])) for count in counts))
     assert content(session) == before
+    return told
+
+
+def test_boards_in_turn_end_in_geometry_of_command(session: Path, told: list[BoardProgress], tmp_path: Path) -> None:
     first_verdicts = [next(it for it in told if it.after_sweep == sweep) for sweep in range(1, _SWEEPS + 1)]
     assert [it.frames for it in first_verdicts] == [_NODES, 2 * _NODES, 3 * _NODES]
     assert all(it.verdict is not None and it.verdict.words for it in first_verdicts)
@@ -221,8 +228,10 @@ def test_contradicting_corners_are_no_advice() -> None:
         judge(boards, views, OPTICS.size_px, SweepPlan({}, (1, 1), (500.0,), 0.5, {}, 0))
 
 
-def test_live_planes_take_poses_of_boards(session: Path, tmp_path: Path) -> None:
-    told = followed(session, tmp_path, BoardNews(tuple(frames_of(session))))
+def test_live_planes_take_poses_of_boards(
+    session: Path, told: list[BoardProgress], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(LivePlanes, "_refine", lambda *_: None)  # PMLEM takes long
     dark = tuple(
         LiveFrame(taken.intent, taken.file, planned.stop.node, planned.exposure_s)
         for planned, taken, _ in taken_frames(session)

@@ -14,7 +14,7 @@ from unittest import mock
 import numpy as np
 import pytest
 import tifffile
-from hypothesis import example, given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -353,6 +353,7 @@ def frames_begun(
     return begun_s
 
 
+@settings(max_examples=12)
 @given(
     exposure_s=st.floats(0.05, 10.0),
     pause_s=st.floats(0.01, 9.5) | st.floats(0.01, 59.5),

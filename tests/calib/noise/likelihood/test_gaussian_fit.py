@@ -122,11 +122,11 @@ def errors_and_stated(
 
 
 def test_stated_errors_are_those_made_and_the_bound() -> None:
-    """24 sets of two unlike numbers know the mean square of errors within 0.45, and stated errors differ by 3 %.
+    """12 sets of two unlike numbers know the mean square of errors within 0.64, and stated errors differ by 3 %.
 
     Scatter between series that comes about by chance widens some sets, and narrows none.
     """
-    side, seeds = 48, range(1000, 1024)
+    side, seeds = 48, range(1000, 1012)
     specimens = (specimen(seed, shape=(side, side)) for seed in seeds)
     all_series = [dark_series(chip, EXPOSURES_S, 10, rng) for chip, rng in specimens]
     errors, stated, _ = errors_and_stated(all_series)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from faintfield.calib.arrangement.views import Node
@@ -108,6 +108,7 @@ def test_unfit_pattern_is_refused() -> None:
 PARTS = st.text(st.characters(exclude_categories=["N"], exclude_characters="{}"), min_size=1, max_size=3)
 
 
+@settings(max_examples=25)
 @given(st.text(max_size=12), PARTS)
 def test_any_names_give_nodes_or_named_failure(text: str, parted: str) -> None:
     names = [f"{text}{row}{parted}{column}.png" for row, column in NODES]
