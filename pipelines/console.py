@@ -90,17 +90,18 @@ def _drawn(report: "_Report") -> Iterator[None]:
     from rich import progress as parts  # help loads this module, and draws no bar
     from rich.table import Column
 
+    class Label(parts.ProgressColumn):
+        def render(self, task: parts.Task) -> Text:
+            return Text(task.description, no_wrap=True, overflow="ellipsis")
+
     class State(parts.ProgressColumn):
         def render(self, task: parts.Task) -> Text:
-            return Text(report.state())
+            return Text(report.state(), no_wrap=True)
 
-    one_line = Column(no_wrap=True)
-    columns = (
-        parts.TextColumn("{task.description}", markup=False, table_column=one_line),
-        parts.BarColumn(bar_width=None, table_column=Column(ratio=1, max_width=40)),
-        State(table_column=one_line),
-    )
-    with parts.Progress(*columns, console=console, transient=True, expand=True) as bar:
+    # One line: where it is too long, the bar and the label are cut
+    state = State(table_column=Column(no_wrap=True))
+    columns = (Label(), parts.BarColumn(bar_width=None, table_column=Column(max_width=40)), state)
+    with parts.Progress(*columns, console=console, transient=True) as bar:
         # A single step has no share that is done: its bar pulses
         task = bar.add_task(visible(report.label), total=None if report.total == 1 else report.total)
         report.on_advance = lambda: bar.advance(task)

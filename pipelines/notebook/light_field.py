@@ -404,10 +404,11 @@ class LightField:
         """Return the smaller and the larger end of a range of depths; BadValue if it is none."""
         if depth_range is None:
             return None
-        pair = isinstance(depth_range, Sequence) and len(depth_range) == 2
-        if not (pair and all(isinstance(end, Real) for end in depth_range)):
-            raise BadValue(f"depth_range: got {depth_range!r}; give two numbers, (nearest, farthest)")
-        least, most = min(depth_range), max(depth_range)
+        try:
+            least, most = sorted(map(float, depth_range))
+        except (TypeError, ValueError) as failure:
+            message = f"depth_range: got {depth_range!r}; give two numbers, (nearest, farthest)"
+            raise BadValue(message) from failure
         possible = least > 0 or self.units.depth == "disparity_px"
         if not possible or least == most or not np.isfinite([least, most]).all():
             raise BadValue(f"depth_range: got {depth_range}; give two different depths in front of the camera")

@@ -193,9 +193,9 @@ def _check_depths(selection: Selection) -> None:
             if selection.auto_sweep
             else "--depth-map compares those of a sweep"
         )
-        raise WrongUsage(f"{option}, and --depth-mm auto leaves few; give --sweep alone")
+        raise WrongUsage(f"{option}, and --depth auto leaves few; give --sweep alone")
     if selection.auto and any(selection.single.values()):
-        raise WrongUsage("--depth-mm auto finds all depths; give others in a call of their own")
+        raise WrongUsage("--depth auto finds all depths; give others in a call of their own")
     count = len(set(selection.numbers("own", "mm", "px")))
     if wants_map and not selection.auto_sweep and count < _MIN_DEPTHS_OF_A_MAP:
         raise WrongUsage(

@@ -44,6 +44,9 @@ _STAGES = (100.0, 50.0, 25.0, 12.0, 6.0, 3.0)
 # The highest confidence at the ends of the range, as a better depth may lie beyond, and where there is no light.
 _DOUBTFUL = 0.5
 
+# Quantile of 1/depth that stands for the nearest depths: few samples may be nearer by mistake.
+_NEAREST = 0.99
+
 # Movement of the outermost view from one depth to the next, in samples; fewest and most depths.
 _SAMPLES_PER_STEP, _MIN_DEPTHS, _MAX_DEPTHS = 1.6, 64, 128
 
@@ -75,8 +78,8 @@ class SurfaceEstimate:
         Of views that were left out; None if there are too few views to leave some out.
     lit_share : float
         Share of the samples whose light stands out of the noise.
-    spacing_needed : float
-        Factor by which views must be farther apart for the median depth to be sure.
+    spacing_needed : float, optional
+        Factor by which views must be farther apart for the nearest depths to be sure; None without light.
     """
 
     inverse_depth: NDArray[np.float64]
@@ -84,7 +87,7 @@ class SurfaceEstimate:
     rounds: int
     prediction: Prediction | None
     lit_share: float
-    spacing_needed: float
+    spacing_needed: float | None
 
 
 def estimate_surface(views: PinholeViews, inverse_depths: NDArray[np.float64]) -> SurfaceEstimate:
@@ -119,7 +122,8 @@ def estimate_surface(views: PinholeViews, inverse_depths: NDArray[np.float64]) -
     lit = lit_samples(views, depths)
     doubtful = (index <= 1) | (index >= len(inverse_depths) - 2) | ~lit
     sure[doubtful] = np.minimum(sure[doubtful], _DOUBTFUL)
-    spacing = spacing_needed(float(np.median(depths)), parallax)
+    nearest = float(np.quantile(depths[lit], _NEAREST)) if lit.any() else 0.0
+    spacing = spacing_needed(nearest, parallax) if nearest > 0 else None
     return SurfaceEstimate(depths, sure, best + 1, prediction, float(lit.mean()), spacing)
 
 

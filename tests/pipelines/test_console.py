@@ -64,7 +64,7 @@ def test_part_speaks_for_whole_unless_short(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(console, "_Report", report)
     for _ in progress([1], "whole"):
         with working("short"):
-            assert lines.get(timeout=HANG_S).startswith("whole: ")
+            assert re.fullmatch(r"whole: \d+ s", lines.get(timeout=HANG_S))  # one step needs no count
         with working("part"):
             while not lines.get(timeout=HANG_S).startswith("part: "):
                 pass
@@ -85,6 +85,18 @@ def test_bar_goes_on_while_a_part_works(monkeypatch: pytest.MonkeyPatch) -> None
         pass
     assert "[alone]" in screen.getvalue()
     assert "[part]" not in screen.getvalue()
+
+
+@pytest.mark.parametrize("label", ["planes", "comparing the views of all colours"])
+def test_bar_fits_on_one_line(label: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    screen = io.StringIO()
+    monkeypatch.setattr(console, "console", Console(file=screen, force_terminal=True, width=50, color_system=None))
+    with stage("penalty weight"):
+        list(progress([1, 2], label))
+    frames = re.split(r"\r\x1b\[2K|\n", re.sub(r"\x1b\[\?25[lh]", "", screen.getvalue()))
+    drawn = [frame for frame in frames if frame.strip("\r\x1b[1A2K")]
+    assert drawn
+    assert all(frame.startswith(label[:6]) and frame.endswith("0 s (penalty weight)") for frame in drawn), drawn
 
 
 _LINE = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z (INFO|WARNING|ERROR) (.*)")

@@ -179,7 +179,8 @@ class SurfaceFacts(Struct, frozen=True, kw_only=True):
     sure_of_lit : float, optional
         Share of the samples with light whose depth is sure.
     spacing_needed : float, optional
-        Factor by which nodes must be farther apart for the median depth to be sure; at most 1 if they are far enough.
+        Factor by which nodes must be farther apart for the nearest depths to be sure; at most 1 if they are far
+        enough.
     channels : list of SurfaceChannel
         Solution of each colour of the picture.
     wall_time_s : float
@@ -279,13 +280,13 @@ class SurfaceRecord(SurfaceFacts, frozen=True, kw_only=True):
         """Words on a surface of which no depth is sure, or too few to show as 1 %; None if there are more."""
         if self.sure_share >= _MIN_SURE_SHARE:
             return None
-        few = f"{'Almost no' if self.sure_share else 'No'} depth of this surface is sure: do not measure in it; "
+        sentence = f"{'Almost no' if self.sure_share else 'No'} depth of this surface is sure: do not measure in it; "
         if self.spacing_needed is not UNSET and self.spacing_needed > 1:
-            return few + (
-                f"its nodes are too close together, use {ceil(10 * self.spacing_needed) / 10:.1f} times their distance "
-                "at least, or more views"
+            return sentence + (
+                "its nodes are too close together even for the nearest depths: use more than "
+                f"{ceil(10 * self.spacing_needed) / 10:.1f} times their distance, or more views"
             )
-        return few + "use more light, more views or nodes farther apart, or check poses and range of depths"
+        return sentence + "use more light, more views or nodes farther apart, or check poses and range of depths"
 
     @property
     def maps(self) -> list[str]:

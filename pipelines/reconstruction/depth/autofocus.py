@@ -1,4 +1,4 @@
-"""`--depth-mm auto`: the depths of objects, found by comparing the views."""
+"""`--depth auto`: the depths of objects, found by comparing the views."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -121,7 +121,7 @@ def reconstruct_surface(
         held_out=held_out,
         share_of_sure=shares_of_depths(search),
         sure_of_lit=sure_of_lit(search.estimate.confidence, search.estimate.lit_share),
-        spacing_needed=search.estimate.spacing_needed,
+        spacing_needed=search.estimate.spacing_needed or UNSET,
         channels=[in_units(elemental_set, _channel(name, light)) for name, light in lights.items()],
         wall_time_s=time.monotonic() - started,
     )

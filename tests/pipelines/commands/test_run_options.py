@@ -33,8 +33,8 @@ def test_only_options_of_sets_are_missing_from_run() -> None:
 
 
 EXCLUDED = [
-    ("run", "--depth-mm auto --depth-mm 500", "--depth-mm auto finds all depths; give others in a call of their"),
-    ("run", "--depth-mm auto --sweep auto", "--sweep auto makes all planes of a range, and --depth-mm auto leaves"),
+    ("run", "--depth-mm auto --depth-mm 500", "--depth auto finds all depths; give others in a call of their"),
+    ("run", "--depth-mm auto --sweep auto", "--sweep auto makes all planes of a range, and --depth auto leaves"),
     ("run", "--depth-mm 500 --depth 700 --depth-map", "--depth-map compares depths, and 2 are given; give at"),
     ("run", "--depth-mm 500 --method mlem --uncertainty", "--uncertainty is for pmlem, joint and occlusion, not"),
     ("run", "--depth-mm 500 --joint --penalty none --prior auto", "--prior auto starts from total variation"),

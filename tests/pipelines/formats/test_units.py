@@ -39,7 +39,7 @@ BACK = ("--method", "backprojection")
 
 # Times that were measured: of the command itself.
 WALL_TIMES = re.compile(
-    r"in \d+\.\d s\b|wall time, s|: (\d+ of \d+, )?\d+ s(, about \d+ (s|min) to go)?$", re.MULTILINE
+    r"in \d+\.\d s\b|wall time, s|: (\d+ of \d+, )?\d+ s(, about \d+ (s|min) to go)?( \([a-z ]+\))?$", re.MULTILINE
 )
 
 # TIFF's tag of the unit of its resolution, and the value for the centimetre.

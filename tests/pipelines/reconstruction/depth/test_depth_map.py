@@ -86,14 +86,14 @@ def test_focus_and_map_are_recorded(swept: Path) -> None:
 
 @pytest.mark.deep
 def test_surfaces_have_no_stairs_and_end_with_sweep(tmp_path: Path, done: Command) -> None:
-    # In smaller views, edges and borders are near everywhere, and no depth is sure
+    # Smaller views are near edges and borders everywhere, and darker ones less clear: few of their depths are sure
     grid = ("--size-px", 240, 180, "--rows", 5, "--columns", 5)
     done("simulate", tmp_path / "set", "--objects", "surfaces", "--snr", 5, *grid)
     done("reconstruct", tmp_path / "set", "--out", tmp_path, "--sweep-mm", "400:700:5", *SWEEP[2:])
     depth_mm = read_frame(tmp_path / "depth_mm.tiff").pixels_dn
     true_mm = read_frame(tmp_path / "set" / "truth" / "true_depth_mm.tiff").pixels_dn
     sure = np.isfinite(depth_mm)
-    assert sure[true_mm < 700].mean() > 0.05
+    assert sure[true_mm < 700].mean() > 0.1
     assert sure[true_mm > 770].mean() < 0.02
     # Neighbouring planes of the sweep are farther apart than 4 %: depths at the nearest plane would mostly be wrong
     assert (np.abs(depth_mm[sure] / true_mm[sure] - 1) < 0.02).mean() > 0.9
