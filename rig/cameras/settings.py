@@ -29,7 +29,8 @@ class CoolingSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         Temperature of the sensor that a capture waits for before the first frame of each step; by default it does not
         wait. The camera's own settings make it cool.
     settle_tolerance_c, settle_limit_s : float
-        Largest difference from `settle_temperature_c` that counts as reached; time limit for the wait.
+        Largest difference from `settle_temperature_c` that counts as reached; time limit of the wait for that
+        temperature.
     """
 
     settle_temperature_c: float | None = None
@@ -237,13 +238,14 @@ class SimulatedSettings(MosaicSettings, frozen=True, forbid_unknown_fields=True,
     size_px : (int, int)
         Width and height of a frame.
     lit_photons_per_s, unlit_photons_per_s : float
-        Photons per second on a pixel that sees a white object, with the lights on; the same with the lights almost off.
+        Photons per second on a pixel that sees a white object, with the lights on; photons per second on such a pixel
+        with the lights almost off.
     read_noise_e, gain_dn_per_e, saturation_dn : float, float, int
-        Read noise of the sensor, by default that of the paper; its gain, by default that of the paper; its highest
-        value, by default that of the paper.
+        Read noise of the sensor, by default that of the paper; gain of the sensor, by default that of the paper;
+        highest value of a pixel, by default that of the paper.
     position_error_mm, rotation_error_mrad : float
         Standard deviation per axis of the camera's position about that of the motors; standard deviation per axis of
-        its rotation.
+        the camera's rotation.
     scale_error, squareness_mrad : float
         Relative error of distances along x; angle between the axes less a right angle.
     start_temperature_c : float, optional

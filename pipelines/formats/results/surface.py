@@ -32,10 +32,9 @@ from faintfield.pipelines.formats.results.records import (
 
 SURFACE_FILE = "surface.json"
 
-# Largest share of what changes from view to view that a surface may leave unexplained: simulated ones with right poses
-# and range leave at most 0.44 at any light, with poses off by 3 mm and 15 mrad at least 0.76, outside the range more
-# than 1 (docs/explanation/surface.md). The share is known if the changes raise the deviance by at least the second
-# number.
+# Largest share of what changes from view to view that a surface may leave unexplained: with right poses and range it is
+# at most 0.60, outside the range more than 1 (docs/quality.md). The share is known if the changes raise the deviance by
+# at least the second number.
 MAX_UNEXPLAINED, _MIN_CHANGES = 2 / 3, 0.2
 
 # Mean deviance of a surface above which nothing vouches for it, without neighbours to compare with.

@@ -28,7 +28,7 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defau
         Width and height of the detector.
     fx_px, fy_px, cx_px, cy_px : float
         Focal length along x; focal length along y; column of the principal point, where the centre of the first pixel
-        is 0; row of the principal point, likewise.
+        is 0; row of the principal point, where the centre of the first pixel is 0.
     distortion : tuple of float
         k1, k2, p1, p2, k3, k4, k5, k6 in OpenCV's order; may be shorter.
     mosaic : tuple of str, optional
