@@ -251,6 +251,43 @@ def shifts_px(
     return np.asarray(new - old)
 
 
+def inverse_depth_sigma(
+    before: NDArray[np.float64],
+    after: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+    depth_mm: float,
+    *,
+    depths_known: bool,
+) -> float:
+    """Return the standard deviation that the 1/depth of all points has in common by errors of the poses.
+
+    Rotations that grow along the grid shift the views as another 1/depth does. Let s (view, 2) be where the cameras see
+    a point on the axis of the reference view, and q its 1/depth. Errors δs of the poses then change q by
+    `Σ s′·δs / Σ |s′|²`, with `s′ = ∂s/∂q`. Unless depths are known, so far as the alignment changed the poses in this
+    way, nothing but the views vouches for it, and these hardly tell: that change counts as an error, too.
+
+    `before` and `after` (view, 6) are the poses, and the covariance is that of all numbers of the latter.
+    """
+    q = 1 / depth_mm
+    along = (_on_axis(after, q * (1 + _STEP)) - _on_axis(after, q * (1 - _STEP))) / (2 * _STEP * q)
+    weights = along / np.sum(along**2)
+    sensitivity = np.empty(after.shape)
+    for axis in range(POSE):
+        step = _STEP * (np.arange(POSE) == axis)
+        sensitivity[:, axis] = np.sum(weights * (_on_axis(after + step, q) - _on_axis(after - step, q)), 1) / (
+            2 * _STEP
+        )
+    variance = float(sensitivity.ravel() @ covariance @ sensitivity.ravel())
+    change = 0.0 if depths_known else float(np.sum(weights * (_on_axis(after, q) - _on_axis(before, q))))
+    return float(np.sqrt(max(variance, 0.0) + change**2))
+
+
+def _on_axis(poses: NDArray[np.float64], inverse_depth: float) -> NDArray[np.float64]:
+    """Return where cameras (view, 2), of focal length 1, see the point on the reference axis at a 1/depth."""
+    turned = np.array([rotation_matrix(pose)[:, 2] for pose in poses]) + inverse_depth * poses[:, 3:]
+    return np.asarray(turned[:, :2] / turned[:, 2:])
+
+
 def transfer_sigmas_px(
     lens: Lens, poses: NDArray[np.float64], reference: int, uncertainty: PoseUncertainty, depth_mm: float
 ) -> float:

@@ -45,6 +45,7 @@ from faintfield.pipelines.reconstruction.alignment import (
     align_set,
     assumed_errors,
     change_lens,
+    inverse_depth_sigma,
     plausible_errors,
     pose_uncertainty,
     shifts_px,
@@ -183,7 +184,7 @@ def _record(
     before, after = elemental_set.poses_rt_cam_ref, alignment.rt_cam_ref
     shifts = shifts_px((old, before), (lens, after), middle_mm)
     left = shifts_px((lens, move_poses(after, -alignment.last_steps)), (lens, after), middle_mm)
-    nodes = elemental_set.nodes
+    nodes, of_poses = elemental_set.nodes, uncertainty.covariance[(count := len(lens.parameters)) :, count:]
     turns = alignment.steps[:, 2]
     record = AlignmentRecord(
         source="views",
@@ -213,6 +214,9 @@ def _record(
             )
             for depth in (aligned.depths_mm[0], aligned.depths_mm[-1])
         },
+        inverse_depth_sigma=inverse_depth_sigma(
+            before, after, of_poses, middle_mm, depths_known=bool(options.depth_mm)
+        ),
         **provenance("align", options, elemental_set.input_hashes(), elemental_set.units).parts(),
     )
     return record, uncertainty

@@ -31,7 +31,12 @@ MISPLACEMENT = 0.2
 
 
 def confidence(
-    index: Image, costs: Image, inverse_depths: Image, explained: Image, parallax: float | None
+    index: Image,
+    costs: Image,
+    inverse_depths: Image,
+    explained: Image,
+    parallax: float | None,
+    shared_sigma: float = 0.0,
 ) -> NDArray[np.float32]:
     """Return the probability (row, column) that depths are right within `RIGHT_WITHIN`.
 
@@ -49,11 +54,14 @@ def confidence(
     parallax : float, optional
         Root of the sum of squares of the views' parallaxes, in samples per unit of 1/depth; None for the first
         probability alone.
+    shared_sigma : float
+        Standard deviation that all 1/depth have in common, by errors of the poses.
     """
     found = found_probability(features(index, costs, inverse_depths, explained), COEFFICIENTS)
     if parallax is not None:
         q = np.interp(index, np.arange(len(inverse_depths)), inverse_depths)
-        found = found * precise_probability(RIGHT_WITHIN * q * parallax, MISPLACEMENT)
+        sigma = float(np.hypot(MISPLACEMENT, shared_sigma * parallax))
+        found = found * precise_probability(RIGHT_WITHIN * q * parallax, sigma)
     return np.asarray(found, np.float32)
 
 
@@ -64,12 +72,12 @@ def found_probability(features: NDArray[np.float64], coefficients: ArrayLike) ->
     return np.minimum(likely, np.where(poorly, _MAX_IF_POORLY, _MAX_CONFIDENCE))
 
 
-def precise_probability(tolerance: NDArray[np.float64], misplacement: float) -> NDArray[np.float64]:
-    """Return the probability that the error by misplaced views is within a tolerance.
+def precise_probability(tolerance: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
+    """Return the probability that an error by misplaced views, of a standard deviation, is within a tolerance.
 
     Both are in samples, the tolerance as the root of the sum of squares of the movements of the views.
     """
-    return np.asarray(erf(tolerance / (np.sqrt(2) * misplacement)))
+    return np.asarray(erf(tolerance / (np.sqrt(2) * sigma)))
 
 
 def spacing_needed(inverse_depth: float, parallax: float) -> float:

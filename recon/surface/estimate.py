@@ -90,12 +90,15 @@ class SurfaceEstimate:
     spacing_needed: float | None
 
 
-def estimate_surface(views: PinholeViews, inverse_depths: NDArray[np.float64]) -> SurfaceEstimate:
+def estimate_surface(
+    views: PinholeViews, inverse_depths: NDArray[np.float64], shared_sigma: float = 0.0
+) -> SurfaceEstimate:
     """Return the surface that explains the views best.
 
     All rounds but the last are done without some of the views; the last starts from the one that predicts these best.
 
-    `inverse_depths` (depth,) are the 1/depth to choose from, ascending in equal steps.
+    `inverse_depths` (depth,) are the 1/depth to choose from, ascending in equal steps. `shared_sigma` is the standard
+    deviation that all of them have in common, by errors of the poses.
     """
     nodes = views.nodes
     left_out = validation_views(len(nodes)) if len(nodes) >= _MIN_JUDGED else np.zeros(0, np.intp)
@@ -117,7 +120,7 @@ def estimate_surface(views: PinholeViews, inverse_depths: NDArray[np.float64]) -
     final = DepthEvidence(views, inverse_depths, halves(nodes))
     index, costs = next_depths(final, final.explained(candidates[best]))
     parallax = float(np.linalg.norm(views.reach))
-    sure = confidence(index, costs, inverse_depths, explained_share(final, index), parallax)
+    sure = confidence(index, costs, inverse_depths, explained_share(final, index), parallax, shared_sigma)
     depths = np.interp(index, np.arange(len(inverse_depths)), inverse_depths)
     lit = lit_samples(views, depths)
     doubtful = (index <= 1) | (index >= len(inverse_depths) - 2) | ~lit

@@ -199,7 +199,7 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> Searches:
     """Replace what is slow: the search for depths, σ, refinement and pictures; return what the search is given."""
     given: Searches = []
 
-    def search(views: Any, inverse_depths: NDArray[np.float64]) -> SurfaceEstimate:
+    def search(views: Any, inverse_depths: NDArray[np.float64], shared_sigma: float) -> SurfaceEstimate:
         given.append((views, inverse_depths))
         return found_at_once(views)
 

@@ -138,6 +138,9 @@ class CameraPoses(Struct, frozen=True, kw_only=True):
         Pose of the camera at each node.
     homings : list of HomingRecord, optional
         Shifts by homings of the stage between the board images, where they show.
+    inverse_depth_sigma : float, optional
+        Standard deviation that the 1/depth of all points has in common, as the views do not tell it from rotations that
+        grow along the grid; in the inverse of the unit of lengths. Absent: by boards, or from an older version.
     """
 
     format: Literal[1] = 1
@@ -147,6 +150,7 @@ class CameraPoses(Struct, frozen=True, kw_only=True):
     reference_node: Node
     nodes: Annotated[list[NodeRecord], Meta(min_length=1)]
     homings: list[HomingRecord] | UnsetType = UNSET
+    inverse_depth_sigma: Annotated[float, Meta(ge=0)] | UnsetType = UNSET
 
     def camera_lens(self) -> Lens:
         """Return the lens; ValueError if it is impossible."""

@@ -63,7 +63,8 @@ def with_poses_of_views(elemental_set: "ElementalSet", path: Path) -> "Elemental
         for view, node in zip(settings.view, elemental_set.nodes, strict=True)
     ]
     aligned = msgspec.structs.replace(settings, view=views, camera=settings.camera.with_lens(geometry.camera_lens()))
-    return replace(elemental_set, settings=aligned, measured_in=path, poses="aligned")
+    sigma = geometry.inverse_depth_sigma or 0.0
+    return replace(elemental_set, settings=aligned, measured_in=path, poses="aligned", inverse_depth_sigma=sigma)
 
 
 def check_match(path: Path, geometry: CameraPoses, elemental_set: "ElementalSet", nodes: Sequence[Node | None]) -> None:

@@ -63,6 +63,8 @@ class ElementalSet:
         The geometry.json of the lens, if it is not the set's own.
     poses : {"stated", "measured", "aligned", "nominal", "true"}
         Source of the poses.
+    inverse_depth_sigma : float
+        Standard deviation that the 1/depth of all points has in common by errors of the poses, as far as it is known.
     described_in : str
         Name of the file that says what the images are.
     noise_reference : tuple of Path
@@ -82,6 +84,7 @@ class ElementalSet:
     unusable: NDArray[np.bool_]
     measured_in: Path | None = None
     poses: Poses = "stated"
+    inverse_depth_sigma: float = 0.0
     described_in: str = FILE_NAME
     noise_reference: tuple[Path, ...] = ()
     bright_view: tuple[Path, float] | None = None

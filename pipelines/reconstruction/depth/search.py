@@ -25,6 +25,7 @@ from faintfield.pipelines.reconstruction.depth.shared_range import overlap, reme
 from faintfield.pipelines.reconstruction.operators import plane_grid, principal_shift, response_of
 from faintfield.recon.errors import GeometryMismatch, NothingInFocus
 from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.surface.confidence import RIGHT_WITHIN
 from faintfield.recon.surface.estimate import SurfaceEstimate, equal_steps, estimate_surface, found_range
 from faintfield.recon.surface.pinhole_views import UNKNOWN, PinholeViews
 from faintfield.recon.threads import map_in_threads
@@ -241,8 +242,9 @@ def depths_of_set(
     check_places(views_of_search(elemental_set, range_mm, out), range_mm)
     with naming_range(elemental_set, far, near, purpose):
         inform(f"{purpose} {_between(elemental_set, far, near)}: comparing {len(depths)} depths")
+        _warn_of_shared_error(elemental_set, 2 / (far + near))
         with working(f"finding the depths of the {purpose}"):
-            found = estimate_surface(views, depths)
+            found = estimate_surface(views, depths, elemental_set.inverse_depth_sigma)
     inverse_depth = enlarged(found.inverse_depth, grid.shape, bins)
     found = replace(found, inverse_depth=inverse_depth, confidence=enlarged(found.confidence, grid.shape, bins))
     return DepthSearch(depths, bins, grid, found)
@@ -276,6 +278,18 @@ def _check_steps(views: PinholeViews, depths: NDArray[np.float64]) -> None:
         raise GeometryMismatch(f"{apart}; give a narrower range, above all a farther near end")
     if step > _COARSE:
         inform(f"warning: {apart}; a narrower range would find more")
+
+
+def _warn_of_shared_error(elemental_set: ElementalSet, depth: float) -> None:
+    """Say so if poses by the views leave all depths uncertain together, by half of what still counts as right."""
+    share = elemental_set.inverse_depth_sigma * depth
+    if share > RIGHT_WITHIN / 2:
+        at = elemental_set.depth_text(float(f"{depth:.2g}"))
+        inform(
+            f"warning: poses by the views leave all depths uncertain together, by {share:.0%} at {at} (standard "
+            "deviation), so that none is sure; measure the poses by boards, or give planes at known depths to "
+            "`faintfield align --depth`"
+        )
 
 
 def enlarged[Number: np.floating](part: NDArray[Number], shape: tuple[int, int], bins: int) -> NDArray[Number]:

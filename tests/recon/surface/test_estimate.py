@@ -205,5 +205,8 @@ def test_confidence_falls_with_parallax() -> None:
         tolerated = RIGHT_WITHIN * inverse_depths[10] * parallax
         expected = confidence(*known, None) * np.mean(np.abs(draws) < tolerated)
         np.testing.assert_allclose(confidence(*known, parallax), expected, atol=0.005)
+    shared = confidence(*known, 1e9, 5e-6) / confidence(*known, 1e9)  # views so far apart that only this error counts
+    draws = rng.normal(0, 5e-6, 100_000)
+    np.testing.assert_allclose(shared, np.mean(np.abs(draws) < RIGHT_WITHIN * inverse_depths[10]), atol=0.005)
     enough = 5e3 * spacing_needed(inverse_depths[10], 5e3)
     assert confidence(*known, 0.99 * enough).max() < SURE < confidence(*known, 1.01 * enough).max()

@@ -59,7 +59,7 @@ def test_unexplained_surface_is_told_of_at_the_end(
     prediction = Prediction(np.array([3]), 1000, surface=2045.0, planes=2050.0, standard_error=1.0, neighbours=3000.0)
     monkeypatch.setattr(
         "faintfield.pipelines.reconstruction.depth.search.estimate_surface",
-        lambda views, _: replace(found_at_once(views), prediction=prediction),
+        lambda views, *_: replace(found_at_once(views), prediction=prediction),
     )
     told = done("reconstruct", scene, "--surface", *FAST, "--out", scene / "out", "--json")
     warning = json.loads(told.stdout)["surface_warning"]
@@ -76,7 +76,7 @@ def test_unexplained_surface_is_told_of_at_the_end(
         (
             0.5,
             1.61,
-            "No depth of this surface is sure: do not measure in it; its nodes are too close together, use 1.7",
+            "No depth of this surface is sure: do not measure in it; its nodes are too close",
         ),
         (0.95, 1.0, None),
     ],
