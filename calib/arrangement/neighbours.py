@@ -76,7 +76,7 @@ class NeighbourFits:
     shift_px : array (view, 2)
         Displacement x, y of each view against its neighbours, beyond what disparities explain.
     turn_sigma_rad, magnification_sigma, shift_sigma_px : array (view,), array (view,), array (view, 2)
-        Their standard errors, which blocks without detail enlarge.
+        Their standard errors; large if few blocks have detail.
     """
 
     odd: list[int] = field(default_factory=list)
@@ -94,7 +94,7 @@ class NeighbourFits:
 
 
 class PairFit(NamedTuple):
-    """Median correlation of the blocks of two neighbours, and how displacements across the step run, with errors."""
+    """Median correlation of the blocks of two neighbours; fit of the displacements across the step, with errors."""
 
     score: float
     chance: float
