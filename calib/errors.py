@@ -34,8 +34,8 @@ class CalibrationError(Exception):
 class LensNotInvertible(CalibrationError):
     """The distortion folds the image onto itself within the detector.
 
-    Of numbers typed by hand, correct the signs, and the order: k1, k2, p1, p2, k3 …. Of a calibration, move boards into
-    the corners of the image, or use a simpler `--lens`.
+    Correct the signs and the order (k1, k2, p1, p2, k3 …) of numbers typed by hand. If a calibration found them, move
+    boards into the corners of the image, or use a simpler `--lens`.
     """
 
 

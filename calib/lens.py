@@ -151,6 +151,12 @@ class Lens:
             pixels[in_front] = cv2.projectPoints(points[in_front], *arguments)[0][:, 0]
         return pixels
 
+    def undistortion_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return column and row, each (row, column), at which this lens sees the pixels of its pinhole."""
+        matrix = self.camera_matrix()
+        maps = cv2.initUndistortRectifyMap(matrix, self._coefficients(), None, matrix, self.size_px, cv2.CV_32FC1)
+        return np.asarray(maps[0], np.float32), np.asarray(maps[1], np.float32)
+
     def _interpolated(self, columns: NDArray[np.float64]) -> RaysOfRows | None:
         """Return what interpolates the rays (row, column, 2) of the columns in given rows, None if nothing does well.
 
@@ -185,8 +191,8 @@ class Lens:
         if not miss_px <= _ROUND_TRIP_PX:
             raise LensNotInvertible(
                 f"distortion {self.distortion} cannot be undone over the {self.size_px[0]} x {self.size_px[1]} px "
-                f"detector: off by {miss_px:.3g} px, limit {_ROUND_TRIP_PX} px; correct signs and order (k1, k2, p1, "
-                "p2, k3 …) of numbers typed by hand, calibrate with boards that reach the corners, or crop"
+                f"detector: off by {miss_px:.3g} px, limit {_ROUND_TRIP_PX} px; calibrate with boards that reach "
+                "the corners, crop, or correct signs and order of numbers typed by hand"
             )
         return rays
 

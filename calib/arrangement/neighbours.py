@@ -30,8 +30,16 @@ _CHANCE_BLOCKS = 8
 # Least mean error of a block's displacement, px: interpolated peaks are no better.
 _LEAST_ERROR_PX = 0.02
 
+# Blocks beyond the number of parameters from which their residuals tell the error, which else is the whole search;
+# least number of them, counted without overlap, by which the sum of the residuals is divided.
+_MIN_FREE_BLOCKS, _LEAST_FREE = 3, 1.0
+
 # Standard deviation of normal errors over the mean of their absolute values, and of a median over that of a mean.
 _SIGMA_OF_MEAN, _SIGMA_OF_MEDIAN = 1.25, 1.25
+
+# Largest standard error of a pair over that of the typical pair, below which no error is taken to be: beyond it, the
+# pair tells nothing, and rounding would spoil the errors of the views behind it.
+_MAX_SIGMA_RATIO = 1e3
 
 # Rounds of reweighting, in which pairs and blocks that disagree lose their weight.
 _ROUNDS = 8
@@ -68,7 +76,7 @@ class NeighbourFits:
     shift_px : array (view, 2)
         Displacement x, y of each view against its neighbours, beyond what disparities explain.
     turn_sigma_rad, magnification_sigma, shift_sigma_px : array (view,), array (view,), array (view, 2)
-        Their standard errors, which blocks without detail enlarge.
+        Their standard errors; large if few blocks have detail.
     """
 
     odd: list[int] = field(default_factory=list)
@@ -86,7 +94,7 @@ class NeighbourFits:
 
 
 class PairFit(NamedTuple):
-    """Median correlation of the blocks of two neighbours, and how displacements across the step run, with errors."""
+    """Median correlation of the blocks of two neighbours; fit of the displacements across the step, with errors."""
 
     score: float
     chance: float
@@ -127,13 +135,18 @@ def compare_neighbours(pictures: Mapping[Node, Picture], range_px: tuple[float, 
         views = np.arange(len(pictures))
         design = (second[:, np.newaxis] == views) * 1.0 - (first[:, np.newaxis] == views)
         value, sigma = (column[chosen] for column in quantity)
+        if len(sigma):
+            sigma = np.clip(sigma, np.median(sigma), _MAX_SIGMA_RATIO * np.median(sigma))
         solution = _fit_robustly(design, value, 1 / sigma)
         normal = (design / sigma[:, np.newaxis] ** 2).T @ design
         variance = np.diag(np.linalg.pinv(normal, rcond=1e-9, hermitian=True))
         part = _parts(len(views), first, second)
+        # Around closed squares, pairs disagree by their errors
+        free = len(value) - len(views) + len(np.unique(part))
+        misfit = _SIGMA_OF_MEAN * float(np.sum(np.abs(value - design @ solution) / sigma)) / max(free, 1)
         for linked in part == np.unique(part)[:, np.newaxis]:
             solution[linked] -= np.median(solution[linked])
-        return solution, np.sqrt(np.maximum(variance, 0.0))
+        return solution, max(misfit, 1.0) * _SIGMA_OF_MEDIAN * np.sqrt(np.maximum(variance, 0.0))
 
     # Pairs of a column tell of x, pairs of a row of y
     (x_px, x_sigma_px), (y_px, y_sigma_px) = (per_view(offset, good & (axes == axis)) for axis in (1, 0))
@@ -177,19 +190,27 @@ def compare_pair(view: Picture, other: Picture, axis: int, range_px: tuple[float
     solution = _fit_robustly(design, offset_px, weight)
     constant, turn, magnification = solution.tolist()
     turn = turn if axis == 0 else -turn
-    sigmas = _standard_errors(design, np.abs(offset_px - design @ solution), weight)
+    covered_px = [corner[-1] - corner[0] + _BLOCK_PX for corner in corners]
+    overlap = max(np.prod([len(corner) for corner in corners]) * _BLOCK_PX**2 / np.prod(covered_px), 1.0)
+    sigmas = _standard_errors(design, np.abs(offset_px - design @ solution), weight, overlap)
     return PairFit(float(np.median(score)), float(np.median(chance)), constant, turn, magnification, *sigmas)
 
 
-def _standard_errors(design: Array, residual: Array, weight: Array) -> list[float]:
-    """Return the standard errors of the solution by the mean size of the residuals; large where it is free."""
+def _standard_errors(design: Array, residual: Array, weight: Array, overlap: float = 1.0) -> list[float]:
+    """Return the standard errors of the solution by the size of the residuals; large where it is free.
+
+    Each pixel belongs to `overlap` blocks, so that so many equations count as one. A solution of least absolute
+    deviations passes through as many points as it has parameters, whose residuals of zero tell nothing.
+    """
     count, parameters = design.shape
     relative = weight / (weight.mean() or 1.0)
-    per_equation = max(float(np.mean(relative * residual)), _LEAST_ERROR_PX) * _SIGMA_OF_MEAN * _SIGMA_OF_MEDIAN
+    free = max(count / overlap - parameters, _LEAST_FREE)
+    residual_px = float(np.sum(relative * residual)) / overlap / free
+    per_equation = max(residual_px, _LEAST_ERROR_PX) if count - parameters >= _MIN_FREE_BLOCKS else float(_ACROSS_PX)
     normal = design.T @ (design * relative[:, np.newaxis])
     normal += 1e-9 * (float(np.trace(normal)) + 1.0) * np.eye(parameters)
-    variance = per_equation**2 * count / max(count - parameters, 1) * np.diag(np.linalg.inv(normal))
-    return list(np.sqrt(variance).tolist())
+    sigma = np.sqrt(overlap * np.diag(np.linalg.inv(normal)))
+    return list((_SIGMA_OF_MEAN * _SIGMA_OF_MEDIAN * per_equation * sigma).tolist())
 
 
 def _fit_robustly(design: Array, value: Array, weight: Array) -> Array:

@@ -146,8 +146,8 @@ def _refusal(alignment: Alignment, gain: HeldOutGain, plausible: PoseErrors, opt
         )
     if alignment.gain.sure:
         return None
-    advice = "`faintfield align --depth …` helps where planes at known depths hold all of the scene"
-    advice = "" if options.depth_mm else f", and {advice}"
+    remedy = ", and `faintfield align --depth …` helps where planes at known depths hold all of the scene"
+    advice = "" if options.depth_mm else remedy
     return (
         "the poses stay as they are: the new ones do not predict held-out pixels better, beyond chance (gain of "
         f"{gain.text}; more than 3 are needed); they may be right, or light or views too few{advice}"

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from faintfield.calib.errors import LensNotInvertible
 from faintfield.calib.homography import rotation_matrix
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.console import inform, progress
@@ -43,6 +44,9 @@ from faintfield.pipelines.formats.sets.elemental_file import (
 from faintfield.pipelines.formats.sets.elemental_set import stated_length
 from faintfield.pipelines.formats.sets.session_set import load_set_or_session
 from faintfield.pipelines.formats.units import MAX_ANGLE_RAD, MAX_LENGTH_MM, Units
+
+# Pixels along each side of a picture in which a stated lens is checked.
+_CHECKED_PIXELS = 33
 
 # Largest error of the columns of a rotation in length and right angles, as rounded numbers have it.
 _ROTATION_TOLERANCE = 1e-2
@@ -178,7 +182,7 @@ def _nodes(images: Sequence[PosedImage]) -> Sequence[tuple[int, int] | None]:
 def stated_lens(size_px: tuple[int, int], fx_px: float, fy_px: float, options: LensOptions | GridOptions) -> Lens:
     """Return the lens of the options, whose principal point is the middle of the picture by default.
 
-    Raises WrongUsage for a lens that cannot be, and LensNotInvertible for one that folds the corners of the picture.
+    Raises WrongUsage for a lens that cannot be, and LensNotInvertible for one that folds the picture.
     """
     middle_x, middle_y = ((side - 1) / 2 for side in size_px)
     cx_px = middle_x if options.cx_px is None else options.cx_px
@@ -187,7 +191,16 @@ def stated_lens(size_px: tuple[int, int], fx_px: float, fy_px: float, options: L
         lens = Lens(size_px, fx_px, fy_px, cx_px, cy_px, options.distortion)
     except ValueError as failure:
         raise WrongUsage(f"the lens of the options cannot be: {failure}; correct them") from failure
-    lens.rays(step=(max(size_px[1] - 1, 1), max(size_px[0] - 1, 1)))
+    # A lattice of pixels, and the corners
+    x, y = (np.linspace(0, side - 1, _CHECKED_PIXELS) for side in size_px)
+    try:
+        lens.rays_at(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
+    except LensNotInvertible as failure:
+        numbers = " ".join(f"--distortion {number:g}" for number in options.distortion)
+        raise LensNotInvertible(
+            f"{numbers}: folds the picture of {size_px[0]} x {size_px[1]} px onto itself; correct signs and order (k1, "
+            "k2, p1, p2, k3 …), or --fx-px"
+        ) from failure
     return lens
 
 

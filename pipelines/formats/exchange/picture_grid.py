@@ -65,6 +65,11 @@ class ImportedGrid(msgspec.Struct, frozen=True):
 def import_pictures(src: Path, out: Path, options: GridOptions) -> ImportedGrid:
     """Make an elemental set of the pictures in a folder or a file, put in order by what they show."""
     check_set_free(out, options, src)
+    prescribed = Orientation(options.transpose, options.flip_rows, options.flip_columns)
+    if options.keep_order and prescribed != Orientation():
+        flags = ("transpose", "flip_rows", "flip_columns")
+        option = next(f"--{flag.replace('_', '-')}" for flag in flags if getattr(options, flag))
+        raise WrongUsage(f"--keep-order contradicts {option}; leave one out")
     if options.distortion and None in (options.pitch_mm, options.fx_px):
         lacking = "--pitch-mm" if options.pitch_mm is None else "--fx-px"
         raise WrongUsage(f"--distortion is that of a lens whose scale is known; give {lacking}, too")
@@ -76,7 +81,6 @@ def import_pictures(src: Path, out: Path, options: GridOptions) -> ImportedGrid:
     own_scale = pitch_mm is None and fx_px is None and disparity_px is None
     if described is not None:
         pitch_mm, fx_px, disparity_px = described.scale(pitch_mm, fx_px, disparity_px)
-    prescribed = Orientation(options.transpose, options.flip_rows, options.flip_columns)
     with _unpacked(src, options, described.size if described else None) as views:
         for remark in views.remarks:
             inform(remark)

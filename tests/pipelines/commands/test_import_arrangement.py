@@ -118,6 +118,9 @@ def test_copies_and_shuffles_are_refused(nine_views: Views, tmp_path: Path, fain
     _check_refused(faintfield, src, "ShuffledPictures")
     stated = faintfield("import", "grid", src, tmp_path / "set", "--flip-rows")
     assert "so the order may be wrong" in stated.stderr
+    kept = faintfield("import", "grid", src, tmp_path / "kept", "--rows", 3, "--columns", 3, "--keep-order")
+    assert kept.returncode == 0
+    _assert_as_rendered(load_set(tmp_path / "kept"), shuffled)
 
 
 def test_two_likely_orders_are_refused_with_both(tmp_path: Path, faintfield: Command) -> None:
@@ -155,8 +158,18 @@ def test_uncertain_magnification_is_not_irregular(tmp_path: Path, done: Command)
     assert not _arrangement(done, _write(tmp_path / "src", views)).irregular
 
 
-def test_stated_distortion_is_undone_before_pictures_are_compared(tmp_path: Path, done: Command) -> None:
-    (width, height), focal_px, distortion = SMALL_PX, 96.0, -0.3
+def test_small_noisy_pictures_are_not_irregular(tmp_path: Path, done: Command) -> None:
+    """A pair of 64 x 48 px has six blocks, which overlap by half."""
+    layers = (Layer(-1.0), Layer(-3.0, (-8, -6), (12, 10)), Layer(-4.0, (15, 8), (9, 12)))
+    views = with_noise(light_field(layers, (3, 3), (64, 48), seed=2), 7, seed=102)
+    assert not _arrangement(done, _write(tmp_path / "src", views)).irregular
+
+
+@pytest.mark.parametrize("distortion", [-0.3, 0.3])
+def test_stated_distortion_is_undone_before_pictures_are_compared(
+    distortion: float, tmp_path: Path, done: Command
+) -> None:
+    (width, height), focal_px = SMALL_PX, 96.0
     lens = Lens(SMALL_PX, focal_px, focal_px, (width - 1) / 2, (height - 1) / 2, (distortion,))
     places = (focal_px * lens.rays() + (lens.cx_px, lens.cy_px)).astype(np.float32)
     views = light_field((Layer(-6.0),), (3, 3), SMALL_PX)

@@ -94,12 +94,14 @@ def test_lens_is_that_of_options(tmp_path: Path, done: Command, faintfield: Comm
         (("--fx-px", 9), "give --pitch-mm, too"),
         (("--fx-px", 9, "--pitch-mm", 50, "--disparity-px", 2), "not of aligned ones; leave one out"),
         (("--fx-px", 9, "--pitch-mm", 50, "--distortion", "nan"), "the lens of the options cannot be"),
+        (("--keep-order", "--flip-rows"), "--keep-order contradicts --flip-rows; leave one out"),
     ):
         ended = faintfield("import", "grid", src, tmp_path / "no", *wrong, *lens)
         assert (ended.returncode, words in ended.stderr) == (2, True)
-    folding = ("--pitch-mm", 50, "--fx-px", 9, "--distortion", -5)
-    ended = faintfield("import", "grid", src, tmp_path / "no", *folding)
-    assert_refused(ended, "LensNotInvertible", "correct signs and order (k1, k2, p1, p2, k3 …)")
+    # The second folds the picture inside, not at its corners
+    for folding in (("--distortion", -5), ("--distortion", -2.1, "--distortion", 1)):
+        ended = faintfield("import", "grid", src, tmp_path / "no", "--pitch-mm", 50, "--fx-px", 9, *folding)
+        assert_refused(ended, "LensNotInvertible", "correct signs and order (k1, k2, p1, p2, k3 …)")
 
 
 def test_full_disk_is_found_before_pictures_are_compared(
