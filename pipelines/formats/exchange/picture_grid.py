@@ -150,6 +150,11 @@ def _scale(
         least, largest = arrangement.disparity_range_px
         # Ranges are those along columns of nodes, the scale is that along rows
         at_infinity_px = max(largest + _BEYOND_SHARE * (largest - least) + _BEYOND_PX, 0.0) / arrangement.pitch_ratio
+        if at_infinity_px > 0:
+            inform(
+                f"infinitely far points are taken to have a disparity of {at_infinity_px:.2f} px, beyond all that were "
+                "found, and the 2 % of a confidence are those of the difference from it; state it by --disparity-px"
+            )
     return pitch_mm or 1.0, focal_px, at_infinity_px, False
 
 
