@@ -184,7 +184,8 @@ def _record(
     before, after = elemental_set.poses_rt_cam_ref, alignment.rt_cam_ref
     shifts = shifts_px((old, before), (lens, after), middle_mm)
     left = shifts_px((lens, move_poses(after, -alignment.last_steps)), (lens, after), middle_mm)
-    nodes, of_poses = elemental_set.nodes, uncertainty.covariance[(count := len(lens.parameters)) :, count:]
+    nodes, of_lens = elemental_set.nodes, len(lens.parameters)
+    of_poses = uncertainty.covariance[of_lens:, of_lens:]
     turns = alignment.steps[:, 2]
     record = AlignmentRecord(
         source="views",

@@ -287,7 +287,7 @@ def _warn_of_shared_error(elemental_set: ElementalSet, depth: float) -> None:
         at = elemental_set.depth_text(float(f"{depth:.2g}"))
         inform(
             f"warning: poses by the views leave all depths uncertain together, by {share:.0%} at {at} (standard "
-            "deviation), so that none is sure; measure the poses by boards, or give planes at known depths to "
+            "deviation), so that hardly any is sure; measure the poses by boards, or give planes at known depths to "
             "`faintfield align --depth`"
         )
 

@@ -80,6 +80,12 @@ def test_poses_by_the_views_are_nearer_to_the_truth_by_what_they_state(
     before, after = (np.sqrt(np.mean(moved_px(posed.poses_rt_cam_ref) ** 2)) for posed in (stated, aligned))
     assert after < 0.35 * before
 
+    # The least-squares change of 1/depth by these shifts, common to all points
+    along = true[others, 3:5]
+    common = np.sum(along * moved_px(aligned.poses_rt_cam_ref)) / stated.settings.camera.fx_px / np.sum(along**2)
+    assert abs(common) < 3 * aligned.inverse_depth_sigma
+    assert aligned.inverse_depth_sigma < 0.02 / 700
+
     with np.load(tmp_path / "aligned" / COVARIANCE_FILE) as arrays:
         covariance, lens = arrays["covariance"], len(arrays["intrinsics"])
     rows = (lens + 6 * others[:, np.newaxis] + np.arange(6)).ravel()

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -17,14 +18,14 @@ from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
 from faintfield.pipelines.reconstruction.depth.comparison import BETWEEN_PIXELS, between_pixels
-from faintfield.pipelines.reconstruction.depth.search import enlarged
+from faintfield.pipelines.reconstruction.depth.search import depths_of_set, enlarged
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
 from faintfield.pipelines.reconstruction.planes.penalised import Objective, solve_then_sigma
 from faintfield.pipelines.reconstruction.planes.solve import solve
 from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.surface.pinhole_views import UNKNOWN
 from tests.pipelines.conftest import Command, Edit, assert_refused
-from tests.pipelines.surfaces import Searches
+from tests.pipelines.surfaces import Searches, found_at_once
 from tests.recon.surface_scene import GRID
 
 RANGE = ("--depth-range-mm", "400:900")
@@ -127,6 +128,20 @@ def test_range_up_to_infinity_is_searched(seen: Searches, scene: Path, faintfiel
     assert "warning" not in done(*call, "400:1000000000").stderr
     assert "a narrower range would find more" in done(*call, "10:900").stderr
     assert 1 / seen[0][1][0] == pytest.approx(1e9)
+
+
+@pytest.mark.parametrize(("at_600_mm", "share"), [(0.005, None), (0.12, "by 12% at 600 mm")])
+def test_error_that_all_depths_share_is_counted_and_said(
+    at_600_mm: float, share: str | None, scene: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    counted = mock.Mock(side_effect=lambda views, *_: found_at_once(views))
+    monkeypatch.setattr("faintfield.pipelines.reconstruction.depth.search.estimate_surface", counted)
+    sigma = at_600_mm / 600
+    with caplog.at_level("INFO", "faintfield"):
+        depths_of_set(replace(load_set(scene), inverse_depth_sigma=sigma), (450.0, 900.0), scene)
+    assert counted.call_args.args[2] == sigma
+    assert ("leave all depths uncertain together" in caplog.text) == (share is not None)
+    assert (share or "") in caplog.text
 
 
 def test_saturated_or_too_small_views_are_refused(
